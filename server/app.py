@@ -52,6 +52,8 @@ from server.routes import (
 from server.scene.exports import Exports
 from server.scene.scenes import Scenes
 from server.settings import ServerSettings
+from server.siblings.passing import PassOn
+from server.siblings.siblings import Siblings
 from server.stream.hub import Hub
 
 
@@ -75,12 +77,15 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
         app.state.readiness = Readiness(settings, where)
         app.state.scenes = Scenes(settings, where, app.state.hub)
         await app.state.scenes.open()
+        app.state.siblings = Siblings(where.siblings, settings.secret) if where.has_siblings else None
         app.state.exports = Exports(app.state.scenes, where)
         await app.state.exports.open()
         yield
         await app.state.exports.stop()
         await app.state.readiness.stop()
         await app.state.scenes.stop()
+        if app.state.siblings is not None:
+            await app.state.siblings.close()
         await where.close()
 
     app = FastAPI(
@@ -100,6 +105,13 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     app.add_middleware(BodyLimit, limit=int(settings.max_body_mb * 1e6))
     app.add_middleware(compressed)
     app.add_middleware(HeadAsGet)
+    if placement is not None and placement.has_siblings:
+        app.add_middleware(
+            PassOn,
+            siblings=lambda: app.state.siblings,
+            has=lambda id: id in app.state.scenes,
+            most_bytes=int(settings.max_body_mb * 1e6),
+        )
     if settings.allowed_origins:
         app.add_middleware(
             CORSMiddleware,

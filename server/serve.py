@@ -65,6 +65,7 @@ def serve(settings: ServerSettings) -> None:
     placement = _placement(settings, prepare)
     sockets = listen(settings.host, settings.port)
     asyncio.run(placement.open())  # said here in a sentence, too
+    asyncio.run(placement.announce(settings.host, sockets[0].getsockname()[1]))
     keep_freed_memory()
     config = guarded(
         create_app(_with_files(settings), placement),

@@ -24,6 +24,7 @@ from studies.quality.commands import (
 from studies.rigs.commands import calibration, drift, rigs
 from studies.scale.commands import scale
 from studies.service.commands import crossing, faults, ingest, memory, sleeping, views
+from studies.simulation.commands import simulate
 from studies.variants.commands import variants
 
 STUDIES = {
@@ -33,7 +34,7 @@ STUDIES = {
     "Accuracy against time": (frontier, effort, paper, variants),
     "Speed of the code": (kernels, device, moving, scale, startup),
     "Hard cases": (stability, timing),
-    "The running service": (faults, ingest, views, memory, sleeping, crossing, cluster),
+    "The running service": (faults, ingest, views, memory, sleeping, crossing, cluster, simulate),
 }
 """The commands by the heading under which `scripts/bench --help` lists them."""
 

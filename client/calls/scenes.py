@@ -34,6 +34,7 @@ def create_scene(
     settings: Mapping[str, Any] | None = None,
     frames_per_second: float = 30.0,
     ingest: IngestSettings | None = None,
+    nodes: Mapping[str, str] | None = None,
 ) -> Call[SceneStatus]:
     """Creates a scene. The request is never sent twice: that would make two.
 
@@ -44,6 +45,7 @@ def create_scene(
         settings: what differs from the preset, nested.
         frames_per_second: frame n without a time of its own is taken at n / frames_per_second.
         ingest: how the scene takes frames, and what it keeps of them.
+        nodes: labels that a node of the cluster must have to run its processes.
 
     >>> new = client.create_scene(rig, name="studio", settings={"update": {"iterations": 50}})
     >>> new.state, new.settings["update"]["iterations"]
@@ -57,6 +59,7 @@ def create_scene(
         settings=dict(settings or {}),
         frames_per_second=frames_per_second,
         ingest=ingest or IngestSettings(),
+        nodes=dict(nodes or {}),
     )
     return Call("POST", path(), reads(SceneStatus), repeatable=False, arguments=body(request))
 

@@ -1,4 +1,4 @@
-"""Settings written on the command line: NAME=VALUE to nested changes."""
+"""Settings, and labels of nodes, written on the command line as NAME=VALUE."""
 
 from __future__ import annotations
 
@@ -15,6 +15,34 @@ Changes = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME=VALUE", help="Change a setting, as update.iterations=200. May be repeated."),
 ]
+
+Labels = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--node",
+        metavar="LABEL=VALUE",
+        help="On a cluster: run the new scene on nodes with this label. May be repeated.",
+    ),
+]
+
+
+def parse_labels(labels: Sequence[str] | None) -> dict[str, str]:
+    """Reads labels of nodes; None gives none.
+
+    Raises:
+        ValueError: one without a sign, or two values of one label.
+
+    >>> parse_labels(["rig=stage-a", "disk=fast"])
+    {'rig': 'stage-a', 'disk': 'fast'}
+    """
+    result: dict[str, str] = {}
+    for label in labels or ():
+        name, sign, value = (part.strip() for part in label.partition("="))
+        if not (name and sign and value):
+            raise ValueError(f"label {label!r} cannot be read; write it as rig=stage-a")
+        if result.setdefault(name, value) != value:
+            raise ValueError(f"label {name!r} has two values, {result[name]!r} and {value!r}; give one of them")
+    return result
 
 
 def parse_changes(changes: Sequence[str] | None) -> dict[str, Any]:

@@ -13,7 +13,7 @@ import typer
 from client import rig
 from client.cli import scenes
 from client.cli.capture_options import opened, takes_capture
-from client.cli.changes import Changes, Preset, parse_changes
+from client.cli.changes import Changes, Labels, Preset, parse_changes, parse_labels
 from client.cli.progress import Bars, console
 from client.importers.open_source import CaptureOptions
 from client.sdk import DEFAULT_URL, Client
@@ -83,9 +83,12 @@ def push(
     encoding: Encode = Encoding.JPEG,
     preset: Preset = "scas4d",
     changes: Changes = None,
+    nodes: Labels = None,
 ) -> None:
     """Sends a capture to a running service as its rig would, and waits for the last frame."""
-    settings = parse_changes(changes)
+    settings, labels = parse_changes(changes), parse_labels(nodes)
+    if labels and scene is not None:
+        raise ValueError("--node is for a new scene, and --scene goes on with one that has its nodes; leave one out")
     source = opened(capture, options, encoding=encoding.value)
     with Client(url, token=token, outage=0) as client:
         client.live()  # a wrong address is said at once, an outage later is waited for
@@ -103,6 +106,7 @@ def push(
             preset=preset,
             settings=settings,
             ingest=IngestSettings(when_full=when_full.value),
+            nodes=labels,
             on_progress=bars,
             on_message=lambda sentence: console.print(sentence, style="yellow", highlight=False),
         )

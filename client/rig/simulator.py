@@ -36,6 +36,7 @@ def push(
     preset: str = "scas4d",
     settings: Mapping[str, Any] | None = None,
     ingest: IngestSettings | None = None,
+    nodes: Mapping[str, str] | None = None,
     on_progress: OnProgress | None = None,
     on_message: OnMessage | None = None,
 ) -> Delivery:
@@ -59,6 +60,7 @@ def push(
         preset: named settings.
         settings: what differs from the preset, nested.
         ingest: how the scene takes frames.
+        nodes: labels that a node of the cluster must have for a new scene.
         on_progress: hears of progress: the stages of frame 0, then "frames" with the number finished.
         on_message: hears sentences: outages, frames that were lost, where it goes on.
 
@@ -86,6 +88,7 @@ def push(
                 settings=settings,
                 frames_per_second=source.fps,
                 ingest=ingest,
+                nodes=nodes,
             )
             if source.points is not None and start == 0:
                 client.put_points(status.id, source.points)

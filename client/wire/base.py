@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, FiniteFloat
 
 from scas4d_core.cameras import CAMERA_NAME
+from scas4d_core.errors import InputError
 
 MAX_CAMERAS = 512
 MAX_PIXELS_A_SIDE = 16_384
+MAX_LABELS = 16
+LABEL_WORD = r"[A-Za-z0-9](?:[A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?"
+"""The value of a label, and each side of the slash in its name, as Ray and Kubernetes take them."""
 
 CameraName = Annotated[
     str,
@@ -18,6 +23,23 @@ CameraName = Annotated[
         description="Letters, digits, dot, dash, underscore; not `time`, and not beginning with `mask.`.",
     ),
 ]
+
+
+def _checked(labels: dict[str, str]) -> dict[str, str]:
+    """Raises an InputError for a label that no node can have."""
+    for name, value in labels.items():
+        for what, text, pattern in (("name", name, f"(?:{LABEL_WORD}/)?{LABEL_WORD}"), ("value", value, LABEL_WORD)):
+            if re.fullmatch(pattern, text) is None:
+                raise InputError(
+                    f"{text[:80]!r} cannot be the {what} of a node's label",
+                    "write names and values of 1 to 63 letters, digits, dots, dashes and underscores, of which the "
+                    "first and the last are letters or digits; a name may have one slash, as studio.example/rig",
+                )
+    return labels
+
+
+Labels = Annotated[dict[str, str], Field(max_length=MAX_LABELS), AfterValidator(_checked)]
+"""Labels of nodes, by name."""
 Row3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 Row4 = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
 Pixel = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from client.wire.base import MAX_CAMERAS, Model
+from client.wire.base import MAX_CAMERAS, Labels, Model
 from client.wire.budgets import Budget
 from client.wire.frames import EffectModel
 from client.wire.rigs import RigModel
@@ -94,6 +94,10 @@ class SceneCreate(Model):
         description="Frame n without a time of its own is taken at n / frames_per_second.",
     )
     ingest: IngestSettings = IngestSettings()
+    nodes: Labels = Field(
+        default_factory=dict,
+        description='On a cluster: its processes run only on nodes with all these labels, as {"rig": "stage-a"}.',
+    )
 
 
 class SceneEdit(Model):
@@ -256,6 +260,9 @@ class SceneStatus(Model):
     )
     created: str = Field(description="UTC, ISO 8601.")
     ingest: IngestSettings = IngestSettings()
+    nodes: dict[str, str] = Field(
+        default_factory=dict, description="On a cluster: labels of the nodes on which its processes may run."
+    )
     settings: dict[str, Any]
     budget: Budget = Field(default=Budget(), description="As it was put last; nulls: as `settings` say.")
 

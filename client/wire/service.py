@@ -66,6 +66,7 @@ class Node(Model):
 
     id: str
     host: str
+    labels: dict[str, str] = Field(default_factory=dict, description="Those it was started with; none of Ray's own.")
     alive: bool
     cpus: float
     cpus_taken: float = Field(description="By processes of this service's scenes, as they were estimated.")
@@ -81,6 +82,7 @@ class Waiting(Model):
     scene: str
     role: str
     needs: str
+    seconds: float = Field(default=0.0, description="So long it has waited; to start takes a few without waiting.")
 
 
 class Cluster(Model):
@@ -89,3 +91,6 @@ class Cluster(Model):
     placement: Literal["local", "ray"]
     nodes: list[Node]
     waiting: list[Waiting]
+    answers: bool = Field(
+        default=True, description="The head of the cluster answers; else the nodes are as it told them last."
+    )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 from client.wire import RigModel
@@ -23,7 +24,7 @@ class Needs:
     """Of one process.
 
     Attributes:
-        role: what it does, in a word. scene: whose. cpus, gpus: parts of them. memory: bytes.
+        role: what it does, in a word. scene: whose. cpus, gpus: parts of them. memory: bytes. labels: of the node.
     """
 
     role: str
@@ -31,19 +32,25 @@ class Needs:
     cpus: float
     gpus: float
     memory: int
+    labels: Mapping[str, str] = field(default_factory=dict)
 
     def words(self) -> str:
         """In words.
 
         >>> Needs("worker", "a", 1, 0, 700_000_000).words()
         '1 CPU and 0.7 GB of memory'
+        >>> Needs("worker", "a", 1, 0, 700_000_000, {"rig": "stage-a"}).words()
+        '1 CPU and 0.7 GB of memory on a node with rig=stage-a'
         """
         gpus = f", {self.gpus:g} GPU" if self.gpus else ""
-        return f"{self.cpus:g} CPU{gpus} and {self.memory / 1e9:.1f} GB of memory"
+        labels = ", ".join(f"{name}={value}" for name, value in self.labels.items())
+        node = f" on a node with {labels}" if labels else ""
+        return f"{self.cpus:g} CPU{gpus} and {self.memory / 1e9:.1f} GB of memory{node}"
 
     def options(self) -> dict[str, Any]:
         """As options of a Ray actor."""
-        return {"num_cpus": self.cpus, "num_gpus": self.gpus, "memory": self.memory}
+        room = {"num_cpus": self.cpus, "num_gpus": self.gpus, "memory": self.memory}
+        return room | ({"label_selector": dict(self.labels)} if self.labels else {})
 
 
 def needs_of(entry: Entry, spec: Any, server: ServerSettings) -> Needs | None:
@@ -52,11 +59,11 @@ def needs_of(entry: Entry, spec: Any, server: ServerSettings) -> Needs | None:
     if not isinstance(scene, SceneSpec):
         return None
     found = estimate(RigModel.of(scene.rig), scene.settings, server)
-    name = scene.folder.name
+    name, labels = scene.folder.name, scene.nodes
     if entry is worker.main:
         gpu = 1.0 if scene.settings.device == "cuda" else 0.0
-        return Needs("worker", name, 1.0, gpu, round(1e6 * found.worker_mb))
+        return Needs("worker", name, 1.0, gpu, round(1e6 * found.worker_mb), labels)
     memory = round(1e6 * found.readers_mb / 2)
     if entry in (renderer.views, renderer.bulk):
-        return Needs(entry.__name__, name, READER_CPUS, 0.0, memory)
-    return Needs(entry.__module__.rpartition(".")[2], name, ASIDE_CPUS, 0.0, memory)
+        return Needs(entry.__name__, name, READER_CPUS, 0.0, memory, labels)
+    return Needs(entry.__module__.rpartition(".")[2], name, ASIDE_CPUS, 0.0, memory, labels)

@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import ray
 
 from client.wire import Cluster, Node, Waiting
 from server.cluster.needs import Needs
+
+RAYS_OWN = "ray.io/"
+"""Prefix of labels that Ray gives a node."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Of a process: the id of its node, None while it waits for one; since when, `time.monotonic`."""
+
+    needs: Needs
+    node: str | None = None
+    since: float = field(default_factory=time.monotonic)
 
 
 def all_nodes() -> list[dict[str, Any]]:
@@ -30,34 +44,39 @@ def is_lost(id: str) -> bool:
         return True
 
 
-def cluster_of(nodes: Sequence[Mapping[str, Any]], places: Mapping[str, tuple[Needs, str | None]]) -> Cluster:
-    """Nodes that are alive, and lost ones that had a process, with what they have.
+def cluster_of(
+    nodes: Iterable[Mapping[str, Any]], places: Collection[Place], *, lost: Collection[str] = (), answers: bool = True
+) -> Cluster:
+    """Nodes that are alive, were lost lately, or had a process, with what they have; and what waits.
 
     Args:
-        nodes: as Ray describes them. places: processes, with the id of their node; None: they wait for one.
+        nodes: as Ray describes them. places: of processes. lost: ids. answers: the head of the cluster does.
     """
     found = []
     for node in nodes:
-        own = [needs for needs, place in places.values() if place == node["NodeID"]]
-        if not (node["Alive"] or own):
+        own = [place.needs for place in places if place.node == node["NodeID"]]
+        if not (node["Alive"] or own or node["NodeID"] in lost):
             continue
         has = node["Resources"]
         found.append(
             Node(
                 id=node["NodeID"],
                 host=node["NodeManagerHostname"],
+                labels={name: value for name, value in node["Labels"].items() if not name.startswith(RAYS_OWN)},
                 alive=node["Alive"],
                 cpus=has.get("CPU", 0.0),
                 cpus_taken=round(sum(needs.cpus for needs in own), 3),
                 gpus=has.get("GPU", 0.0),
                 memory_mb=round(has.get("memory", 0.0) / 1e6, 1),
                 memory_taken_mb=round(sum(needs.memory for needs in own) / 1e6, 1),
-                scenes=sorted(needs.scene for needs in own if needs.role == "worker"),
+                scenes=sorted({needs.scene for needs in own if needs.role == "worker"}),
             )
         )
+    now = time.monotonic()
     waiting = [
-        Waiting(scene=needs.scene, role=needs.role, needs=needs.words())
-        for needs, place in places.values()
-        if place is None
+        Waiting(scene=needs.scene, role=needs.role, needs=needs.words(), seconds=round(now - place.since, 1))
+        for place in places
+        if place.node is None
+        for needs in (place.needs,)
     ]
-    return Cluster(placement="ray", nodes=found, waiting=waiting)
+    return Cluster(placement="ray", nodes=found, waiting=waiting, answers=answers)

@@ -8,8 +8,9 @@ import logging
 import os
 import secrets
 import socket
-from collections.abc import Callable, Coroutine
-from typing import Any
+from collections.abc import Callable, Coroutine, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
 
 import ray
 from ray.exceptions import RayActorError, RayError
@@ -19,7 +20,9 @@ from server.cluster.folder import check_folder
 from server.cluster.host import Gone, Host, Started
 from server.cluster.marks import mark
 from server.cluster.needs import Needs, needs_of
-from server.cluster.nodes import all_nodes, cluster_of, is_lost, living_nodes
+from server.cluster.nodes import Place, all_nodes, cluster_of, is_lost
+from server.cluster.services import announced, others
+from server.cluster.watch import NodeWatch
 from server.processes import worker
 from server.processes.messages import WaitsForNode
 from server.processes.placement import STOP_SECONDS, AnyProcess, Ended, Entry, Placement
@@ -30,8 +33,14 @@ WAIT_S = 3.0
 """A worker that is not placed after so long says what it waits for."""
 REACH_S = 5.0
 """The head of the cluster answers within so long."""
+LOST_S = 10.0
+"""The head says within so long whether a node is lost."""
+THREADS = 8
+"""That wait for the head at a time."""
 STOPPED_S = 5.0
 """An actor has so much longer than its process to say that this has ended."""
+
+T = TypeVar("T")
 
 log = logging.getLogger("scas4d.server")
 
@@ -44,19 +53,25 @@ class RayPlacement(Placement):
             RAY_ADDRESS. server: settings of the service; every node has to see its data folder at the same path.
 
     Attributes:
-        places: processes that were started and have not ended, by name of their actor, with the id of the node once it
-            is known.
+        places: of processes that were started and have not ended, by name of their actor.
     """
 
     fenced = True
+    has_siblings = True
+    has_labels = True
 
     def __init__(self, prepare: Callable[[], None] | None, address: str | None, server: ServerSettings) -> None:
         super().__init__(prepare)
-        self.places: dict[str, tuple[Needs, str | None]] = {}
+        self.places: dict[str, Place] = {}
+        # Of its own: the journals are written by those of the event loop, and the head of the cluster may not answer.
+        self._threads = ThreadPoolExecutor(THREADS, "ray")
+        self._watch = NodeWatch(all_nodes, threads=self._threads)
         self._address = address
         self._server = server
         self._token = secrets.token_hex(3)
         self._started = 0
+        self._announced: Any = None
+        self._siblings: Mapping[str, str] = {}
 
     async def open(self) -> None:
         """Joins the cluster, and checks that all nodes see the data folder.
@@ -85,15 +100,32 @@ class RayPlacement(Placement):
         data = self._server.data.resolve()
         await asyncio.to_thread(check_folder, data)
         await asyncio.to_thread(mark, data, self._token)
-        log.info("scenes run on a Ray cluster of %d nodes", len(living_nodes()))
+        await self._watch.look()
+        log.info("scenes run on a Ray cluster of %d nodes", sum(node["Alive"] for node in self._watch.nodes))
 
     async def cluster(self) -> Cluster:
         """See `Placement`."""
-        return cluster_of(await asyncio.to_thread(all_nodes), self.places)
+        watch = self._watch
+        await watch.look()
+        return cluster_of(watch.nodes, self.places.values(), lost=watch.lost, answers=watch.answers)
+
+    async def announce(self, host: str, port: int) -> None:
+        """See `Placement`: an actor has the address, and goes with this service."""
+        self._announced = await self.asked(announced, self._token, host, port)
+
+    async def siblings(self) -> Sequence[str]:
+        """See `Placement`; what was known before where the head does not answer."""
+        self._siblings = await self.asked(others, self._token, self._siblings)
+        return list(self._siblings.values())
+
+    def asked(self, function: Callable[..., T], *arguments: Any) -> asyncio.Future[T]:
+        """Calls what asks the head of the cluster, in a thread."""
+        return asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
 
     async def close(self) -> None:
         """Leaves the cluster; actors that are left end."""
         await asyncio.to_thread(ray.shutdown)
+        self._threads.shutdown(wait=False, cancel_futures=True)
 
     def start(
         self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[Ended], None]
@@ -105,7 +137,7 @@ class RayPlacement(Placement):
         self._started += 1
         epoch = spec.folder.epoch if entry is worker.main else self._started
         name = f"{needs.scene}.{needs.role}.{epoch}.{self._token}"
-        self.places[name] = needs, None
+        self.places[name] = Place(needs)
         return RayProcess(self, name, needs, (entry, spec), on_message, on_end)
 
     def host(self, name: str, needs: Needs) -> Any:
@@ -148,7 +180,7 @@ class RayProcess:
         self._over = False
         self._actor: Any = None
         loop = asyncio.get_running_loop()
-        self._making = loop.run_in_executor(None, placement.host, name, needs)
+        self._making: asyncio.Future[Any] = placement.asked(placement.host, name, needs)
         self._tasks: set[asyncio.Task[None]] = set()
         self._task = loop.create_task(self._run(*runs))
 
@@ -190,7 +222,7 @@ class RayProcess:
                         self._tell(message)
         except RayActorError as error:
             log.warning("actor %s is lost: %s", self._name, error)
-            if self._node is not None and await asyncio.to_thread(is_lost, self._node):
+            if self._node is not None and await self._is_lost(self._node):
                 self._end(Ended(None, f"the node of its {role} is lost", lost=True))
             else:
                 self._end(Ended(None, f"the actor of its {role} ended: {_first_line(error)}"))
@@ -213,12 +245,18 @@ class RayProcess:
         while not (await asyncio.wait([starting], timeout=WAIT_S))[0]:
             if self._needs.role == "worker" and not said:
                 said = True
-                self._tell(WaitsForNode(f"no node has room for its worker, which needs {self._needs.words()}"))
+                self._tell(WaitsForNode(f"its worker is not placed on a node yet; it needs {self._needs.words()}"))
         started: Started = starting.result()
         if started.fault is not None:
             raise _NotStarted(started.fault)
         self._pid, self._node = started.pid, started.node
-        self._placement.places[self._name] = self._needs, started.node
+        self._placement.places[self._name] = Place(self._needs, started.node)
+
+    async def _is_lost(self, node: str) -> bool:
+        try:
+            return await asyncio.wait_for(self._placement.asked(is_lost, node), LOST_S)
+        except TimeoutError:  # the head does not say
+            return True
 
     def _tell(self, message: Any) -> None:
         try:
@@ -243,7 +281,7 @@ class RayProcess:
 
     async def _kill(self) -> None:
         with contextlib.suppress(RayError, ValueError, OSError):
-            await asyncio.to_thread(ray.kill, await asyncio.shield(self._making))
+            await self._placement.asked(ray.kill, await asyncio.shield(self._making))
 
     def _beside(self, coroutine: Coroutine[Any, Any, None]) -> None:
         task = asyncio.get_running_loop().create_task(coroutine)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import shutil
+from collections import Counter as Counts
 from collections.abc import Iterator, Mapping, Sequence
 
 from prometheus_client import CollectorRegistry, Counter, Histogram
 from prometheus_client.core import GaugeMetricFamily, Metric
 
-from client.wire import SceneState, SceneStatus
+from client.wire import Cluster, SceneState, SceneStatus
 from scas4d_core.frame_outcome import AlarmKind
 from server.connections.refusals import Refusal
 from server.settings import ServerSettings
@@ -94,7 +95,7 @@ for process in ("worker", "reader"):
 
 
 class State:
-    """Gauges of a service: scenes, queues, subscribers, disk."""
+    """Gauges of a service: scenes, queues, subscribers, disk, and the cluster if it has one."""
 
     def __init__(
         self,
@@ -103,12 +104,14 @@ class State:
         hub: Hub,
         ready_after: float | None,
         connections: Mapping[str, int],
+        cluster: Cluster | None = None,
     ) -> None:
         self.settings = settings
         self.scenes = scenes
         self.hub = hub
         self.ready_after = ready_after
         self.connections = connections
+        self.cluster = cluster
 
     def collect(self) -> Iterator[Metric]:
         """Yields the gauges as they are now."""
@@ -144,3 +147,33 @@ class State:
         if self.ready_after is not None:
             help = "From the start of the service until its kernels were warmed up."
             yield GaugeMetricFamily("scas4d_ready_after_seconds", help, value=self.ready_after)
+        if self.cluster is not None:
+            yield from of_cluster(self.cluster)
+
+
+def of_cluster(cluster: Cluster) -> Iterator[Metric]:
+    """Yields the gauges of nodes, as far as the head of the cluster tells of them, and what this service has there."""
+    yield GaugeMetricFamily("scas4d_cluster_up", "1 while the head of the cluster answers.", value=cluster.answers)
+    nodes = cluster.nodes if cluster.answers else []
+    for name, help, field, unit in (
+        ("scas4d_node_up", "1 for a node that is alive, 0 for one that was lost lately.", "alive", 1),
+        ("scas4d_node_cpus", "CPUs of a node.", "cpus", 1),
+        ("scas4d_node_cpus_taken", "CPUs of a node that scenes take, by their estimates.", "cpus_taken", 1),
+        ("scas4d_node_memory_bytes", "Memory of a node.", "memory_mb", 1e6),
+        ("scas4d_node_memory_taken_bytes", "Memory that scenes take, by their estimates.", "memory_taken_mb", 1e6),
+    ):
+        gauge = GaugeMetricFamily(name, help, labels=["node", "host"])
+        for node in nodes:
+            if node.alive or field == "alive":
+                gauge.add_metric([node.id, node.host], unit * getattr(node, field))
+        yield gauge
+    places = GaugeMetricFamily("scas4d_scene_node", "1 for the node of a scene's worker.", labels=["scene", "node"])
+    for node in cluster.nodes:
+        for scene in node.scenes:
+            places.add_metric([scene, node.id], 1)
+    yield places
+    help = "Processes of scenes that wait for a node, or are about to start, by what they do."
+    waiting = GaugeMetricFamily("scas4d_processes_waiting", help, labels=["role"])
+    for role, count in {"worker": 0, **Counts(one.role for one in cluster.waiting)}.items():
+        waiting.add_metric([role], count)
+    yield waiting

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from pathlib import Path
@@ -23,6 +24,8 @@ class SceneSpec:
     minimum_cameras: int = 1
     kept: IngestSettings = field(default_factory=IngestSettings)
     frames_per_second: float | None = None
+    nodes: Mapping[str, str] = field(default_factory=dict)
+    """Labels that a node must have to run them."""
 
 
 # To the worker.

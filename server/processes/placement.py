@@ -14,7 +14,7 @@ import queue
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection
 from typing import Any, NoReturn, Protocol
 
@@ -202,9 +202,13 @@ class Placement:
 
     Attributes:
         fenced: workers get epochs (`server.storage.fencing`): one may go on after it was taken for dead.
+        has_siblings: other services may have scenes of the same cluster.
+        has_labels: it runs processes on nodes that have labels, of which a scene may ask for some.
     """
 
     fenced = False
+    has_siblings = False
+    has_labels = False
 
     def __init__(self, prepare: Callable[[], None] | None = None) -> None:
         self.prepare = prepare
@@ -225,6 +229,13 @@ class Placement:
     async def cluster(self) -> Cluster | None:
         """The machines on which processes run; None: this one alone."""
         return None
+
+    async def announce(self, host: str, port: int) -> None:
+        """Tells other services of the cluster where this one listens."""
+
+    async def siblings(self) -> Sequence[str]:
+        """Addresses of the other services of the cluster, as `http://10.0.0.2:8000`."""
+        return ()
 
     async def open(self) -> None:
         """Makes ready to start processes; called once, before any."""

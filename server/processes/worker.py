@@ -84,7 +84,8 @@ def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
         pass
     # Numerical libraries keep threads that can hang at exit, and all that matters is on disk.
     logging.shutdown()
-    lock.release()
+    if lock is not None:
+        lock.release()
     os._exit(0)
 
 

@@ -20,6 +20,8 @@ async def metrics(request: Request, scenes: AllScenes, settings: TheSettings) ->
     readiness: Readiness = request.app.state.readiness
     gauges = CollectorRegistry()
     state, guard = request.app.state, request.app.state.guard
-    gauges.register(counted.State(settings, scenes.statuses(), state.hub, readiness.after, guard.counts()))
+    cluster = await scenes.placement.cluster()
+    found = counted.State(settings, scenes.statuses(), state.hub, readiness.after, guard.counts(), cluster)
+    gauges.register(found)
     text = generate_latest(counted.registry) + generate_latest(gauges)
     return Response(text, media_type=CONTENT_TYPE_PLAIN_0_0_4)

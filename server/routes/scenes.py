@@ -14,10 +14,12 @@ from scas4d_core.rig_checks import RigError, check_scene
 from scas4d_core.settings import Settings
 from server.health import devices, estimate
 from server.http import validation
-from server.http.permissions import ALL, PERMISSION
+from server.http.permissions import ALL, PERMISSION, Permission
 from server.problems import Problem, of_rig
+from server.processes.placement import Placement
 from server.routes.access import AllExports, AllScenes, SceneId, TheRecord, TheScene, TheSettings
 from server.settings import ServerSettings
+from server.siblings.siblings import PASSED, Siblings
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
@@ -55,6 +57,18 @@ def check_rig(request: SceneCreate, settings: Settings) -> None:
         raise Problem(422, error.fault, field=field, value=unit, remedy=error.remedy) from None
 
 
+def check_nodes(request: SceneCreate, placement: Placement) -> None:
+    """Refuses labels of nodes where scenes run on the service's own machine alone."""
+    if request.nodes and not placement.has_labels:
+        raise Problem(
+            422,
+            "this service runs all scenes on its own machine, which has no labels",
+            field="nodes",
+            value=request.nodes,
+            remedy="leave it out, or run the service on a cluster: scas4d serve --placement ray",
+        )
+
+
 async def check_settings(request: SceneCreate, settings: Settings, server: ServerSettings) -> None:
     """Refuses settings that cannot work with the rig or on this machine."""
     check_rig(request, settings)
@@ -76,6 +90,7 @@ async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, r
                 value=f"{camera.width}x{camera.height}",
                 remedy="send smaller pictures with the intrinsics to match, or raise SCAS4D_MAX_IMAGE_PIXELS",
             )
+    check_nodes(request, scenes.placement)
     await check_settings(request, settings, server)
     scene = await scenes.create(request, settings)
     response.headers["Location"] = f"/v1/scenes/{scene.id}"
@@ -83,11 +98,21 @@ async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, r
 
 
 @router.get("")
-async def listed(scenes: AllScenes, request: Request) -> SceneList:
-    """Lists all scenes, and wakes none; a link has its own alone. 503 while those of an earlier run are recovered."""
+async def listed(scenes: AllScenes, request: Request, response: Response) -> SceneList:
+    """Lists all scenes, and wakes none; a link has its own alone. 503 while those of an earlier run are recovered.
+
+    On a cluster those of its other services are among them; X-Unreachable names the services that do not answer.
+    """
     scenes.recovering.check()
-    only = request.scope.get(PERMISSION, ALL).scene
-    return SceneList(scenes=[status for status in scenes.statuses() if only in (None, status.id)])
+    permission: Permission = request.scope.get(PERMISSION, ALL)
+    found = scenes.statuses()
+    siblings: Siblings | None = request.app.state.siblings
+    if siblings is not None and PASSED not in request.headers:
+        others, silent = await siblings.scenes(permission)
+        found = sorted([*found, *others], key=lambda status: status.created)
+        if silent:
+            response.headers["X-Unreachable"] = ", ".join(silent)
+    return SceneList(scenes=[status for status in found if permission.scene in (None, status.id)])
 
 
 @router.get("/{id}")

@@ -5,18 +5,19 @@ from __future__ import annotations
 import time
 from datetime import UTC, datetime
 
-from fastapi import APIRouter
+from fastapi import APIRouter, Request
 
 from client.wire import Share, ShareRequest
 from server.http.sharing import Sharing
 from server.problems import Problem
 from server.routes.access import AllScenes, TheSettings
+from server.siblings.siblings import Siblings
 
 router = APIRouter(prefix="/v1/shares", tags=["service"])
 
 
 @router.post("", status_code=201)
-async def share(request: ShareRequest, scenes: AllScenes, settings: TheSettings) -> Share:
+async def share(request: ShareRequest, scenes: AllScenes, settings: TheSettings, asked: Request) -> Share:
     """Makes a token that may only read, of one scene or of all, and the address at which the page shows it.
 
     It cannot be taken back: it ends by itself, or with the token of the service.
@@ -30,7 +31,9 @@ async def share(request: ShareRequest, scenes: AllScenes, settings: TheSettings)
             remedy="start it with SCAS4D_TOKEN; then others need a token, or a link",
         )
     if request.scene is not None:
-        scenes.status(request.scene)  # 404 where there is none
+        siblings: Siblings | None = asked.app.state.siblings
+        if request.scene in scenes or siblings is None or await siblings.owner(request.scene) is None:
+            scenes.status(request.scene)  # 404 where there is none
     end = int(time.time() + request.seconds)
     token = Sharing(secret).issue(request.scene, end)
     shown = f"scene={request.scene}&" if request.scene is not None else ""

@@ -26,6 +26,10 @@ class Recovering:
         self._left: list[str] = []
         self._task: asyncio.Task[None] | None = None
 
+    def __contains__(self, id: str) -> bool:
+        """Returns whether a scene was found, and is not recovered yet."""
+        return id in self._left
+
     async def begin(self) -> None:
         """Lists the scenes; a journal may be that of a day, so they are read in the background."""
         self._left = await asyncio.to_thread(self._folders)

@@ -80,7 +80,7 @@ class Scene:
         )
         kept = content.ledger.edited.rules(asked)
         least, rate = self.rules.minimum_cameras, definition.request.frames_per_second
-        self.spec = SceneSpec(folder, rig, definition.settings, least, kept, rate)
+        self.spec = SceneSpec(folder, rig, definition.settings, least, kept, rate, definition.request.nodes)
         self.points_sha256 = found.points_sha256
         self.warnings = found.warnings
         self._definition = definition

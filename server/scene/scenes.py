@@ -77,6 +77,9 @@ class Scenes:
         """Number of scenes, awake or asleep."""
         return len(self.by_id.keys() | self.asleep.keys())
 
+    def __contains__(self, id: str) -> bool:
+        return any(id in known for known in (self.by_id, self.asleep, self.unreadable, self.recovering))
+
     def statuses(self) -> list[SceneStatus]:
         """The status of every scene that is recovered, oldest first; none is woken."""
         found = [(scene.created, scene.status) for id, scene in self.asleep.items() if id not in self.by_id]

@@ -123,6 +123,7 @@ class SceneFacts:
             warnings=[*self.warnings, *first_warnings(self.first), *timing_warnings(newest.get("timing"))],
             created=self.definition.created.isoformat(),
             ingest=ledger.edited.rules(request.ingest),
+            nodes=request.nodes,
             settings=settings.model_dump(mode="json"),
             budget=ledger.budgets[-1][1],
         )

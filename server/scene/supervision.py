@@ -35,7 +35,10 @@ OTHER_DEATHS = 6
 """A frame is set aside after so many deaths from outside, too: something is wrong with it all the same."""
 FIRST_DELAY_S, LONGEST_DELAY_S = 0.5, 30.0
 
-SWEEP_AFTER_S = 60.0
+LOST_AT_ONCE = 3
+"""Machines that are lost one after another without a pause; a frame may be what takes them down."""
+
+SWEEP_AFTER_S = 120.0
 """The states of a worker that was given up are kept for so long: NFS shows a link as it was for up to a minute."""
 
 UPDATES_KEPT = 8
@@ -67,7 +70,7 @@ class WorkerDeaths:
 
     def __init__(self) -> None:
         self.count = 0
-        self._in_a_row = 0
+        self._in_a_row = self._lost_in_a_row = 0
         self._oom_kills = oom_kills()
 
     def started(self) -> None:
@@ -76,10 +79,10 @@ class WorkerDeaths:
 
     def committed(self) -> None:
         """Notes that the worker works: it has committed a frame."""
-        self._in_a_row = 0
+        self._in_a_row = self._lost_in_a_row = 0
 
     def died(self, exit_code: int | None, *, lost: bool = False) -> tuple[bool, float]:
-        """Notes that the worker is gone; `lost`: with its machine, and another one is waited for no longer than once.
+        """Notes that the worker is gone; `lost`: with its machine, and another one is waited for less.
 
         Returns:
             True where it died by its own doing (it exited, or by a signal that only a fault of its own sends, or it was
@@ -89,7 +92,8 @@ class WorkerDeaths:
         own = own or oom_kills() > self._oom_kills
         self.count += 1
         if lost:
-            return False, FIRST_DELAY_S
+            self._lost_in_a_row += 1
+            return False, min(LONGEST_DELAY_S, FIRST_DELAY_S * 2 ** max(0, self._lost_in_a_row - LOST_AT_ONCE))
         delay = min(LONGEST_DELAY_S, FIRST_DELAY_S * 2**self._in_a_row)
         self._in_a_row += 1
         return own, delay
@@ -138,6 +142,8 @@ class WorkerProcess:
         self._process: AnyProcess | None = None
         self._next: asyncio.TimerHandle | None = None
         self._closed = False
+        self._ends = False
+        """It has ended, and when the next starts is not said yet."""
         self._epoch: int | None = None
         self._fencing: asyncio.Task[None] | None = None
         """Begins an epoch for the next process."""
@@ -149,7 +155,7 @@ class WorkerProcess:
 
     def start(self) -> None:
         """Starts the process, unless it runs, is about to, or the scene ends."""
-        if self._process is None and self._fencing is None and self._next is None and not self._closed:
+        if not (self._process or self._fencing or self._next or self._ends or self._closed):
             # Once a folder has epochs, a worker on another machine may go on that was taken for dead.
             if self._placement.fenced or self.spec.folder.states.is_symlink():
                 self._fencing = asyncio.get_running_loop().create_task(self._start_fenced())
@@ -161,13 +167,14 @@ class WorkerProcess:
         folder = self.spec.folder
         try:
             epoch = await asyncio.to_thread(begin_epoch, folder.states, folder.worker_lock)
-        except (OSError, FencingError) as error:
-            self._fencing = None
+            if not self._closed:
+                self._start(replace(self.spec, folder=replace(folder, epoch=epoch)))
+        except Exception as error:  # whatever it is, the scene must not stand still
+            if not isinstance(error, OSError | FencingError):
+                log.exception("scene %s", folder.name)
             self._gone(Ended(None, f"the committed states cannot be taken over: {message_of(error)}"))
-            return
-        self._fencing = None
-        if not self._closed:
-            self._start(replace(self.spec, folder=replace(folder, epoch=epoch)))
+        finally:
+            self._fencing = None
 
     def _start(self, spec: SceneSpec) -> None:
         self.deaths.started()
@@ -184,7 +191,8 @@ class WorkerProcess:
             log.info("scene %s: removed %s, of workers before", self.spec.folder.name, ", ".join(names))
 
     def start_in(self, seconds: float) -> None:
-        """Starts the next process after so long."""
+        """Starts the next process after so long; to be called at each end."""
+        self._ends = False
         if not self._closed:
             self._next = asyncio.get_running_loop().call_later(seconds, self._again)
 
@@ -216,6 +224,7 @@ class WorkerProcess:
     def _gone(self, reason: Ended) -> None:
         self.ready, self.life, self._process = False, None, None
         if not self._closed:
+            self._ends = True
             self._ended(reason)
 
 

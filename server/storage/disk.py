@@ -82,15 +82,19 @@ def lock_data(data: Path) -> FolderLock:
         ) from None
 
 
-def alone(folder: SceneFolder) -> FolderLock:
+def alone(folder: SceneFolder) -> FolderLock | None:
     """Sees to it that no other worker commits to a scene: waits for its end.
 
-    With an epoch there is nothing to wait for: one on another machine may stop while it holds the lock, and commits to
-    a folder of its own (`server.storage.fencing`).
+    With an epoch there is nothing to wait for and no lock: one on another machine may stop while it holds one, and
+    commits to a folder of its own (`server.storage.fencing`).
     """
     path = folder.worker_lock
     if folder.epoch is not None:
-        path.unlink(missing_ok=True)  # this is another file
+        beside = path.with_name(f"{path.name}.{folder.epoch}")
+        with contextlib.suppress(OSError):
+            beside.write_text(f"{os.getpid()}\n")
+            beside.replace(path)
+        return None
     # A service that was killed leaves a worker in the middle of an update: two must not commit to one history.
     lock = FolderLock(path, wait=True)
     with contextlib.suppress(OSError):  # a full disk is no reason not to work

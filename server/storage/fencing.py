@@ -28,6 +28,8 @@ MARK = ".epoch"
 """A file in each folder of an epoch: a folder that has it cannot be replaced by another of the same epoch."""
 PASSES = 20
 """Times that a folder is linked which changes meanwhile: whoever writes to it is at work still."""
+MOST_KEPT = 5
+"""Folders of epochs that are kept while worker after worker ends before it works."""
 LOCAL_S = 10.0
 """A worker of this machine whose service was killed ends within so long."""
 
@@ -73,7 +75,13 @@ def begin_epoch(states: Path, lock: Path) -> int:
     before = epoch_read(states)
     epoch = 1 + max((epoch for _, epoch in _folders(states)), default=-1)
     _take_over(states, epoch, before)
-    _point(states, epoch)
+    try:
+        _point(states, epoch)
+    except OSError:
+        shutil.rmtree(epoch_folder(states, epoch), ignore_errors=True)
+        raise
+    for early in sorted(epochs(states))[:-MOST_KEPT]:  # `sweep` waits for a worker that works
+        shutil.rmtree(epoch_folder(states, early), ignore_errors=True)
     return epoch
 
 
@@ -82,6 +90,8 @@ def sweep(states: Path, epoch: int) -> list[str]:
     gone = [path for path, number in _folders(states) if number < epoch]
     for path in gone:
         shutil.rmtree(path, ignore_errors=True)
+    for link in states.parent.glob(f".{states.name}.*.link"):
+        link.unlink(missing_ok=True)
     return sorted(path.name for path in gone)
 
 

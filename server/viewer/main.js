@@ -3,6 +3,7 @@
 import { Manage } from "./manage.js";
 import { listenToKeys } from "./keys.js";
 import { $, curtain, inOrder, node, note, page, sentence } from "./page.js";
+import { ClusterView } from "./panels/cluster.js";
 import { Figures } from "./panels/figures.js";
 import { showCameras, showEffects, showFacts, showQueue, showWarnings } from "./panels/facts.js";
 import { PartList } from "./panels/parts.js";
@@ -47,7 +48,8 @@ const figures = new Figures((index) => timeline.choose(index));
 const tradeoff = new Tradeoff($);
 const takeAway = new TakeAway();
 const manage = new Manage(showStatus, letGo);
-const list = new SceneList(openScene);
+const list = new SceneList(openScene, () => cluster.appear());
+const cluster = new ClusterView((id) => list.called(id), (id) => list.choose(id));
 
 // A scene.
 

@@ -28,9 +28,9 @@ const called = (scene) => (scene.name ? `${scene.name} (${scene.id.slice(0, 6)})
 const beside = (scene) => (scene.state === "failed" ? " · failed" : scene.archived ? " · archived" : scene.asleep ? " · asleep" : "");
 
 export class SceneList {
-  /** @param open opens a scene by its status in the list */
-  constructor(open) {
-    this.open = open;
+  /** @param open opens a scene by its status in the list; listed: called whenever the service has told its scenes */
+  constructor(open, listed) {
+    Object.assign(this, { open, listed });
     takeToken();
     this.gone = false; // the scene that was open is not there any more: what was said of it stays
     $("scenes").addEventListener("change", (event) => this.choose(event.target.value));
@@ -49,6 +49,7 @@ export class SceneList {
       return;
     }
     this.scenes = scenes;
+    this.listed();
     const chosen = page.scene ?? wanted().scene;
     this.draw(scenes);
     const there = scenes.find((scene) => scene.id === chosen) ?? (this.gone || chosen ? null : scenes.at(-1));
@@ -78,6 +79,12 @@ export class SceneList {
     if (id === page.scene) return;
     this.gone = false;
     this.open(this.scenes.find((scene) => scene.id === id) ?? { id });
+  }
+
+  /** The name of a scene; its id where it has none, or is not listed. */
+  called(id) {
+    const scene = (this.scenes ?? []).find((one) => one.id === id);
+    return scene ? called(scene) : id;
   }
 
   /** Buttons for all scenes but one. */

@@ -18,6 +18,8 @@ export const token = {
   forget: () => sessionStorage.removeItem(KEY),
   /** Whether the bearer may look and not change anything. */
   reads: () => sessionStorage.getItem(KEY)?.startsWith("scas4d.read.") ?? false,
+  /** Whether the bearer may look at one scene alone; a token that reads all has a star in place of the scene. */
+  readsOne: () => token.reads() && !sessionStorage.getItem(KEY).startsWith("scas4d.read.*."),
 };
 
 /** Sends a request; returns the answer, whatever media type it has. */

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import shutil
 import threading
 import time
 from collections import Counter
@@ -22,7 +23,8 @@ Run = Callable[[Study, Sequence[str]], list[ScenarioResult]]
 
 GOES_ON_S = 30.0
 """A scene works again so soon after its node is gone."""
-SWEPT_S = 90.0
+HEAD_GONE_S = 10.0
+SWEPT_S = 180.0
 """Folders of workers before are gone after so long."""
 
 
@@ -112,6 +114,47 @@ def stopped_node(
         service.stop()
 
 
+def restarted_head(
+    study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo
+) -> ScenarioResult:
+    """`kill -9` of the cluster's head during an update; it comes back after a while, with what Redis kept."""
+    service = study.service("head")
+    service.start()
+    scene = study.create(service)
+    sender = FrameSender(study, service, scene)
+    half = len(study.frames) // 2
+    try:
+        for index in range(half):
+            sender.send(index)
+        service.finish(scene, half)
+        sending = threading.Thread(target=_send, args=(sender, range(half, len(study.frames))))
+        sending.start()
+        time.sleep(0.5 * update_s)
+        before = service.status(scene).committed
+        nodes.stop_head()
+        time.sleep(HEAD_GONE_S)
+        without = service.status(scene).committed - before
+        echo(f"{without} frames committed in {HEAD_GONE_S:g} s without a head")
+        nodes.start_head()
+        sending.join()
+        service.finish(scene, len(study.frames))
+        deaths = service.status(scene).worker_deaths
+        node = _node_of(service, nodes, scene)
+        nodes.kill(node)  # whether the head that came back places and watches
+        nodes.add()
+        _until(lambda: service.status(scene).worker_deaths > deaths, "a lost node was not noticed")
+        _until(lambda: service.worker_pid(scene) is not None, "the scene was not placed again")
+        faults = sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
+        found = (
+            f"{without} frames committed meanwhile, {deaths} workers lost; then a node was killed, and its scene "
+            f"placed on another; {len(expected)} states compared"
+        )
+        target = "0 acknowledged frames lost, final state bit-identical, scenes are placed again afterwards"
+        return ScenarioResult(f"the head killed, back after {HEAD_GONE_S:g} s (Redis)", target, found, faults)
+    finally:
+        service.stop()
+
+
 def _node_of(service: Service, nodes: Nodes, scene: str, killed: Counter[int] | None = None) -> int:
     """The node of the scene's worker, as soon as there is one.
 
@@ -131,6 +174,11 @@ def _node_of(service: Service, nodes: Nodes, scene: str, killed: Counter[int] | 
     raise StudyError("the scene's worker is on no node")
 
 
+def _send(sender: FrameSender, indices: range) -> None:
+    for index in indices:
+        sender.send(index)
+
+
 def _works(service: Service, scene: str) -> bool:
     """True where the worker has a frame again, or nothing left to do."""
     status = service.status(scene)
@@ -147,6 +195,8 @@ def _until(done: Callable[[], bool], fault: str) -> None:
 
 ON_NODES = ("nodes", "stopped")
 """Scenarios of nodes by name."""
+OF_THE_HEAD = "head"
+"""That of a head which has Redis, in a cluster of its own."""
 AS_LOCALLY = ("kills", "beginnings", "log", "bits")
 """Scenarios that run as on one machine; a full disk and strangers are the service's own, wherever workers run."""
 
@@ -158,11 +208,22 @@ def run(study: Study, *, count: int, seed: int, parts: Sequence[str], local: Run
         count: of kills. local: runs scenarios by name, over a study whose service is on the cluster.
     """
     outcomes = []
+    if set(parts) & {*ON_NODES, OF_THE_HEAD}:
+        expected, update_s = undisturbed(study)
+        echo(f"undisturbed, on one machine: {len(expected)} states, {update_s:.2f} s an update")
+    if OF_THE_HEAD in parts:
+        if (redis_server := shutil.which("redis-server")) is not None:
+            with Nodes(redis_server=redis_server) as nodes:
+                outcomes.append(restarted_head(_on(study, nodes), nodes, expected, update_s, echo))
+        elif len(parts) == 1:
+            raise StudyError("part head needs redis-server: apt-get install redis-server")
+        else:
+            echo("part head is left out: it needs redis-server")
+    if not set(parts) & {*ON_NODES, *AS_LOCALLY}:
+        return outcomes
     with Nodes() as nodes:
-        there = replace(study, environment={**study.environment, "SCAS4D_PLACEMENT": f"ray={nodes.address}"})
+        there = _on(study, nodes)
         if set(parts) & set(ON_NODES):
-            expected, update_s = undisturbed(study)
-            echo(f"undisturbed, on one machine: {len(expected)} states, {update_s:.2f} s an update")
             if "nodes" in parts:
                 outcomes.append(killed_nodes(there, nodes, expected, update_s, count, seed, echo))
             if "stopped" in parts:
@@ -170,3 +231,7 @@ def run(study: Study, *, count: int, seed: int, parts: Sequence[str], local: Run
         if others := [part for part in parts if part in AS_LOCALLY]:
             outcomes += local(there, others)
     return outcomes
+
+
+def _on(study: Study, nodes: Nodes) -> Study:
+    return replace(study, environment={**study.environment, "SCAS4D_PLACEMENT": f"ray={nodes.address}"})

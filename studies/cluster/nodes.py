@@ -5,13 +5,17 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
-from collections.abc import Iterator
+import socket
+import subprocess
+import time
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 HEALTH = {"period_ms": 1000, "timeout_ms": 2000, "failure_threshold": 3, "initial_delay_ms": 1000}
 """Ray's checks of its nodes: one that does not answer is lost after 3 to 9 s (defaults: about a minute)."""
+REDIS, REDIS_S = "RAY_REDIS_ADDRESS", 10.0
 STORE_BYTES = 80 * 2**20
 """Of a node's object store, which scenes do not use."""
 
@@ -20,15 +24,17 @@ class Nodes:
     """A head without room for scenes, and some nodes beside.
 
     Args:
-        count: of nodes beside the head. cpus: of each.
+        count: of nodes beside the head. cpus: of each. redis_server: program of that name, which keeps what the head
+            knows; None: its memory does.
 
     Attributes:
         address: of the head, for `--placement ray=ADDRESS`.
     """
 
-    def __init__(self, count: int = 3, cpus: float = 2) -> None:
+    def __init__(self, count: int = 3, cpus: float = 2, redis_server: str | None = None) -> None:
         from ray.cluster_utils import Cluster
 
+        self._redis = None if redis_server is None else _redis(redis_server)
         os.environ.update({f"RAY_health_check_{name}": str(value) for name, value in HEALTH.items()})
         self._cpus = cpus
         self._cluster: Any = Cluster(
@@ -49,10 +55,16 @@ class Nodes:
         for pid in tuple(self._nodes):
             self.resume(pid)
         self._cluster.shutdown()
+        if self._redis is not None:
+            self._redis.kill()
+            self._redis.wait()
+            del os.environ[REDIS]
 
-    def add(self) -> int:
-        """Adds a node; returns the process id of its raylet."""
-        node = self._cluster.add_node(num_cpus=self._cpus, object_store_memory=STORE_BYTES)
+    def add(self, labels: Mapping[str, str] | None = None) -> int:
+        """Adds a node, with labels; returns the process id of its raylet."""
+        node = self._cluster.add_node(
+            num_cpus=self._cpus, object_store_memory=STORE_BYTES, labels=dict(labels) if labels else None
+        )
         pid = int(node.all_processes["raylet"][0].process.pid)
         self._nodes[pid] = node
         return pid
@@ -79,10 +91,37 @@ class Nodes:
         for pid in (node, *_below(node)):
             _signal(pid, signal.SIGSTOP)
 
+    def stop_head(self) -> None:
+        """`kill -9` of the head's process."""
+        self._cluster.head_node.kill_gcs_server()
+
+    def start_head(self) -> None:
+        """Starts it again, at its address."""
+        self._cluster.head_node.start_gcs_server()
+
     def resume(self, node: int) -> None:
         """SIGCONT, its processes first: they have a moment before their raylet learns that it was given up."""
         for pid in (*reversed(_below(node)), node):
             _signal(pid, signal.SIGCONT)
+
+
+def _redis(program: str) -> subprocess.Popen[bytes]:
+    """A server of Redis in memory; Ray finds it by the environment."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    started = subprocess.Popen(
+        [program, "--port", str(port), "--bind", "127.0.0.1", "--save", "", "--appendonly", "no"],
+        stdout=subprocess.DEVNULL,
+    )
+    until = time.monotonic() + REDIS_S
+    while True:
+        with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1):
+            os.environ[REDIS] = f"127.0.0.1:{port}"
+            return started
+        if time.monotonic() > until:
+            raise TimeoutError(f"{program} does not listen after {REDIS_S:g} s")
+        time.sleep(0.05)
 
 
 def _signal(pid: int, number: signal.Signals) -> None:

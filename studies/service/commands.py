@@ -32,8 +32,8 @@ def faults(
     part: Annotated[
         list[str] | None,
         typer.Option(
-            help="Only this: kills, beginnings, log, disk, bits or strangers; on a cluster nodes, stopped, kills, "
-            "beginnings, log or bits. May be repeated."
+            help="Only this: kills, beginnings, log, disk, bits or strangers; on a cluster nodes, stopped, "
+            "head (needs redis-server), kills, beginnings, log or bits. May be repeated."
         ),
     ] = None,
     placement: Annotated[str, typer.Option(help="`ray`: on a Ray cluster of three nodes, on this machine.")] = "local",
@@ -61,7 +61,9 @@ def faults(
     need_server()
     if placement not in ("local", "ray"):
         raise typer.BadParameter(f"there is no placement {placement!r}; give local or ray", param_hint="--placement")
-    known = of_faults.PARTS if placement == "local" else (*of_nodes.ON_NODES, *of_nodes.AS_LOCALLY)
+    known = (
+        of_faults.PARTS if placement == "local" else (*of_nodes.ON_NODES, of_nodes.OF_THE_HEAD, *of_nodes.AS_LOCALLY)
+    )
     if unknown := set(part or []) - set(known):
         raise typer.BadParameter(f"there is no part {sorted(unknown)[0]!r}; the parts are {', '.join(known)}")
     opened = open_source(capture)

@@ -7,7 +7,7 @@ import shutil
 
 import browser_engine
 import pytest
-from browser_page import FRAMES, push, start_scene
+from browser_page import FRAMES, SIZES, push, start_scene
 from running import Running, fake_settings
 
 from client.sdk import Client
@@ -42,6 +42,20 @@ def page(chromium):
     opened.on("console", lambda message: opened.faults.append(message.text) if message.type == "error" else None)
     yield opened
     opened.close()
+
+
+@pytest.fixture(params=SIZES)
+def sized(request, chromium):
+    """A page of a size, with a finger on the phone; faults that the test does not expect fail it."""
+    phone = request.param == "phone"
+    context = chromium.new_context(viewport=SIZES[request.param], has_touch=phone, is_mobile=phone)
+    page = context.new_page()
+    page.set_default_timeout(20_000)
+    page.size, page.faults = request.param, []
+    page.on("pageerror", lambda error: page.faults.append(str(error)))
+    page.on("console", lambda message: page.faults.append(message.text) if message.type == "error" else None)
+    yield page
+    context.close()
 
 
 @pytest.fixture(scope="session")

@@ -5,47 +5,15 @@
 
 from __future__ import annotations
 
-import os
 from contextlib import contextmanager
-from pathlib import Path
 
 import browser_engine
 import fakes
-import pytest
-from browser_page import opened, push, shown, start_scene, until
+from browser_page import SIZES, looked_at, opened, push, shown, start_scene, until
 from running import Running, fake_settings
 from sending import wait_for
 
 from client.sdk import Client
-
-SIZES = {"desk": {"width": 1440, "height": 900}, "phone": {"width": 390, "height": 844}}
-SERIOUS = ("serious", "critical")
-
-
-@pytest.fixture(params=SIZES)
-def sized(request, chromium):
-    """A page of a size, with a finger on the phone; faults that the test does not expect fail it."""
-    phone = request.param == "phone"
-    context = chromium.new_context(viewport=SIZES[request.param], has_touch=phone, is_mobile=phone)
-    page = context.new_page()
-    page.set_default_timeout(20_000)
-    page.size, page.faults = request.param, []
-    page.on("pageerror", lambda error: page.faults.append(str(error)))
-    page.on("console", lambda message: page.faults.append(message.text) if message.type == "error" else None)
-    yield page
-    context.close()
-
-
-def looked_at(page, name, faults=()):
-    """Keeps a screenshot, and checks what holds in every state."""
-    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="pip install axe-playwright-python")
-    if folder := os.environ.get("SCAS4D_TEST_PICTURES"):
-        page.screenshot(path=str(Path(folder) / f"{name}-{page.size}.png"))
-    found = axe.Axe().run(page).response["violations"]
-    serious = [(one["id"], [node["html"][:200] for node in one["nodes"]]) for one in found if one["impact"] in SERIOUS]
-    assert serious == []
-    assert page.evaluate("document.documentElement.scrollWidth") <= SIZES[page.size]["width"]
-    assert [fault for fault in page.faults if not any(part in fault for part in faults)] == []
 
 
 def title(page, words):

@@ -12,6 +12,7 @@ import pytest
 import yaml
 from prometheus_client import Metric
 
+from client.wire import Cluster, Node
 from server.health import metrics
 from server.settings import ServerSettings
 from server.stream.hub import Hub
@@ -36,7 +37,10 @@ def families(tmp_path_factory: pytest.TempPathFactory) -> list[Metric]:
     for outcome in ("answered", "failed", "cancelled"):  # `Readers.ask`
         metrics.ANSWER_SECONDS.labels("render", outcome)
     settings = ServerSettings(data=tmp_path_factory.mktemp("data"))
-    state = metrics.State(settings, [], Hub(1), 1.0, {"idle": 0})
+    room = {"cpus": 8, "cpus_taken": 1, "gpus": 0, "memory_mb": 16_000, "memory_taken_mb": 700}
+    node = Node(id="n", host="h", alive=True, scenes=["s"], **room)
+    cluster = Cluster(placement="ray", nodes=[node], waiting=[])
+    state = metrics.State(settings, [], Hub(1), 1.0, {"idle": 0}, cluster)
     return [*metrics.registry.collect(), *state.collect()]
 
 

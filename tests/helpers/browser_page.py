@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import base64
 import io
+import os
+from pathlib import Path
 
 import numpy as np
+import pytest
 from browser_engine import colours, make_rig, positions
 from PIL import Image
 from running import picture
@@ -13,6 +16,8 @@ from running import picture
 from scas4d_core.captures import InitialPoints
 
 FRAMES = 7
+SIZES = {"desk": {"width": 1440, "height": 900}, "phone": {"width": 390, "height": 844}}
+SERIOUS = ("serious", "critical")
 
 
 def start_scene(sdk, name="ring", settings=None, ingest=None):
@@ -56,3 +61,15 @@ def _text(page):
 def canvas(page, id="picture"):
     data = page.evaluate(f"document.getElementById({id!r}).toDataURL('image/png').split(',')[1]")
     return np.array(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGBA")).astype(int)
+
+
+def looked_at(page, name, faults=()):
+    """Keeps a screenshot, and checks what holds in every state."""
+    axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="pip install axe-playwright-python")
+    if folder := os.environ.get("SCAS4D_TEST_PICTURES"):
+        page.screenshot(path=str(Path(folder) / f"{name}-{page.size}.png"))
+    found = axe.Axe().run(page).response["violations"]
+    serious = [(one["id"], [node["html"][:200] for node in one["nodes"]]) for one in found if one["impact"] in SERIOUS]
+    assert serious == []
+    assert page.evaluate("document.documentElement.scrollWidth") <= SIZES[page.size]["width"]
+    assert [fault for fault in page.faults if not any(part in fault for part in faults)] == []

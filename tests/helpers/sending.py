@@ -28,9 +28,9 @@ def serving(folder):
         running.stop()
 
 
-def create(http, **ingest):
+def create(http, nodes=None, **ingest):
     body = {"rig": RigModel.of(make_rig()).model_dump(mode="json"), "ingest": ingest, "name": "studio"}
-    return http.post("/v1/scenes", json={**body, "frames_per_second": 10}).json()["id"]
+    return http.post("/v1/scenes", json={**body, "frames_per_second": 10, "nodes": nodes or {}}).json()["id"]
 
 
 def put_form(http, id, index, images=None):

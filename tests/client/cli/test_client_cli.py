@@ -269,6 +269,9 @@ def test_serve_refuses_to_listen_beyond_this_machine():
         (("push", "nowhere"), "nowhere: no such folder"),
         (("push", "TINY", "--url", "http://127.0.0.1:9"), "start one with: scas4d serve"),
         (("push", "TINY", "--set", "iterations"), "update.iterations=200"),
+        (("push", "TINY", "--node", "stage-a"), "write it as rig=stage-a"),
+        (("push", "TINY", "--node", "rig=a", "--node", "rig=b"), "'rig' has two values"),
+        (("push", "TINY", "--node", "rig=a", "--scene", "x"), "--node is for a new scene"),
     ],
 )
 def test_what_a_user_can_mend_is_one_line(capture_folder, arguments, said):
@@ -282,6 +285,12 @@ def test_a_setting_the_service_refuses_is_named(service, capture_folder):
     done = scas4d("push", str(capture_folder), "--url", service.url, "--set", "update.iteration=1")
     assert done.returncode == 1
     assert "settings.update.iteration" in done.stderr
+
+
+def test_labels_where_there_is_no_cluster_are_refused(service, capture_folder):
+    done = scas4d("push", str(capture_folder), "--url", service.url, "--node", "rig=stage-a")
+    assert done.returncode == 1
+    assert "--placement ray" in done.stderr
 
 
 def test_changes_are_parsed():

@@ -103,6 +103,10 @@ def test_frames_are_committed_on_a_node_and_views_are_answered(service: Service,
     assert here.cpus == 2
     assert 1 <= here.cpus_taken <= 1.5
     assert here.memory_taken_mb > 100
+    told = service.http.get("/metrics").text
+    assert f'scas4d_scene_node{{node="{here.id}",scene="{scene}"}} 1.0' in told
+    assert f'scas4d_node_cpus{{host="{here.host}",node="{here.id}"}} 2.0' in told
+    assert "scas4d_cluster_up 1.0" in told
 
 
 def test_a_worker_that_dies_is_followed_by_one_of_the_next_epoch(service: Service, scene: str) -> None:
@@ -125,6 +129,9 @@ def test_a_scene_goes_on_when_its_node_is_lost(service: Service, nodes: Nodes, s
     sent(service, scene, range(2, 5))
     until(lambda: committed(service, scene) == 5)
     assert node_of(service, nodes, scene) != lost
+    assert [node.alive for node in cluster(service).nodes].count(False) == 1
+    told = service.http.get("/metrics").text.splitlines()
+    assert [line[-4:] for line in told if line.startswith("scas4d_node_up")].count(" 0.0") == 1
     assert [service.frame(scene, index).state for index in range(5)] == ["committed"] * 5
     nodes.add()
 
@@ -164,7 +171,7 @@ def test_a_scene_without_room_waits_and_says_why(service: Service, nodes: Nodes)
         until(lambda: service.status(late).error)
         said = service.status(late)
         assert said.degraded
-        assert "no node has room for its worker, which needs 1 CPU and" in str(said.error)
+        assert "its worker is not placed on a node yet; it needs 1 CPU and" in str(said.error)
         sent(service, late, range(1))
         for id in ids:
             if id not in waiting():
@@ -184,6 +191,43 @@ def test_scenes_are_found_again_after_the_service_was_killed(service: Service, s
     sent(service, scene, range(3, 4))
     until(lambda: committed(service, scene) == 4)
     assert epoch_read(states(service, scene)) == 1
+
+
+def test_a_scene_waits_for_a_node_with_its_label_and_runs_there(service: Service, nodes: Nodes) -> None:
+    id = create(service.http, nodes={"rig": "stage-a"})
+    sent(service, id, range(1))
+    until(lambda: service.status(id).error)
+    said = service.status(id)
+    assert said.nodes == {"rig": "stage-a"}
+    assert str(said.error).endswith("GB of memory on a node with rig=stage-a")
+    added = nodes.add({"rig": "stage-a"})
+    until(lambda: committed(service, id) == 1)
+    assert service.http.post(f"/v1/scenes/{id}/render", json={"camera": "c0"}).status_code == 200
+    (here,) = [node for node in cluster(service).nodes if node.labels]
+    assert (here.labels, here.scenes) == ({"rig": "stage-a"}, [id])
+    assert node_of(service, nodes, id) == added
+    service.http.delete(f"/v1/scenes/{id}")
+
+
+def test_another_service_of_the_cluster_passes_on_what_is_not_its_own(
+    service: Service, nodes: Nodes, scene: str, tmp_path: Path
+) -> None:
+    other = Service(tmp_path / "data", fakes.environment(SCAS4D_PLACEMENT=f"ray={nodes.address}"))
+    other.start()
+    try:
+        sent(other, scene, range(2))
+        until(lambda: committed(other, scene) == committed(service, scene) == 2)
+        view = other.http.post(f"/v1/scenes/{scene}/render", json={"camera": "c0", "frame": 1})
+        assert (view.status_code, view.headers["content-type"]) == (200, "image/png"), view.text
+        late = create(other.http)
+        until(lambda: late in [one["id"] for one in service.http.get("/v1/scenes").json()["scenes"]])
+        assert service.http.get(f"/v1/scenes/{late}").status_code == 200
+    finally:
+        other.stop()
+    gone = service.http.get(f"/v1/scenes/{late}")
+    assert (gone.status_code, gone.headers["retry-after"]) == (503, "2"), gone.text
+    until(lambda: "x-unreachable" not in service.http.get("/v1/scenes").headers)  # Ray has noticed
+    assert service.http.get(f"/v1/scenes/{scene}").status_code == 200
 
 
 @pytest.mark.parametrize(

@@ -66,6 +66,9 @@ class FakePlacement:
         self.may_make = threading.Event()
         self.may_make.set()
 
+    def asked(self, function: Callable[..., Any], *arguments: Any) -> asyncio.Future[Any]:
+        return asyncio.get_running_loop().run_in_executor(None, function, *arguments)
+
     def host(self, name: str, needs: Needs) -> FakeActor:
         self.may_make.wait(10)
         return self.actor

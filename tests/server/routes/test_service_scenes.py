@@ -150,6 +150,17 @@ def test_a_bad_scene_is_refused_by_name(http, name):
     assert len(http.get("/v1/scenes").json()["scenes"]) == scenes
 
 
+def test_labels_of_nodes_need_a_cluster(http):
+    found = problem(http.post("/v1/scenes", json={"rig": rig_json(), "nodes": {"rig": "stage-a"}}), 422)
+    assert (found["field"], found["value"]) == ("nodes", "{'rig': 'stage-a'}")
+    assert found["remedy"] == "leave it out, or run the service on a cluster: scas4d serve --placement ray"
+    bad = problem(http.post("/v1/scenes", json={"rig": rig_json(), "nodes": {"rig": "stage a"}}), 422)
+    assert (bad["field"], bad["detail"]) == (
+        "body.nodes",
+        "body.nodes: 'stage a' cannot be the value of a node's label",
+    )
+
+
 def test_numbers_that_are_none_are_refused(http):
     text = '{"rig": {"axes": "opencv", "cameras": [{"name": "a", "intrinsics": [[NaN,0,1],[0,1,1],[0,0,1]], '
     text += '"world_to_camera": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]], "width": 4, "height": 4}]}}'

@@ -16,7 +16,7 @@ from scas4d_core.storage.history import History
 from server.processes import worker
 from server.processes.placement import Ended, Placement
 from server.scene import supervision
-from server.scene.supervision import OTHER_DEATHS
+from server.scene.supervision import LONGEST_DELAY_S, OTHER_DEATHS, WorkerDeaths
 from server.storage.fencing import epoch_read
 from server.storage.layout import DataFolder
 
@@ -73,14 +73,17 @@ def test_no_frame_is_set_aside_for_machines_that_were_lost(tmp_path):
         assert http.get(f"/v1/scenes/{id}/frames/1").json()["state"] in ("queued", "updating")
 
 
-@pytest.mark.parametrize("fault", [errno.EIO, errno.ENOSPC])
+@pytest.mark.parametrize(
+    "fault",
+    [OSError(errno.EIO, "Input/output error"), OSError(errno.ENOSPC, "No space left"), KeyError("a fault of its own")],
+)
 def test_states_that_cannot_be_taken_over_are_tried_again(tmp_path, monkeypatch, fault):
     begin, faults = supervision.begin_epoch, []
 
     def faulty(states, lock):
         if len(faults) < 2:
             faults.append(fault)
-            raise OSError(fault, "it does not do")
+            raise fault
         return begin(states, lock)
 
     monkeypatch.setattr(supervision, "begin_epoch", faulty)
@@ -115,3 +118,13 @@ def test_states_go_to_other_machines_and_back(tmp_path):
         assert http.get(f"/v1/scenes/{id}/frames/4").json()["time"] == pytest.approx(0.4)
     assert epoch_read(states(tmp_path, id)) > there
     assert History.load(states(tmp_path, id)).indices == [0, 1, 2, 3, 4]
+
+
+def test_machines_that_are_lost_one_after_another_are_given_more_and_more_time():
+    """A frame may be what takes them down."""
+    deaths = WorkerDeaths()
+    pauses = [deaths.died(None, lost=True)[1] for _ in range(12)]
+    assert pauses[:4] == [0.5, 0.5, 0.5, 1.0]
+    assert pauses[-1] == LONGEST_DELAY_S
+    deaths.committed()
+    assert deaths.died(None, lost=True) == (False, 0.5)

@@ -1,10 +1,24 @@
-"""The prediction of when a queue has room."""
+"""The prediction of when a queue has room, and the pauses between a worker's end and the next one's start."""
 
 from __future__ import annotations
 
-import pytest
+import asyncio
 
-from server.scene.supervision import FIRST_GUESS_S, OVERDUE, SHORTEST_S, UPDATES_KEPT, WorkClock
+import pytest
+from running import make_rig
+
+from scas4d_core.presets import preset
+from server.processes.messages import SceneSpec
+from server.processes.placement import Ended
+from server.scene.supervision import (
+    FIRST_GUESS_S,
+    OVERDUE,
+    SHORTEST_S,
+    UPDATES_KEPT,
+    WorkClock,
+    WorkerProcess,
+)
+from server.storage.layout import SceneFolder
 
 
 class Hand:
@@ -96,3 +110,46 @@ def test_a_frame_set_aside_says_nothing_of_updates(clock, hand):
     clock.end(committed=False)
     clock.end(committed=True)  # nothing is at work: nothing is measured
     assert clock.remaining() == FIRST_GUESS_S
+
+
+class Processes:
+    """A placement whose processes end when they are told to."""
+
+    fenced = False
+
+    def __init__(self):
+        self.ends = []
+
+    def start(self, entry, spec, on_message, on_end):
+        self.ends.append(on_end)
+        return object()
+
+
+def test_nothing_starts_a_worker_before_the_pause_after_its_end_is_over(tmp_path):
+    """A frame may come, or the journal take a while, between its end and what is said about the next."""
+
+    async def deaths():
+        there = Processes()
+        spec = SceneSpec(SceneFolder(tmp_path), make_rig(), preset("scas4d"))
+        process = WorkerProcess(spec, there, lambda message: None, lambda why: None)
+        process.start()
+        for seconds in (0.05, 0.15):
+            there.ends[-1](Ended(-9))
+            process.start()
+            assert not process.starts_again
+            process.start_in(seconds)
+            process.start()
+            assert process.starts_again
+            count = len(there.ends)
+            await asyncio.sleep(seconds / 2)
+            assert len(there.ends) == count
+            await asyncio.sleep(seconds)
+            assert len(there.ends) == count + 1
+            assert not process.starts_again
+        process.close()
+        there.ends[-1](Ended(-9))
+        process.start_in(0)
+        await asyncio.sleep(0.05)
+        assert len(there.ends) == 3
+
+    asyncio.run(deaths())

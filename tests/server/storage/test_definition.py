@@ -22,6 +22,14 @@ def test_what_was_written_is_read(stored):
     assert Definition.of_json(stored).settings == Settings()
 
 
+def test_labels_of_nodes_are_kept_and_older_scenes_have_none(stored):
+    assert Definition.of_json(stored).request.nodes == {}
+    older = {**stored, "request": {name: value for name, value in stored["request"].items() if name != "nodes"}}
+    assert Definition.of_json(older).request.nodes == {}
+    stored["request"]["nodes"] = {"rig": "stage-a"}
+    assert Definition.of_json(Definition.of_json(stored).as_json()).request.nodes == {"rig": "stage-a"}
+
+
 def test_numbers_beyond_a_later_limit_are_brought_to_it(stored):
     stored["settings"]["update"]["iterations"] = 10**9
     found = Definition.of_json(stored).settings.update.iterations

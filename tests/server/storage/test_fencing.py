@@ -160,7 +160,7 @@ def test_a_full_disk_leaves_nothing_behind(states: Path, lock: Path, monkeypatch
     assert sorted(path.name for path in states.parent.iterdir()) == ["states", "states.0"]
 
 
-def test_a_link_that_cannot_be_moved_leaves_the_states_as_they_were(
+def test_a_link_that_cannot_be_moved_leaves_all_as_it_was(
     states: Path, lock: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refused(path: Path, target: Path) -> Path:
@@ -171,7 +171,17 @@ def test_a_link_that_cannot_be_moved_leaves_the_states_as_they_were(
         begin_epoch(states, lock)
     monkeypatch.undo()
     assert epoch_read(states) == 0
-    assert begin_epoch(states, lock) == 2
+    assert sorted(path.name for path in states.parent.iterdir()) == ["states", "states.0"]
+    assert begin_epoch(states, lock) == 1
+    assert frames(states) == [0, 1]
+
+
+def test_workers_that_end_before_they_work_do_not_fill_the_disk(states: Path, lock: Path) -> None:
+    """Sweeping waits for a worker that works."""
+    for _ in range(3 * fencing.MOST_KEPT):
+        begin_epoch(states, lock)
+    assert len(epochs(states)) == fencing.MOST_KEPT
+    assert max(epochs(states)) == epoch_read(states)
     assert frames(states) == [0, 1]
 
 
@@ -264,8 +274,10 @@ def test_sweeping_leaves_later_epochs_and_other_reconstructions(states: Path, lo
     shutil.copytree(epoch_folder(states, 0), other)
     for name in ("states.0.abcd.part", "states.2.abcd.part"):
         (states.parent / name).mkdir()
+    (states.parent / ".states.abcd.link").symlink_to("states.0")  # a stop came before it was moved
     assert sweep(states, 1) == ["states.0", "states.0.abcd.part"]
     assert other.is_dir()
+    assert not list(states.parent.glob(".states*"))
     assert frames(states) == [0, 1]
 
 
@@ -275,11 +287,12 @@ def test_parts_of_an_epoch_are_none_of_its_folders(states: Path) -> None:
 
 
 def test_a_worker_with_an_epoch_does_not_wait_for_one_that_stopped(tmp_path: Path, lock: Path) -> None:
-    held = alone(SceneFolder(tmp_path, epoch=0))
-    mine = alone(SceneFolder(tmp_path, epoch=1))  # with the lock of the other it would wait for ever
+    held = alone(SceneFolder(tmp_path))
+    assert held is not None
+    assert alone(SceneFolder(tmp_path, epoch=1)) is None  # with a lock it would wait for ever
     assert int(lock.read_text()) == os.getpid()
+    assert [path.name for path in tmp_path.iterdir()] == [lock.name]
     held.release()
-    mine.release()
 
 
 def test_what_reconstructions_before_left_is_found_with_its_epochs(states: Path) -> None:

@@ -1,0 +1,87 @@
+"""Services of one cluster find one another: each has an actor with its address, which Ray ends with the service."""
+
+from __future__ import annotations
+
+import logging
+import socket
+from collections.abc import Mapping
+from typing import Any
+
+import ray
+from ray.exceptions import RayError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+from server.settings import is_loopback
+
+PREFIX = "service."
+"""Begins the names of these actors; the service's word follows."""
+ASK_S = 2.0
+
+log = logging.getLogger("scas4d.server")
+
+
+class Address:
+    """The actor: it tells where the service listens, and the node from which alone that can be reached, or None."""
+
+    def __init__(self, url: str, node: str | None) -> None:
+        self._told = url, node
+
+    def get(self) -> tuple[str, str | None]:
+        """Returns both."""
+        return self._told
+
+
+def announced(word: str, host: str, port: int) -> Any:
+    """Announces this service; returns the actor, which goes with this process. Blocking.
+
+    Args:
+        word: of this service. host, port: it listens there; an address that stands for all is told as this node's.
+    """
+    node = str(ray.get_runtime_context().get_node_id())
+    if host in ("0.0.0.0", "::", ""):
+        host = str(ray.util.get_node_ip_address())  # type: ignore[no-untyped-call]
+    elif is_loopback(host):
+        log.warning("other machines of the cluster cannot reach this service at %s; give it an address: --host", host)
+    url = f"http://{_authority(host, port)}"
+    made: Any = ray.remote(Address)
+    here = NodeAffinitySchedulingStrategy(node, soft=True)
+    actor = made.options(name=PREFIX + word, num_cpus=0, max_restarts=-1, scheduling_strategy=here)
+    return actor.remote(url, node if is_loopback(host) else None)
+
+
+def _authority(host: str, port: int) -> str:
+    """The numbers of an address: a service refuses names that it is not told of."""
+    found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    number = str(found[0][4][0])
+    return f"[{number}]:{port}" if ":" in number else f"{number}:{port}"
+
+
+def others(word: str, known: Mapping[str, str]) -> dict[str, str]:
+    """Returns the addresses of the other services by the names of their actors. Blocking.
+
+    Args:
+        word: of this service. known: what was returned before; returned again where Ray does not say.
+    """
+    try:
+        names = [name for name in ray.util.list_named_actors() if name.startswith(PREFIX) and name != PREFIX + word]
+        node = str(ray.get_runtime_context().get_node_id())
+    except (RayError, RuntimeError, ConnectionError) as error:
+        log.warning("the head of the cluster does not say which services there are: %s", error)
+        return dict(known)
+    found: dict[str, str] = {}
+    for name in names:
+        try:
+            url, only = (known[name], None) if name in known else _asked(name)
+        except (RayError, ValueError) as error:  # it ends, or begins
+            log.info("service %s does not tell its address: %s", name, error)
+            continue
+        if only in (None, node):
+            found[name] = url
+    return found
+
+
+def _asked(name: str) -> tuple[str, str | None]:
+    actor: Any = ray.get_actor(name)
+    found: Any = ray.get(actor.get.remote(), timeout=ASK_S)
+    url, only = found
+    return str(url), only

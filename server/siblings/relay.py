@@ -1,0 +1,129 @@
+"""Relays a WebSocket to the sibling that has its scene: messages both ways, and how either end closes."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+from collections.abc import Mapping
+from urllib.parse import urlsplit
+
+from starlette.types import Receive, Scope, Send
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus, WebSocketException
+from websockets.typing import Subprotocol
+
+from server import problems
+from server.connections.websocket import limit_messages
+from server.problems import Problem
+from server.siblings.siblings import CONNECT_S, SILENT_S, unreachable
+
+RESTARTS, ABNORMAL = 1012, 1006
+"""The service restarts; what stands for a connection that ended without a word, and is never sent."""
+
+
+async def relay(
+    address: str,
+    scene: str,
+    headers: Mapping[str, str],
+    most_bytes: int,
+    scope: Scope,
+    receive: Receive,
+    send: Send,
+) -> None:
+    """Relays until either end closes.
+
+    Args:
+        address: at the sibling, `http://…`. headers: for it. most_bytes: of a message of the client.
+
+    Raises:
+        Problem: 503, the sibling does not answer.
+    """
+    try:
+        sibling = await connect(
+            f"ws{address.removeprefix('http')}",
+            sock=await asyncio.wait_for(_connected(address), CONNECT_S),
+            subprotocols=[Subprotocol(name) for name in scope["subprotocols"]] or None,
+            additional_headers=headers,
+            user_agent_header=None,
+            compression=None,
+            max_size=None,  # what a service sends is bounded by what was asked
+            max_queue=1,  # the sibling notices a client that reads slowly, and sends it the newest only
+            open_timeout=SILENT_S,  # it may wake the scene first
+            proxy=None,
+        )
+    except InvalidStatus as refused:
+        await _refused(refused, scope, receive, send)
+        return
+    except (OSError, TimeoutError, WebSocketException):
+        raise unreachable(scene) from None
+    limit_messages(scope, most_bytes)
+    async with sibling:
+        assert (await receive())["type"] == "websocket.connect"
+        await send({"type": "websocket.accept", "subprotocol": sibling.subprotocol})
+        ends = {asyncio.ensure_future(_to_sibling(sibling, receive)), asyncio.ensure_future(_from(sibling, send))}
+        try:
+            await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for end in ends:
+                end.cancel()
+            await asyncio.gather(*ends, return_exceptions=True)
+
+
+async def _connected(address: str) -> socket.socket:
+    """Connects by TCP: a machine that is gone is noticed sooner than a service that is busy."""
+    where = urlsplit(address)
+    assert where.hostname is not None
+    family = socket.AF_INET6 if ":" in where.hostname else socket.AF_INET
+    made = socket.socket(family, socket.SOCK_STREAM)
+    try:
+        made.setblocking(False)
+        made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        await asyncio.get_running_loop().sock_connect(made, (where.hostname, where.port or 80))
+    except BaseException:
+        made.close()
+        raise
+    return made
+
+
+async def _to_sibling(sibling: ClientConnection, receive: Receive) -> None:
+    while (message := await receive())["type"] == "websocket.receive":
+        text = message.get("text")
+        with contextlib.suppress(ConnectionClosed):  # `_from` tells the client
+            await sibling.send(message["bytes"] if text is None else text)
+    code = message.get("code") or RESTARTS
+    await sibling.close(code if _may_be_sent(code) else RESTARTS, message.get("reason") or "")
+
+
+async def _from(sibling: ClientConnection, send: Send) -> None:
+    with contextlib.suppress(ConnectionClosed):
+        while True:
+            message = await sibling.recv()
+            await send({"type": "websocket.send", "text" if isinstance(message, str) else "bytes": message})
+    code = sibling.close_code or ABNORMAL
+    reason = sibling.close_reason or ""
+    await send({"type": "websocket.close", "code": code if _may_be_sent(code) else RESTARTS, "reason": reason})
+
+
+def _may_be_sent(code: int) -> bool:
+    """RFC 6455, 7.4: some codes stand for what happened, and are on no wire."""
+    return 1000 <= code < 5000 and code not in (1004, 1005, ABNORMAL, 1015)
+
+
+async def _refused(refused: InvalidStatus, scope: Scope, receive: Receive, send: Send) -> None:
+    """Answers the handshake as the sibling has answered it."""
+    answer = refused.response
+    if "websocket.http.response" not in scope.get("extensions", {}):
+        problem = Problem(
+            answer.status_code,
+            "the service that has the scene refuses the connection",
+            remedy="ask GET /v1/scenes/ID of the scene why",
+        )
+        await problems.refuse(problem, scope, receive, send)
+        return
+    kept = ("content-type", "retry-after", "www-authenticate")
+    headers = [
+        (name.lower().encode(), value.encode()) for name, value in answer.headers.raw_items() if name.lower() in kept
+    ]
+    await send({"type": "websocket.http.response.start", "status": answer.status_code, "headers": headers})
+    await send({"type": "websocket.http.response.body", "body": answer.body})

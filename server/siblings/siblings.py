@@ -1,0 +1,186 @@
+"""Siblings, the other services of the cluster: which of them has a scene, and which scenes they have."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import OrderedDict
+from collections.abc import Awaitable, Callable, Sequence
+from typing import TypeVar
+
+import httpx
+from pydantic import ValidationError
+
+from client.wire import SceneList, SceneStatus
+from server.http.permissions import ALL, Permission
+from server.http.sharing import LONGEST_SECONDS, Sharing
+from server.problems import Problem
+
+PASSED = "x-scas4d-passed"
+"""Header of what a service asks of another: that one answers for its own scenes alone, and passes nothing on."""
+FRESH_S = 3.0
+"""A list of the siblings is good for so long, and so is the answer that none has a scene."""
+LIST_S = 2.0
+"""A request waits for the first list for so long; later ones get the list before."""
+ASK_S = 5.0
+"""A sibling has so long to answer a question about its scenes."""
+CONNECT_S = 3.0
+SILENT_S = 130.0
+"""A sibling may be silent for so long over a request: longer than it allows a query."""
+REMEMBERED_S = 600.0
+"""A service that is gone is waited for, for so long after it was there: clients of its scenes are told to ask again."""
+MOST_KNOWN = 100_000
+MOST_UNKNOWN = 1_000
+"""Ids that nobody has, remembered for a moment: whoever tries out ids does not reach every sibling with each."""
+
+T = TypeVar("T")
+
+log = logging.getLogger("scas4d.server")
+
+
+class Siblings:
+    """The other services of the cluster. On the event loop.
+
+    Args:
+        listed: returns the addresses of the siblings, as `http://10.0.0.2:8000`; it may take long.
+        secret: the token, which all services of a cluster share; None: there is none.
+        client: of HTTP; by default one of its own.
+
+    Attributes:
+        client: passes requests on.
+    """
+
+    def __init__(
+        self,
+        listed: Callable[[], Awaitable[Sequence[str]]],
+        secret: str | None,
+        client: httpx.AsyncClient | None = None,
+    ) -> None:
+        self._listed = listed
+        self._secret = secret
+        limits = httpx.Limits(max_connections=None, max_keepalive_connections=64)
+        timeout = httpx.Timeout(SILENT_S, connect=CONNECT_S)
+        self.client = client or httpx.AsyncClient(timeout=timeout, limits=limits, trust_env=False)
+        self._addresses: Sequence[str] | None = None
+        self._asked = -FRESH_S
+        self._listing: asyncio.Task[None] | None = None
+        self._owners: OrderedDict[str, tuple[str, float]] = OrderedDict()
+        """Addresses by scene, and when they were last among the siblings."""
+        self._unknown: OrderedDict[str, float] = OrderedDict()
+
+    async def close(self) -> None:
+        """Ends connections to siblings."""
+        if self._listing is not None:
+            self._listing.cancel()
+        await self.client.aclose()
+
+    async def addresses(self) -> Sequence[str]:
+        """Addresses of the siblings, as they were listed last."""
+        if self._listing is None and time.monotonic() - self._asked >= FRESH_S:
+            self._listing = asyncio.get_running_loop().create_task(self._list())
+        if self._listing is not None:
+            await asyncio.wait({self._listing}, timeout=LIST_S if self._addresses is None else 0)
+        return self._addresses or ()
+
+    async def _list(self) -> None:
+        try:
+            self._addresses = await self._listed()
+        except Exception:  # the cluster's head does not answer, or in words that nobody expects
+            log.exception("siblings cannot be listed; those before are asked")
+        finally:
+            self._asked, self._listing = time.monotonic(), None
+
+    def headers(self, permission: Permission) -> dict[str, str]:
+        """Headers with which a sibling is asked, for somebody who may do so much."""
+        found = {PASSED: "1"}
+        if self._secret is not None:
+            found["authorization"] = f"Bearer {_bearer(permission, self._secret)}"
+        return found
+
+    async def owner(self, scene: str) -> str | None:
+        """Returns the address of the sibling that has a scene; None: none of them has it.
+
+        Raises:
+            Problem: 503, the one that had it, or one that may have it, does not answer.
+        """
+        siblings, now = await self.addresses(), time.monotonic()
+        known, when = self._owners.get(scene, (None, 0.0))
+        if known in siblings:
+            assert known is not None
+            _keep(self._owners, scene, (known, now), MOST_KNOWN)
+            return known
+        if now - self._unknown.get(scene, -FRESH_S) < FRESH_S:
+            return None
+        answers = await asyncio.gather(*(self._has(address, scene) for address in siblings))
+        for address, has in zip(siblings, answers, strict=True):
+            if has:
+                _keep(self._owners, scene, (address, now), MOST_KNOWN)
+                return address
+        if None in answers or (known is not None and now - when < REMEMBERED_S):
+            raise unreachable(scene)
+        self.forget(scene)
+        _keep(self._unknown, scene, now, MOST_UNKNOWN)
+        return None
+
+    def forget(self, scene: str) -> None:
+        """Forgets who has a scene: that one says it has it no more."""
+        self._owners.pop(scene, None)
+
+    async def scenes(self, permission: Permission) -> tuple[list[SceneStatus], list[str]]:
+        """Returns the scenes of all siblings, and the addresses of those that do not answer."""
+        siblings = await self.addresses()
+        answers = await asyncio.gather(*(self._get(address, "/v1/scenes", permission) for address in siblings))
+        found: dict[str, SceneStatus] = {}
+        silent = []
+        for address, answer in zip(siblings, answers, strict=True):
+            try:
+                if answer is None or answer.status_code != 200:
+                    raise ValueError(answer)
+                found |= {status.id: status for status in SceneList.model_validate_json(answer.content).scenes}
+            except (ValueError, ValidationError):  # a service of another version may have other words
+                silent.append(address)
+        return list(found.values()), silent
+
+    async def _has(self, address: str, scene: str) -> bool | None:
+        """Returns whether a sibling has a scene; None: it does not say."""
+        answer = await self._get(address, f"/v1/scenes/{scene}", ALL)
+        if answer is None:
+            return None
+        if answer.status_code in (200, 404):
+            return answer.status_code == 200
+        same = "; all services of a cluster need the same token" if answer.status_code == 401 else ""
+        log.warning("service %s does not say whether it has scene %s: %d%s", address, scene, answer.status_code, same)
+        return None
+
+    async def _get(self, address: str, path: str, permission: Permission) -> httpx.Response | None:
+        try:
+            return await self.client.get(address + path, headers=self.headers(permission), timeout=ASK_S)
+        except httpx.HTTPError as error:
+            log.warning("service %s does not answer: %s: %s", address, type(error).__name__, error)
+            return None
+
+
+def unreachable(scene: str) -> Problem:
+    """Makes the answer, 503, where the service that has a scene, or may have it, does not answer."""
+    return Problem(
+        503,
+        "the service of the cluster that has this scene, or may have it, does not answer",
+        field="id",
+        value=scene,
+        remedy="ask again: what it acknowledged is on disk",
+        headers={"Retry-After": "2"},
+    )
+
+
+def _bearer(permission: Permission, secret: str) -> str:
+    if permission == ALL:
+        return secret
+    return Sharing(secret).issue(permission.scene, permission.end or round(time.time()) + LONGEST_SECONDS)
+
+
+def _keep(where: OrderedDict[str, T], scene: str, value: T, most: int) -> None:
+    where[scene] = value
+    where.move_to_end(scene)
+    while len(where) > most:
+        where.popitem(last=False)

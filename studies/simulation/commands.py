@@ -1,0 +1,38 @@
+"""`scripts/bench simulate`."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from studies.options import Page, write_page
+
+
+def simulate(
+    scenes: Annotated[int, typer.Option(min=8, help="Scenes, which fill 85 % of the CPUs.")] = 5000,
+    nodes: Annotated[int, typer.Option(min=3, help="Nodes.")] = 200,
+    failures: Annotated[int, typer.Option(min=20, help="Failures, of nodes, workers, the service, the head.")] = 1000,
+    frames: Annotated[int, typer.Option(min=2, help="Frames of each scene.")] = 40,
+    seed: Annotated[int, typer.Option(help="Of all that is drawn.")] = 0,
+    out: Page = None,
+) -> None:
+    """Simulates a big cluster by a virtual clock: is a frame lost or run twice, and how soon have scenes a place?
+
+    The supervision of workers and the epochs of their folders are the service's own; Ray, nodes and workers are models.
+
+    Example: scripts/bench simulate --scenes 400 --nodes 16 --failures 200
+    """
+    from client.cli.extras import need_server
+
+    need_server()
+    from studies.simulation.simulate import Sizes
+    from studies.simulation.simulate import simulate as run
+    from studies.simulation.targets import rows, told
+
+    outcome = run(Sizes(scenes, nodes, failures, frames, seed))
+    text = told(outcome)
+    typer.echo(text)
+    write_page(out, text)
+    if not all(row.reached for row in rows(outcome)):
+        raise typer.Exit(1)

@@ -1,0 +1,153 @@
+"""Nodes of the modelled cluster, and the time during which one of them had room."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from enum import Enum, auto
+from typing import Protocol
+
+from server.cluster.needs import Needs
+
+
+class NodeState(Enum):
+    """The truth about a node, which Ray learns later."""
+
+    RUNNING = auto()
+    STOPPED = auto()
+    """By SIGSTOP: its workers stand still."""
+    CUT = auto()
+    """Its workers go on; no message passes."""
+    DEAD = auto()
+
+
+class Placed(Protocol):
+    """A process as its node sees it."""
+
+    needs: Needs
+
+    @property
+    def queued(self) -> bool:
+        """True while it waits for its place."""
+
+    def place(self, node: Node) -> None:
+        """Ray has chosen the node."""
+
+    def pause(self) -> None:
+        """The node is stopped."""
+
+    def resume(self) -> None:
+        """The node is continued."""
+
+    def kill(self) -> None:
+        """The node has ended."""
+
+    def lost(self) -> None:
+        """Ray takes the node for lost."""
+
+
+@dataclass(eq=False)
+class Node:
+    """One machine.
+
+    Attributes:
+        cpus, memory: of it, bytes. listed: Ray counts with it. failed_at: when it last fell silent, seconds.
+        held: calls that wait until it can be reached again; dropped where Ray takes it for lost before.
+    """
+
+    number: int
+    cpus: float
+    memory: int
+    state: NodeState = NodeState.RUNNING
+    listed: bool = True
+    failed_at: float = 0.0
+    processes: dict[Placed, None] = field(default_factory=dict)
+    held: list[Callable[[], None]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.free_cpus, self.free_memory = self.cpus, self.memory
+
+    def fits(self, needs: Needs) -> bool:
+        """True where there is room for a process."""
+        return self.free_cpus >= needs.cpus and self.free_memory >= needs.memory
+
+    def load(self) -> float:
+        """Share of the node that is taken, of whichever is scarcer."""
+        return max(1 - self.free_cpus / self.cpus, 1 - self.free_memory / self.memory)
+
+    def take(self, process: Placed) -> None:
+        """Counts a process."""
+        self.processes[process] = None
+        self.free_cpus -= process.needs.cpus
+        self.free_memory -= process.needs.memory
+
+    def give(self, process: Placed) -> bool:
+        """Counts a process no more; False where it was not here."""
+        if process not in self.processes:
+            return False
+        del self.processes[process]
+        self.free_cpus += process.needs.cpus
+        self.free_memory += process.needs.memory
+        return True
+
+
+class Capacity:
+    """Seconds during which a node that runs and can be reached had room, by kind of needs.
+
+    Args:
+        kinds: of needs. now: the clock.
+
+    Attributes:
+        listed: nodes with room by kind, as Ray knows them: one that is silent and not yet lost is among them.
+    """
+
+    def __init__(self, kinds: Sequence[Needs], now: Callable[[], float]) -> None:
+        self.kinds = kinds
+        self.listed = [0] * len(kinds)
+        self._numbers = {(needs.cpus, needs.memory): number for number, needs in enumerate(kinds)}
+        self._now = now
+        self._usable = [0] * len(kinds)
+        self._seen: dict[Node, tuple[list[bool], list[bool]]] = {}
+        self._answers = True
+        self._since = [0.0] * len(kinds)
+        self._seconds = [[0.0, 0.0] for _ in kinds]
+
+    def kind(self, needs: Needs) -> int:
+        """The kind of a process's needs."""
+        return self._numbers[needs.cpus, needs.memory]
+
+    def seconds(self, kind: int) -> tuple[float, float]:
+        """Seconds with room so far, and those of them in which the head answered."""
+        self._count(kind)
+        total, answered = self._seconds[kind]
+        return total, answered
+
+    def changed(self, node: Node) -> None:
+        """Looks at a node again."""
+        none = [False] * len(self.kinds)
+        listed_before, usable_before = self._seen.get(node, (none, none))
+        fits = [node.fits(needs) for needs in self.kinds]
+        listed = fits if node.listed else none
+        usable = listed if node.state is NodeState.RUNNING else none
+        for kind in range(len(self.kinds)):
+            self.listed[kind] += listed[kind] - listed_before[kind]
+            if usable[kind] != usable_before[kind]:
+                self._count(kind)
+                self._usable[kind] += usable[kind] - usable_before[kind]
+        self._seen[node] = listed, usable
+        if not node.listed:
+            del self._seen[node]
+
+    def head(self, answers: bool) -> None:
+        """Notes that the head answers, or does not."""
+        for kind in range(len(self.kinds)):
+            self._count(kind)
+        self._answers = answers
+
+    def _count(self, kind: int) -> None:
+        now = self._now()
+        if self._usable[kind]:
+            spent = now - self._since[kind]
+            self._seconds[kind][0] += spent
+            self._seconds[kind][1] += spent * self._answers
+        self._since[kind] = now

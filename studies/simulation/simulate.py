@@ -1,0 +1,199 @@
+"""`scripts/bench simulate`: runs a cluster through its failures, and checks what is left in the folders."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from random import Random
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from scas4d_core.settings import Settings
+from server.cluster.needs import Needs, needs_of
+from server.processes import worker
+from server.processes.messages import SceneSpec
+from server.settings import ServerSettings
+from server.storage.layout import DataFolder
+from studies.scale.footage import Size, rig
+from studies.simulation.clock import run_virtual
+from studies.simulation.cluster import SimulatedCluster
+from studies.simulation.failures import Failure, Failures, drawn
+from studies.simulation.record import FrameCounts, FrameRecord, TimeRecord, left_over
+from studies.simulation.scene import ScenePlan
+from studies.simulation.service import SimulatedService
+from studies.simulation.takeover import Takeovers
+from studies.simulation.work import content, frame_file, listed, read_frame
+
+RIGS = (
+    (0.50, Size(cameras=4)),
+    (0.35, Size(width=640, height=480)),
+    (0.15, Size(width=1280, height=720, cameras=24)),
+)
+"""Rigs of scenes, and how many of the scenes have each."""
+FULL = 0.85
+"""Share of the CPUs that the scenes take."""
+CPU_BYTES = 1.6e9
+"""Memory of a node for each of its CPUs; the scenes' workers take 1.3 GB on average."""
+APART_S = 1440.0
+"""Seconds between the failures, for each node."""
+CREATED_S = 60.0
+"""Scenes are created within so long."""
+MORE = 0.25
+"""Scenes beyond the room, as a share of the CPUs: with them more are asked for than there are."""
+MORE_AT, LEAVE_AT = 0.5, 0.6
+"""When those are asked for, and when as many others end, as shares of the time."""
+PATIENCE_S = 3600.0
+"""Frames that are not committed so long after the last failure are lost."""
+CALM_S = 420.0
+"""Whatever was stopped goes on and ends within so long, and folders are swept."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """The size of a simulation.
+
+    Attributes:
+        frames: of a scene.
+    """
+
+    scenes: int = 5000
+    nodes: int = 200
+    failures: int = 1000
+    frames: int = 40
+    seed: int = 0
+
+    @property
+    def cpus(self) -> int:
+        """Of a node."""
+        return math.ceil(self.scenes / self.nodes / FULL)
+
+    @property
+    def more(self) -> int:
+        """Scenes that are asked for beyond the room."""
+        return min(self.scenes, math.ceil(MORE * self.nodes * self.cpus))
+
+    @property
+    def seconds(self) -> float:
+        """In which frames are sent and failures happen."""
+        return self.failures * APART_S / self.nodes
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The findings.
+
+    Attributes:
+        placed, resumed, waited, unexplained: see `TimeRecord`. unplaced: workers that are wanted and have no place at
+            the end. happened: failures by kind. workers: that were started. adrift: files written by workers that were
+            given up. folders: of earlier epochs that are left, of
+            scenes that no user has ended. seconds: of virtual time.
+    """
+
+    sizes: Sizes
+    frames: FrameCounts
+    placed: dict[str, list[tuple[float, float]]]
+    resumed: dict[str, list[tuple[float, float]]]
+    waited: list[float]
+    unexplained: int
+    unplaced: int
+    happened: dict[Failure, int]
+    workers: int
+    adrift: int
+    folders: int
+    seconds: float
+
+
+def simulate(sizes: Sizes) -> Outcome:
+    """Runs the simulation; the same sizes and seed give the same outcome."""
+    level, memory = logging.getLogger("scas4d.server").level, Path("/dev/shm")
+    logging.getLogger("scas4d.server").setLevel(logging.ERROR)
+    try:
+        with TemporaryDirectory(dir=memory if memory.is_dir() else None) as folder:
+            return run_virtual(_run(sizes, DataFolder(Path(folder))))
+    finally:
+        logging.getLogger("scas4d.server").setLevel(level)
+
+
+async def _run(sizes: Sizes, data: DataFolder) -> Outcome:
+    loop, random = asyncio.get_running_loop(), Random(sizes.seed)
+    faults: list[dict[str, Any]] = []
+    loop.set_exception_handler(lambda _, context: faults.append(context))
+    rigs = [rig(size) for _, size in RIGS]
+    specs = [SceneSpec(data.scene("any"), one, Settings()) for one in rigs]
+    kinds = [_needs(spec) for spec in specs]
+    by_rig = {id(one): needs for one, needs in zip(rigs, kinds, strict=True)}
+    cluster = SimulatedCluster(sizes.nodes, sizes.cpus, round(sizes.cpus * CPU_BYTES), kinds, random)
+    frames, times = FrameRecord(), TimeRecord(cluster.capacity, loop.time)
+    takeovers = Takeovers(frames, random)
+    between = sizes.seconds / sizes.frames
+    service = SimulatedService(cluster, frames, times, takeovers, lambda spec: by_rig[id(spec.rig)], between)
+    plans = _plans(sizes, data, specs, random)
+    for plan, created in plans:
+        loop.call_at(created, service.create, plan)
+    failures = Failures(cluster, service)
+    failures.plan(drawn(sizes.failures, CREATED_S, sizes.seconds, random))
+    with takeovers.watched():
+        await asyncio.sleep(sizes.seconds)
+        while not (service.done and failures.happened.total() == sizes.failures):
+            await asyncio.sleep(10)
+            if faults or loop.time() > sizes.seconds + PATIENCE_S:
+                break
+        await asyncio.sleep(CALM_S)
+        service.end()
+    if faults:
+        raise RuntimeError(f"the simulation went wrong: {faults[0]['message']}") from faults[0].get("exception")
+    kept = [plan.spec.folder for plan, _ in plans if plan.ends is None]
+    return Outcome(
+        sizes=sizes,
+        frames=frames.total([_checked(frames, plan) for plan, _ in plans]),
+        placed=times.placed,
+        resumed=times.resumed,
+        waited=times.waited,
+        unexplained=times.unexplained,
+        unplaced=times.waiting,
+        happened=dict(failures.happened),
+        workers=frames.workers,
+        adrift=frames.adrift,
+        folders=sum(left_over(folder.path) for folder in kept),
+        seconds=loop.time(),
+    )
+
+
+def _needs(spec: SceneSpec) -> Needs:
+    needs = needs_of(worker.main, spec, ServerSettings())
+    assert needs is not None
+    return needs
+
+
+def _plans(sizes: Sizes, data: DataFolder, specs: Sequence[SceneSpec], random: Random) -> list[tuple[ScenePlan, float]]:
+    """All scenes, and when they are created. The first end in time for those that are asked for beyond the room."""
+    end, found = sizes.seconds, []
+    shares = [share for share, _ in RIGS]
+    for number in range(sizes.scenes + sizes.more):
+        begin, last, count, ends = random.uniform(0, CREATED_S), end, sizes.frames, None
+        if number < sizes.more:
+            last, ends = MORE_AT * end, LEAVE_AT * end
+        elif number >= sizes.scenes:
+            begin, count = begin + MORE_AT * end, max(1, sizes.frames // 2)
+        step = (last - begin) / count
+        moments = [begin + step * (index + random.random()) for index in range(count)]
+        (kind,) = random.choices(range(len(specs)), shares)
+        spec = replace(specs[kind], folder=data.scene(f"scene-{number:05}"))
+        found.append((ScenePlan(spec, kind, moments, ends), begin))
+    return found
+
+
+def _checked(frames: FrameRecord, plan: ScenePlan) -> FrameCounts:
+    """Reads the states of a scene through the link, as clients do."""
+    states, name = plan.spec.folder.states, plan.name
+    found = {index: read_frame(frame_file(states, index)) for index in listed(states)}
+    chain, state = [], name
+    for index in range(len(plan.frames)):
+        state = content(state, index)
+        chain.append(state)
+    frames.acknowledged.setdefault(name, 0)
+    return frames.check(name, found, chain)

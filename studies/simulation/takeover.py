@@ -1,0 +1,60 @@
+"""The worst moments while the service begins an epoch: workers commit between its steps, or the service ends there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from random import Random
+from unittest import mock
+
+from scas4d_core.storage.npz import sync_folder
+from server.storage import fencing
+from server.storage.layout import SceneFolder
+from studies.simulation.record import FrameRecord
+
+HURRIED = 0.5
+"""Chance that a worker of the scene commits at a moment: far more often than by itself."""
+
+
+class _Interrupted(Exception):
+    """The service ended here."""
+
+
+class Takeovers:
+    """Gives others their turn whenever `begin_epoch` syncs a folder.
+
+    It does so when the states are linked, and their folder has no name yet; when it has, and the link has not moved;
+    and when that has moved.
+    """
+
+    def __init__(self, record: FrameRecord, random: Random) -> None:
+        self._record, self._random = record, random
+        self._left: int | None = None
+
+    @contextmanager
+    def watched(self) -> Iterator[None]:
+        """Takes these turns inside."""
+        with mock.patch.object(fencing, "sync_folder", self._sync):
+            yield
+
+    def interrupt(self, folder: SceneFolder) -> None:
+        """The service ends while it begins an epoch of the scene, at one of these moments."""
+        self._left = self._random.randrange(3)
+        with suppress(_Interrupted):
+            fencing.begin_epoch(folder.states, folder.worker_lock)
+        self._left = None
+
+    def _sync(self, folder: Path) -> None:
+        part = folder.name.endswith(fencing.PART)
+        if self._left == 0:
+            if part:  # a service that is killed does not clean up
+                folder.with_name(folder.name.replace(fencing.PART, f".left{fencing.PART}")).mkdir()
+            raise _Interrupted
+        if self._left is not None:
+            self._left -= 1
+        scene = folder.parent.name if part else folder.name
+        for work in tuple(self._record.works.get(scene, ())):
+            if self._random.random() < HURRIED:
+                work.hurry()
+        sync_folder(folder)

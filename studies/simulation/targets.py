@@ -1,0 +1,108 @@
+"""The targets that a simulation has to reach, and the table of what was found."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import median
+
+from studies.simulation.delays import WAIT_S
+from studies.simulation.simulate import Outcome
+
+SOON_S, SHARE = 10.0, 0.99
+"""This share of the workers has a place so soon, counted while a node has room."""
+REASONS = {"new": "of a new scene", "loss": "after a loss", "restart": "after a restart of the service"}
+AFTER = {"node": "a node's failure", "worker": "a worker's end", "service": "the service's end"}
+
+
+@dataclass(frozen=True)
+class Row:
+    """A figure, and the target where it has one."""
+
+    what: str
+    found: str
+    target: str = ""
+    reached: bool = True
+
+
+def rows(outcome: Outcome) -> list[Row]:
+    """Compares an outcome with the targets."""
+    frames = outcome.frames
+    seconds = [times for found in outcome.placed.values() for times in found]
+    share = _share([room for room, _ in seconds])
+    found = [
+        _none("acknowledged frames lost", frames.lost, f" of {frames.read + frames.lost:,}"),
+        _none("frames run twice", frames.twice),
+        _none("workers started while another of their scene ran", frames.beside, f" of {outcome.workers:,}"),
+        _none(
+            "frames read that a worker wrote after it was given up",
+            frames.foreign,
+            f"; such workers wrote {outcome.adrift:,} files",
+        ),
+        _none("frames read that differ from an undisturbed run", frames.different),
+        Row(
+            f"workers placed within {SOON_S:g} s while a node has room",
+            f"{share:.2%} of {len(seconds):,}",
+            f"≥ {SHARE:.0%}",
+            share >= SHARE,
+        ),
+    ]
+    for reason, words in REASONS.items():
+        if times := outcome.placed.get(reason):
+            room, answered = (_share(each) for each in zip(*times, strict=True))
+            share_of = f"{room:.2%} of {len(times):,}; while the head answers {answered:.2%}"
+            found.append(Row(f"… {words}", share_of))
+    longest = max(outcome.waited, default=0.0)
+    found += [
+        _none(
+            f"workers without a place for {WAIT_S:g} s whose scene was not told why",
+            outcome.unexplained,
+            f" of {len(outcome.waited):,}",
+        ),
+        _none(
+            "scenes that have no worker in the end",
+            outcome.unplaced,
+            f"; {outcome.sizes.more:,} were asked for beyond the room, the longest wait was {longest:.0f} s",
+        ),
+        _none("folders of workers before that are left in the end", outcome.folders),
+        Row("frames updated again after a commit that nobody was told of", f"{frames.again:,}"),
+    ]
+    for failure, words in AFTER.items():
+        if times := outcome.resumed.get(failure):
+            found.append(Row(f"from {words} until the scene goes on, while a node has room", _seconds(times)))
+    return found
+
+
+def told(outcome: Outcome) -> str:
+    """The failures in a sentence, and the table, as Markdown."""
+    sizes = outcome.sizes
+    kinds = ", ".join(f"{kind} {count}" for kind, count in sorted(outcome.happened.items()))
+    lines = [
+        f"{sizes.scenes:,} scenes on {sizes.nodes:,} nodes of {sizes.cpus} CPUs, seed {sizes.seed}: "
+        f"{sum(outcome.happened.values()):,} failures ({kinds}) in {outcome.seconds / 3600:.1f} simulated hours.",
+        "",
+        "| | target | found | |",
+        "|---|---|---|---|",
+    ]
+    for row in rows(outcome):
+        verdict = "" if not row.target else "reached" if row.reached else "**missed**"
+        lines.append(f"| {row.what} | {row.target} | {row.found} | {verdict} |")
+    return "\n".join(lines)
+
+
+def _none(what: str, count: int, of: str = "") -> Row:
+    return Row(what, f"{count:,}{of}", "0", count == 0)
+
+
+def _share(seconds: Sequence[float]) -> float:
+    return sum(each <= SOON_S for each in seconds) / max(1, len(seconds))
+
+
+def _seconds(times: Sequence[tuple[float, float]]) -> str:
+    with_room = sorted(total - without for total, without in times)
+    late = with_room[int(0.99 * (len(with_room) - 1))]
+    longest = max(total for total, _ in times)
+    return (
+        f"median {median(with_room):.1f} s, 99 % {late:.1f} s, most {with_room[-1]:.1f} s; "
+        f"with waits for room, most {longest:.0f} s"
+    )

@@ -1,0 +1,224 @@
+"""The work of a modelled worker: commits frames in order to its epoch's folder, and goes on when it is given up."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from server.processes.messages import FrameCommitted, FrameReady, Ready
+from studies.simulation.cluster import SimulatedCluster
+from studies.simulation.delays import ADRIFT_S, ADRIFT_UPDATE_S, QUICKEST_S, START_S, Range
+from studies.simulation.record import FoundFrame, FrameRecord
+
+SUFFIX = ".frame"
+
+
+def content(before: str, index: int) -> str:
+    """The state of a frame, which depends on the one before and on nothing else; before frame 0: the scene's name.
+
+    >>> content("a", 0) == content("a", 0) != content("b", 0)
+    True
+    """
+    return hashlib.blake2b(f"{before} {index}".encode(), digest_size=16).hexdigest()
+
+
+def frame_file(folder: Path, index: int) -> Path:
+    """The file of a frame."""
+    return folder / f"{index:06}{SUFFIX}"
+
+
+def read_frame(path: Path) -> FoundFrame:
+    """Reads the file of a frame."""
+    state, worker, write = path.read_text().split()
+    return FoundFrame(state, int(worker), int(write))
+
+
+def listed(folder: Path) -> list[int]:
+    """Frames that a folder has, in order."""
+    names = (
+        name
+        for name in (os.listdir(folder) if folder.is_dir() else ())
+        if name.endswith(SUFFIX) and not name.startswith(".")
+    )
+    return sorted(int(name.removesuffix(SUFFIX)) for name in names)
+
+
+class _Timer:
+    """One call that is due; it can be paused."""
+
+    def __init__(self, cluster: SimulatedCluster) -> None:
+        self._cluster = cluster
+        self._handle: asyncio.TimerHandle | None = None
+        self._call: Callable[[], None] | None = None
+        self._left = 0.0
+        self._paused = False
+
+    def set(self, delay: Range | float, call: Callable[[], None]) -> None:
+        """Calls after so many seconds of running; takes the place of the call before."""
+        self.cancel()
+        self._call = call
+        self._left = self._cluster.random.uniform(*delay) if isinstance(delay, tuple) else delay
+        if not self._paused:
+            self.resume()
+
+    def pause(self) -> None:
+        self._paused = True
+        if self._handle is not None:
+            self._left = max(0.0, self._handle.when() - self._cluster.loop.time())
+            self._handle.cancel()
+            self._handle = None
+
+    def resume(self) -> None:
+        self._paused = False
+        if self._call is not None and self._handle is None:
+            self._handle = self._cluster.loop.call_later(self._left, self._due)
+
+    def cancel(self) -> None:
+        if self._handle is not None:
+            self._handle.cancel()
+        self._handle = self._call = None
+
+    def _due(self) -> None:
+        call, self._handle, self._call = self._call, None, None
+        assert call is not None
+        call()
+
+
+class Work:
+    """The doings of a worker process.
+
+    A worker that was given up and still runs is a harder opponent than a real one: it has no orders, and yet commits
+    all frames that are acknowledged, and its own newest again and again.
+
+    Args:
+        scene: its name. folder: of its epoch. worker: its number. longest: seconds of an update.
+        say: sends a message to the service. gone: called when it ends by itself.
+    """
+
+    def __init__(
+        self,
+        cluster: SimulatedCluster,
+        record: FrameRecord,
+        scene: str,
+        folder: Path,
+        worker: int,
+        longest: float,
+        say: Callable[[Any], None],
+        gone: Callable[[], None],
+    ) -> None:
+        self._cluster = cluster
+        self._record = record
+        self._scene, self._folder, self._worker, self._longest = scene, folder, worker, longest
+        self._say, self._gone = say, gone
+        self._frames = self._first_own = 0
+        self._state = scene
+        self._at: int | None = None
+        self._opened = self._adrift = self._stopped = self._ended = False
+        self._step, self._end = _Timer(cluster), _Timer(cluster)
+        record.works.setdefault(scene, {})[self] = None
+        self._step.set(START_S, self._open)
+
+    def order(self, message: FrameReady) -> None:
+        """Takes a frame."""
+        if self._ended or self._adrift or self._at is not None:
+            return
+        if message.index != self._frames:
+            raise RuntimeError(f"scene {self._scene}: frame {message.index} comes after {self._frames} frames")
+        low, high = math.log(QUICKEST_S), math.log(max(QUICKEST_S, self._longest))
+        self._begin(math.exp(self._cluster.random.uniform(low, high)))
+
+    def pause(self) -> None:
+        """Its node is stopped."""
+        self._stopped = True
+        self._step.pause()
+        self._end.pause()
+
+    def resume(self) -> None:
+        """Its node is continued."""
+        self._stopped = False
+        self._step.resume()
+        self._end.resume()
+
+    def drift(self) -> None:
+        """Nobody tells it what to do any more: it goes on by itself for a while."""
+        if not self._adrift and not self._ended:
+            self._adrift = True
+            self._end.set(ADRIFT_S, self._leave)
+            if self._opened and self._at is None:
+                self._go_on()
+
+    def hurry(self) -> None:
+        """Commits now what it would commit next: the worst moment, chosen from outside."""
+        if not self._opened or self._stopped or self._ended:
+            return
+        if self._at is not None or (self._adrift and self._frames < self._record.acknowledged[self._scene]):
+            self._step.cancel()
+            self._commit()
+
+    def end(self) -> None:
+        """Ends at once."""
+        self._ended = True
+        self._step.cancel()
+        self._end.cancel()
+        self._record.works[self._scene].pop(self, None)
+
+    def _leave(self) -> None:
+        if not self._ended:
+            self.end()
+            self._gone()
+
+    def _open(self) -> None:
+        try:
+            self._frames = self._first_own = len(listed(self._folder))
+            if self._frames:
+                self._state = read_frame(frame_file(self._folder, self._frames - 1)).state
+        except FileNotFoundError:  # removed: it was given up long ago
+            self._leave()
+            return
+        self._opened = True
+        self._say(Ready(tuple(range(self._frames))))
+        if self._adrift:
+            self._go_on()
+
+    def _begin(self, seconds: float | Range) -> None:
+        self._at = self._frames
+        self._step.set(seconds, self._commit)
+
+    def _commit(self) -> None:
+        index = self._frames
+        state = content(self._state, index)
+        if self._write(index, state):
+            self._at, self._state, self._frames = None, state, index + 1
+            self._say(FrameCommitted(index, {"worker": self._worker}))
+            if self._adrift:
+                self._go_on()
+
+    def _go_on(self) -> None:
+        if self._frames < self._record.acknowledged[self._scene]:
+            self._begin(ADRIFT_UPDATE_S)
+        else:
+            self._step.set(ADRIFT_UPDATE_S, self._again)
+
+    def _again(self) -> None:
+        """Writes its own newest frame again, the same bytes."""
+        if self._frames == self._first_own or self._write(self._frames - 1, self._state):
+            self._go_on()
+
+    def _write(self, index: int, state: str) -> bool:
+        """Writes a frame whole or not at all; a worker whose folder is gone ends."""
+        path, number = frame_file(self._folder, index), self._record.write(self._scene, self._worker)
+        beside = path.with_name(f".{path.name}.{self._worker}.part")
+        try:
+            with open(beside, "w") as file:
+                file.write(f"{state} {self._worker} {number}")
+            os.replace(beside, path)
+        except FileNotFoundError:
+            self._leave()
+            return False
+        self._record.wrote(self._scene, index, self._worker)
+        return True
