@@ -102,4 +102,5 @@ def test_it_still_works_afterwards(fuzzed):
     with Client(fuzzed.url, token=TOKEN) as sdk:
         assert sdk.scene(known["id"]).committed >= 2
         assert sdk.render(known["id"], "c0").size
+        sdk.edit_scene(known["id"], archived=False)  # requests that were made up may have archived it
         sdk.put_frame(known["id"], sdk.scene(known["id"]).next_frame, pictures(3))
