@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 ROUNDED = 512
+"""Bytes of which a place takes a multiple."""
 IN_MEMORY = 16
 """Newest states of a history without a directory that stay in memory; older ones go to a scratch file."""
 

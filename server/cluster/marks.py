@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+from scas4d_core.storage.npz import written_whole
 from server.storage.fencing import PART
 
 MARK = ".service"
@@ -14,9 +15,8 @@ SEEN_S = 10.0
 
 def mark(data: Path, word: str) -> None:
     """Marks the folder as that of the service whose word it is. Blocking."""
-    beside = data / f"{MARK}{PART}"
-    beside.write_text(word)
-    beside.replace(data / MARK)
+    with written_whole(data / MARK, data / f"{MARK}{PART}") as file:
+        file.write(word.encode())
 
 
 def is_marked(data: Path, word: str) -> bool:

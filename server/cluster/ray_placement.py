@@ -179,10 +179,9 @@ class RayProcess:
         self._sent = 0
         self._over = False
         self._actor: Any = None
-        loop = asyncio.get_running_loop()
         self._making: asyncio.Future[Any] = placement.asked(placement.host, name, needs)
         self._tasks: set[asyncio.Task[None]] = set()
-        self._task = loop.create_task(self._run(*runs))
+        self._task = asyncio.get_running_loop().create_task(self._run(*runs))
 
     @property
     def pid(self) -> int | None:

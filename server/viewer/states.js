@@ -25,7 +25,9 @@ export const stateKey = (status) =>
   (status.state === "failed" ? "failed" : status.degraded ? "degraded" : status.asleep ? "asleep" : status.state);
 
 const path = (status) => `/v1/scenes/${status.id}`;
-const counted = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s"}`;
+
+/** A number and its noun: 1 frame, 2 frames. */
+export const counted = (count, noun, many = `${noun}s`) => `${count} ${count === 1 ? noun : many}`;
 
 /** Words over the view of a scene without a committed frame; `page.curtain` has their fields. */
 export function beforeFirstFrame(status, { resume, restore } = {}) {

@@ -7,7 +7,8 @@ import shutil
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 
 from server.storage.fencing import epoch_read, epochs
@@ -24,6 +25,7 @@ Run = Callable[[Study, Sequence[str]], list[ScenarioResult]]
 GOES_ON_S = 30.0
 """A scene works again so soon after its node is gone."""
 HEAD_GONE_S = 10.0
+"""The head is away for so long."""
 SWEPT_S = 180.0
 """Folders of workers before are gone after so long."""
 
@@ -34,13 +36,9 @@ def killed_nodes(
     """`kill -9` of the node on which the scene's worker runs, `count` times, at random moments; a new one joins."""
     random_ = random.Random(seed)
     moments = [random_.randrange(1, len(study.frames)) for _ in range(count)]
-    service = study.service("nodes")
-    service.start()
-    scene = study.create(service)
-    sender = FrameSender(study, service, scene)
     pauses: list[float] = []
     killed: Counter[int] = Counter()
-    try:
+    with _running(study, "nodes") as (service, scene, sender):
         for index in range(len(study.frames)):
             thread = threading.Thread(target=sender.send, args=(index,))
             thread.start()
@@ -61,26 +59,15 @@ def killed_nodes(
         found = f"{lost} acknowledged frames lost, {len(expected)} states compared, on after at most {longest:.1f} s"
         target = f"0 acknowledged frames lost, final state bit-identical, on within {GOES_ON_S:g} s"
         return ScenarioResult(f"a node killed at {count} random moments", target, found, faults)
-    finally:
-        service.stop()
 
 
 def stopped_node(
     study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo
 ) -> ScenarioResult:
     """SIGSTOP of a node during an update; it is continued when its scene has gone on elsewhere."""
-    service = study.service("stopped")
-    service.start()
-    scene = study.create(service)
-    sender = FrameSender(study, service, scene)
-    states = DataFolder(service.data).scene(scene).states
-    half = len(study.frames) // 2
-    try:
-        for index in range(half):
-            sender.send(index)
-        service.finish(scene, half)
-        for index in range(half, len(study.frames)):
-            sender.send(index)
+    with _running(study, "stopped") as (service, scene, sender):
+        states = DataFolder(service.data).scene(scene).states
+        _send(sender, _second_half(study, service, scene, sender))
         time.sleep(0.5 * update_s)
         node = _node_of(service, nodes, scene)
         stale = epoch_read(states)
@@ -105,29 +92,20 @@ def stopped_node(
         until = time.monotonic() + SWEPT_S
         while len(epochs(states)) > 1 and time.monotonic() < until:
             time.sleep(AGAIN_S)
-        if left := sorted(epochs(states))[:-1]:
-            faults.append(f"the folders of epochs {left} are still there")
+        if still := sorted(epochs(states))[:-1]:
+            faults.append(f"the folders of epochs {still} are still there")
         found = f"on after {pause:.1f} s; then the old worker wrote {len(written)} files, which nothing read; removed"
         target = "nothing it wrote is read; found and removed; final state bit-identical"
         return ScenarioResult("a node stopped, and continued after its scene has moved", target, found, faults)
-    finally:
-        service.stop()
 
 
 def restarted_head(
     study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo
 ) -> ScenarioResult:
     """`kill -9` of the cluster's head during an update; it comes back after a while, with what Redis kept."""
-    service = study.service("head")
-    service.start()
-    scene = study.create(service)
-    sender = FrameSender(study, service, scene)
-    half = len(study.frames) // 2
-    try:
-        for index in range(half):
-            sender.send(index)
-        service.finish(scene, half)
-        sending = threading.Thread(target=_send, args=(sender, range(half, len(study.frames))))
+    with _running(study, "head") as (service, scene, sender):
+        left = _second_half(study, service, scene, sender)
+        sending = threading.Thread(target=_send, args=(sender, left))
         sending.start()
         time.sleep(0.5 * update_s)
         before = service.status(scene).committed
@@ -151,8 +129,26 @@ def restarted_head(
         )
         target = "0 acknowledged frames lost, final state bit-identical, scenes are placed again afterwards"
         return ScenarioResult(f"the head killed, back after {HEAD_GONE_S:g} s (Redis)", target, found, faults)
+
+
+@contextmanager
+def _running(study: Study, name: str) -> Iterator[tuple[Service, str, FrameSender]]:
+    """A service over a new folder, a scene of it, and its sender; the service ends with this."""
+    service = study.service(name)
+    service.start()
+    try:
+        scene = study.create(service)
+        yield service, scene, FrameSender(study, service, scene)
     finally:
         service.stop()
+
+
+def _second_half(study: Study, service: Service, scene: str, sender: FrameSender) -> range:
+    """Sends the first half of the frames, and waits for them; returns the others."""
+    half = len(study.frames) // 2
+    _send(sender, range(half))
+    service.finish(scene, half)
+    return range(half, len(study.frames))
 
 
 def _node_of(service: Service, nodes: Nodes, scene: str, killed: Counter[int] | None = None) -> int:
@@ -223,11 +219,10 @@ def run(study: Study, *, count: int, seed: int, parts: Sequence[str], local: Run
         return outcomes
     with Nodes() as nodes:
         there = _on(study, nodes)
-        if set(parts) & set(ON_NODES):
-            if "nodes" in parts:
-                outcomes.append(killed_nodes(there, nodes, expected, update_s, count, seed, echo))
-            if "stopped" in parts:
-                outcomes.append(stopped_node(there, nodes, expected, update_s, echo))
+        if "nodes" in parts:
+            outcomes.append(killed_nodes(there, nodes, expected, update_s, count, seed, echo))
+        if "stopped" in parts:
+            outcomes.append(stopped_node(there, nodes, expected, update_s, echo))
         if others := [part for part in parts if part in AS_LOCALLY]:
             outcomes += local(there, others)
     return outcomes

@@ -149,7 +149,8 @@ def told(found: Mapping[str, Any]) -> str:
         amounts = [amount(name, size) for size in SWEEPS[name]]
         lines += ["", f"| {name} | update, s | view, ms | frame 0, s | memory, MB |", "|---|---|---|---|---|"]
         lines += [
-            f"| {size:g} | {one['update']:.2f} | {1e3 * one['view']:.0f} | {one['frame_0']:.2f} | {one['memory']:.0f} |"
+            f"| {size:,.10g} | {one['update']:.2f} | {1e3 * one['view']:.0f} | "
+            f"{one['frame_0']:.2f} | {one['memory']:.0f} |"
             for size, one in zip(amounts, costs, strict=True)
         ]
         slopes = [slope(amounts, [one[field.name] for one in costs]) for field in fields(Cost)]

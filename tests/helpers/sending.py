@@ -72,8 +72,8 @@ def settled(http, id):
     return status
 
 
-def wait_for(condition):
-    until = time.monotonic() + 20
+def wait_for(condition, seconds=20):
+    until = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < until
         time.sleep(0.05)

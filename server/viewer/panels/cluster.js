@@ -2,13 +2,13 @@
 
 import { $, node, sentence } from "../page.js";
 import { call, token } from "../service.js";
+import { counted } from "../states.js";
 
 const LOOK_MS = 3000;
 const STARTS_S = 5; // a process that waits no longer is about to start
 const ROLES = { worker: "worker", views: "reader of views", bulk: "reader of tracks and parts", exporter: "export", replayer: "replay" };
 
 const number = new Intl.NumberFormat("en", { maximumFractionDigits: 2 });
-const counted = (count, noun, many = `${noun}s`) => `${count} ${count === 1 ? noun : many}`;
 const gigabytes = (mb) => (mb / 1000).toFixed(1);
 
 /** Seconds for a person: 12 s, 3 min, 2 h. */

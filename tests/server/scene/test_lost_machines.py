@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import errno
-import time
 from contextlib import contextmanager
 
 import fakes
 import httpx
 import pytest
 from running import Running, fake_settings, pictures
-from sending import create, put_framed, status
+from sending import create, put_framed, status, wait_for
 
 from scas4d_core.storage.history import History
 from server.processes import worker
@@ -19,6 +18,8 @@ from server.scene import supervision
 from server.scene.supervision import LONGEST_DELAY_S, OTHER_DEATHS, WorkerDeaths
 from server.storage.fencing import epoch_read
 from server.storage.layout import DataFolder
+
+PATIENCE_S = 60
 
 
 class Machines(Placement):
@@ -43,13 +44,6 @@ def service(folder, placement):
         running.stop()
 
 
-def until(done):
-    end = time.monotonic() + 60
-    while not done():
-        assert time.monotonic() < end
-        time.sleep(0.05)
-
-
 def states(folder, id):
     return DataFolder(folder).scene(id).states
 
@@ -60,7 +54,7 @@ def sent(http, id, frames):
 
 
 def committed(http, id, count):
-    until(lambda: status(http, id)["committed"] == count)
+    wait_for(lambda: status(http, id)["committed"] == count, PATIENCE_S)
 
 
 def test_no_frame_is_set_aside_for_machines_that_were_lost(tmp_path):
@@ -69,7 +63,7 @@ def test_no_frame_is_set_aside_for_machines_that_were_lost(tmp_path):
         sent(http, id, [0])
         committed(http, id, 1)
         assert put_framed(http, id, 1, pictures(fakes.DIES)).status_code == 202
-        until(lambda: status(http, id)["worker_deaths"] > OTHER_DEATHS)
+        wait_for(lambda: status(http, id)["worker_deaths"] > OTHER_DEATHS, PATIENCE_S)
         assert http.get(f"/v1/scenes/{id}/frames/1").json()["state"] in ("queued", "updating")
 
 
@@ -89,7 +83,7 @@ def test_states_that_cannot_be_taken_over_are_tried_again(tmp_path, monkeypatch,
     monkeypatch.setattr(supervision, "begin_epoch", faulty)
     with service(tmp_path, Machines) as http:
         id = create(http)
-        until(lambda: "the committed states cannot be taken over: " in (status(http, id)["error"] or ""))
+        wait_for(lambda: "the committed states cannot be taken over: " in (status(http, id)["error"] or ""), PATIENCE_S)
         sent(http, id, [0])
         committed(http, id, 1)
         assert len(faults) == 2

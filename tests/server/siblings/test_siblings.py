@@ -14,7 +14,7 @@ import httpx
 import numpy as np
 import pytest
 from running import Running, fake_settings, picture, pictures, problem
-from sending import FRAMED, create, framed, put_form, put_framed
+from sending import FRAMED, create, framed, put_form, put_framed, wait_for
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
@@ -26,6 +26,7 @@ from server.siblings import siblings as module
 from server.siblings.siblings import Siblings
 
 TOKEN = "the token of all services 0123456789".replace(" ", "-")
+PATIENCE_S = 60
 NOBODYS = "0123456789ab"
 HEADERS = {"Authorization": f"Bearer {TOKEN}"}
 
@@ -73,16 +74,9 @@ def other(services):
     id = create(first, queue_frames=20)
     for index in range(2):
         assert put_framed(second, id, index, pictures(index)).status_code == 202
-    until(lambda: second.get(f"/v1/scenes/{id}").json()["committed"] == 2)
+    wait_for(lambda: second.get(f"/v1/scenes/{id}").json()["committed"] == 2, PATIENCE_S)
     yield second, id
     second.delete(f"/v1/scenes/{id}")
-
-
-def until(done):
-    end = time.monotonic() + 60
-    while not done():
-        assert time.monotonic() < end
-        time.sleep(0.05)
 
 
 def test_frames_views_tracks_and_parts_of_a_scene_elsewhere(services, other):
@@ -114,7 +108,7 @@ def test_every_way_to_send_frames(services, other):
         assert sent.status_code in (200, 202), sent.text
     chunks = (part for part in [framed(4)[:50], framed(4)[50:]])  # without a length
     assert second.put(f"/v1/scenes/{id}/frames/4", content=chunks, headers=FRAMED).status_code == 202
-    until(lambda: second.get(f"/v1/scenes/{id}").json()["committed"] == 5)
+    wait_for(lambda: second.get(f"/v1/scenes/{id}").json()["committed"] == 5, PATIENCE_S)
 
 
 def test_refusals_are_those_of_the_service_that_has_the_scene(services, other):
@@ -168,8 +162,12 @@ def test_streams_and_ingest_by_websocket(services, other):
         socket.send(json.dumps({"type": "subscribe", "id": "v", "topic": "render", "request": asked}))
         assert put_framed(second, id, 3, pictures(3)).status_code == 202
         found = []
-        until(lambda: found.append(socket.recv(timeout=30)) or any('"committed"' in str(one) for one in found))
-        until(lambda: found.append(socket.recv(timeout=30)) or any(isinstance(one, bytes) for one in found))
+        wait_for(
+            lambda: found.append(socket.recv(timeout=30)) or any('"committed"' in str(one) for one in found), PATIENCE_S
+        )
+        wait_for(
+            lambda: found.append(socket.recv(timeout=30)) or any(isinstance(one, bytes) for one in found), PATIENCE_S
+        )
         second.delete(f"/v1/scenes/{id}")
         with contextlib.suppress(ConnectionClosed):
             for _ in range(50):
@@ -374,7 +372,7 @@ def test_a_client_that_hangs_up_is_noticed(services, fresh):
     slow = Slow()
     GONE.append(slow.url)
     try:
-        until(lambda: second.get("/v1/scenes/abcdefabcdef").status_code == 200)
+        wait_for(lambda: second.get("/v1/scenes/abcdefabcdef").status_code == 200, PATIENCE_S)
         with second.stream("GET", "/v1/scenes/abcdefabcdef/render") as answer:
             next(answer.iter_raw())
         assert slow.cut.wait(20)
