@@ -68,7 +68,8 @@ def test_scores_are_the_same_with_the_states_in_a_scratch_file(capture_folder, t
     own = ScratchFile.moved
 
     def noted(self, frame):
-        moved.append(isinstance(frame, FrameAside))
+        if "means" in frame:  # else it is a report
+            moved.append(isinstance(frame, FrameAside))
         return own(self, frame)
 
     rows = []
