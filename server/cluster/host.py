@@ -7,9 +7,11 @@ known by its exit code, which Ray does not tell. It ends with the actor.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import socket
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,6 +36,44 @@ class Gone:
     exit_code: int | None
 
 
+@dataclass(frozen=True)
+class Manner:
+    """How processes run on the service's machine; Ray starts its own otherwise.
+
+    Attributes:
+        threads: OMP_NUM_THREADS, which Ray sets to an actor's CPUs. nice: niceness, which Ray raises by 15: a worker
+            then gives way to all else on its node, to idle daemons too.
+    """
+
+    threads: str | None = None
+    nice: int = 0
+
+    @classmethod
+    def here(cls) -> Manner:
+        """Of this process."""
+        return cls(os.environ.get("OMP_NUM_THREADS"), os.getpriority(os.PRIO_PROCESS, 0))
+
+    def take(self) -> None:
+        """Takes it on, for this thread and what it starts; less nice than now only where the user may."""
+        os.environ.pop("OMP_NUM_THREADS", None)
+        if self.threads is not None:
+            os.environ["OMP_NUM_THREADS"] = self.threads
+        with contextlib.suppress(PermissionError):  # docs/cluster.md says how the node is started instead
+            os.setpriority(os.PRIO_PROCESS, 0, self.nice)
+
+
+@contextlib.contextmanager
+def _no_program() -> Iterator[None]:
+    """A process that is spawned inside does not load the program of this one: Ray's is 40 MB."""
+    main = vars(sys.modules["__main__"])
+    file = main.pop("__file__", None)
+    try:
+        yield
+    finally:
+        if file is not None:
+            main["__file__"] = file
+
+
 def _node_id() -> str:
     """Of the node that this actor is on."""
     import ray
@@ -46,13 +86,11 @@ class Host:
 
     Args:
         prepare: see `Placement`. data: folder of the service, which this node has to see. word: of the service's mark
-            in it. threads: OMP_NUM_THREADS of the service.
+            in it. manner: of the service; None: of this process.
     """
 
-    def __init__(self, prepare: Callable[[], None] | None, data: Path, word: str, threads: str | None = None) -> None:
-        os.environ.pop("OMP_NUM_THREADS", None)  # Ray sets it to the actor's CPUs
-        if threads is not None:
-            os.environ["OMP_NUM_THREADS"] = threads
+    def __init__(self, prepare: Callable[[], None] | None, data: Path, word: str, manner: Manner | None = None) -> None:
+        self._manner = manner
         self._placement = Placement(prepare)
         self._data, self._word = data, word
         self._said: asyncio.Queue[Any] = asyncio.Queue()
@@ -68,7 +106,10 @@ class Host:
             return Started(node, fault=fault)
         if not os.access(self._data, os.R_OK | os.W_OK | os.X_OK):
             return Started(node, fault=f"node {socket.gethostname()} cannot write to the data folder {self._data}")
-        self._process = self._placement.start(entry, spec, self._said.put_nowait, self._ended)
+        if self._manner is not None:
+            self._manner.take()  # here: the niceness is that of the thread that starts the process
+        with _no_program():
+            self._process = self._placement.start(entry, spec, self._said.put_nowait, self._ended)
         self._hand_on()  # what was posted before
         return Started(node, self._process.pid)
 

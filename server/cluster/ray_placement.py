@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import os
 import secrets
 import socket
 from collections.abc import Callable, Coroutine, Mapping, Sequence
@@ -17,7 +16,7 @@ from ray.exceptions import RayActorError, RayError
 
 from client.wire import Cluster
 from server.cluster.folder import check_folder
-from server.cluster.host import Gone, Host, Started
+from server.cluster.host import Gone, Host, Manner, Started
 from server.cluster.marks import mark
 from server.cluster.needs import Needs, needs_of
 from server.cluster.nodes import Place, all_nodes, cluster_of, is_lost
@@ -144,7 +143,7 @@ class RayPlacement(Placement):
         """An actor for a process. Blocking: the head registers its name."""
         made: Any = ray.remote(Host)
         return made.options(name=name, **needs.options()).remote(
-            self.prepare, self._server.data.resolve(), self._token, os.environ.get("OMP_NUM_THREADS")
+            self.prepare, self._server.data.resolve(), self._token, Manner.here()
         )
 
 

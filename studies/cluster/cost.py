@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import median
+
+import numpy as np
 
 from client.wire import FrameState
 from studies.options import Echo
@@ -17,6 +19,8 @@ from studies.service.process import Service, StudyError
 from studies.service.study import FrameSender, Study
 
 PLACEMENTS = ("local", "ray")
+EVERY_S = 0.01
+"""Between two looks at whether a frame is committed."""
 
 
 @dataclass
@@ -24,7 +28,7 @@ class CostFigures:
     """Of one placement.
 
     Attributes:
-        updates: seconds of an update, mean of a turn, of frames that wait. views: seconds of a view.
+        updates: seconds from a frame's acknowledgement to its commit, frame by frame. views: seconds of a view.
         throughput: committed frames a second of all scenes together, one a turn.
     """
 
@@ -52,8 +56,12 @@ def measure(
         lone = {name: _begun(study, service) for name, service in services.items()}
         for turn in range(turns):
             for name in (PLACEMENTS, PLACEMENTS[::-1])[turn % 2]:
-                found[name].updates.append(1 / _together(study, services[name], 1))
                 found[name].views += _views(services[name], lone[name], study.capture.full_rig.names[0], views)
+            for name, seconds in _updates(study, services, lone).items():
+                found[name].updates += seconds
+            for name, scene in lone.items():
+                services[name].http.delete(f"/v1/scenes/{scene}")
+            lone = {name: _begun(study, service) for name, service in services.items()}
             echo(f"turn {turn + 1} of {turns}: one scene")
         for name, scene in lone.items():
             services[name].http.delete(f"/v1/scenes/{scene}")
@@ -70,6 +78,7 @@ def measure(
 def told(found: dict[str, CostFigures], scenes: int) -> str:
     """The figures as Markdown."""
     local, ray = found["local"], found["ray"]
+    ratios = [there / here for here, there in zip(local.updates, ray.updates, strict=True)]
     rows = [
         ("an update, median, s", median(local.updates), median(ray.updates), 3),
         ("a view, median, ms", 1e3 * median(local.views), 1e3 * median(ray.views), 1),
@@ -80,6 +89,11 @@ def told(found: dict[str, CostFigures], scenes: int) -> str:
         table.append(
             f"| {name} | {here:.{digits}f} | {there:.{digits}f} | {there / here:.3f} | {there - here:+.{digits}f} |"
         )
+    low, middle, high = np.percentile(ratios, (25, 50, 75))
+    table += [
+        "",
+        f"Of the {len(ratios)} updates, frame by frame: {middle:.3f} times (half of them {low:.3f} to {high:.3f})",
+    ]
     return "\n".join(table)
 
 
@@ -101,6 +115,21 @@ def _views(service: Service, scene: str, camera: str, count: int) -> list[float]
         if answer.status_code != 200:
             raise StudyError(answer.text)
     return seconds[1:]
+
+
+def _updates(study: Study, services: Mapping[str, Service], scenes: Mapping[str, str]) -> dict[str, list[float]]:
+    """Seconds of each update of one scene a service, which take turns with every frame: they wait for each other."""
+    found: dict[str, list[float]] = {name: [] for name in scenes}
+    for index in range(1, len(study.frames)):
+        for name in (PLACEMENTS, PLACEMENTS[::-1])[index % 2]:
+            service, scene = services[name], scenes[name]
+            FrameSender(study, service, scene).send(index)
+            began = time.monotonic()
+            while service.frame(scene, index).state in (FrameState.QUEUED, FrameState.UPDATING):
+                time.sleep(EVERY_S)
+            found[name].append(time.monotonic() - began)
+            _check(service, [scene], index + 1)
+    return found
 
 
 def _together(study: Study, service: Service, scenes: int) -> float:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import os
+from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
@@ -10,13 +12,39 @@ from typing import Any
 import pytest
 
 from server.cluster import host, marks
-from server.cluster.host import Host
+from server.cluster.host import Host, Manner
 from server.processes.messages import Stop
 
 
 def echo(spec: Any, connection: Connection[Any, Any]) -> None:
     while not isinstance(message := connection.recv(), Stop):
         connection.send((spec, message))
+
+
+def manner(spec: Any, connection: Connection[Any, Any]) -> None:
+    connection.send((os.environ.get("OMP_NUM_THREADS"), os.getpriority(os.PRIO_PROCESS, 0)))
+    connection.recv()
+
+
+def test_a_process_runs_as_on_the_machine_of_its_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray's own are nicer than all else on the node, and have a thread of OpenMP for each CPU of the actor."""
+    monkeypatch.setattr(host, "_node_id", lambda: "here")
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    marks.mark(tmp_path, "mine")
+    nice = os.getpriority(os.PRIO_PROCESS, 0)
+
+    async def run() -> Any:
+        os.setpriority(os.PRIO_PROCESS, 0, nice + 3)  # of this thread alone
+        actor = Host(None, tmp_path, "mine", Manner("2", nice))
+        await actor.start(manner, "scene")
+        found = await asyncio.wait_for(actor.take(), 30)
+        await actor.stop(5)
+        return found
+
+    with ThreadPoolExecutor(1) as pool:
+        threads, niceness = pool.submit(asyncio.run, run()).result()[0]
+    assert threads == "2"
+    assert niceness == (nice if os.geteuid() == 0 else nice + 3)
 
 
 def test_messages_reach_the_process_in_order_from_the_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
