@@ -46,8 +46,9 @@ from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.structure.motion_mask import labelled, labels_learnt
 from scas4d_core.structure.neighbours import Neighbours, build_neighbours
 from scas4d_core.update.frame_update import FrameUpdate, Updater
-from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
+from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
 from scas4d_core.update.result import UpdateResult, UpdateTrace
+from scas4d_core.update.training_view import TrainingView
 from scas4d_core.update.warm_start import motion_between
 
 SMALLEST_CLUSTER = 8

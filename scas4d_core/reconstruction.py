@@ -41,9 +41,10 @@ from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.structure.motion_mask import first_labels, labelled
 from scas4d_core.torch_backend.device import require_device
 from scas4d_core.update.frame_update import Updater
-from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
+from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
 from scas4d_core.update.result import REPORT, Stopwatch
 from scas4d_core.update.schedule import TimeBudget
+from scas4d_core.update.training_view import TrainingView
 
 __all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "ResumePoint", "StepError"]
 
@@ -234,8 +235,7 @@ class Reconstruction(CommittedScene):
         Raises:
             StepError: not later than the last frame, no picture of the rig, or a picture of another size.
         """
-        seconds = self._seconds_to(frame)
-        watch = Stopwatch(started)
+        seconds, watch = self._seconds_to(frame), Stopwatch(started)
         frame = replace(frame, images=dict(frame.images))  # decoded once: a capture's pictures are, whenever looked at
         views = self._views(frame)
         watch.lap("decode")

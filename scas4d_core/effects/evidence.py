@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from scas4d_core.cameras import Rig
     from scas4d_core.gaussians import Gaussians
-    from scas4d_core.update.picture_loss import PictureLoss, TrainingView
+    from scas4d_core.update.picture_loss import PictureLoss
     from scas4d_core.update.result import UpdateResult
+    from scas4d_core.update.training_view import TrainingView
 
 
 @dataclass(frozen=True)

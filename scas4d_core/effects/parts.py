@@ -26,8 +26,9 @@ if TYPE_CHECKING:
     from scas4d_core.settings import SceneSettings, UpdateSettings
     from scas4d_core.structure.hierarchy import Hierarchy
     from scas4d_core.update.deformation import CpuDeformation
-    from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
+    from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
     from scas4d_core.update.rates import Rates
+    from scas4d_core.update.training_view import TrainingView
 
 Array = NDArray[np.float32]
 Arrays = dict[str, NDArray[Any]]

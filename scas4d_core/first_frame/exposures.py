@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.kernels.adam import EVERY_ROW, adam
-from scas4d_core.update.picture_loss import TrainingView
+from scas4d_core.update.training_view import TrainingView
 
 Array = NDArray[np.float32]
 

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from scas4d_core.kernels import activation
 from scas4d_core.settings import SceneSettings, StaticSettings
-from scas4d_core.update.picture_loss import TrainingView
+from scas4d_core.update.training_view import TrainingView
 
 Array = NDArray[np.float32]
 

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from scas4d_core.rasterize.cpu import CpuRasterizer
 from scas4d_core.rasterize.shading import camera_centre
-from scas4d_core.update.picture_loss import TrainingView
+from scas4d_core.update.training_view import TrainingView
 
 Array = NDArray[np.float32]
 

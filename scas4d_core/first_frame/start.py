@@ -24,7 +24,8 @@ from scas4d_core.frame_report import Progress
 from scas4d_core.robust.checks import axis_lengths
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings
 from scas4d_core.storage.history import History, HistoryError
-from scas4d_core.update.picture_loss import TrainingView, ViewFactory
+from scas4d_core.update.picture_loss import ViewFactory
+from scas4d_core.update.training_view import TrainingView
 
 Colour = tuple[float, float, float]
 

@@ -28,8 +28,9 @@ from scas4d_core.kernels.adam import EVERY_ROW, adam
 from scas4d_core.rasterize.limits import scene_limits
 from scas4d_core.rasterize.shading import Shading, without_turn
 from scas4d_core.settings import SceneSettings, StaticSettings
-from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory, view_order
+from scas4d_core.update.picture_loss import PictureLoss, ViewFactory, view_order
 from scas4d_core.update.result import CameraFit, camera_fit
+from scas4d_core.update.training_view import TrainingView
 
 Array = NDArray[np.float32]
 

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from scas4d_core.rasterize.cpu import CpuRasterizer
 from scas4d_core.rasterize.shading import SAME_SIDE, camera_centre, without_turn
-from scas4d_core.update.picture_loss import TrainingView
+from scas4d_core.update.training_view import TrainingView
 
 Array = NDArray[np.float32]
 Float = NDArray[np.float64]

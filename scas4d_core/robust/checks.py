@@ -27,8 +27,9 @@ from numpy.typing import NDArray
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.rasterize.shading import features_seen
 from scas4d_core.robust.outliers import Past, few
-from scas4d_core.update.picture_loss import LABEL, PictureLoss, TrainingView, ViewFactory
+from scas4d_core.update.picture_loss import LABEL, PictureLoss, ViewFactory
 from scas4d_core.update.result import UpdateResult
+from scas4d_core.update.training_view import TrainingView
 
 Array = NDArray[np.float32]
 

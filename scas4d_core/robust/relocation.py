@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.rasterize.shading import features_seen
-from scas4d_core.update.picture_loss import LABEL, PictureLoss, TrainingView
+from scas4d_core.update.picture_loss import LABEL, PictureLoss
+from scas4d_core.update.training_view import TrainingView
 
 Float = NDArray[np.float64]
 

@@ -27,10 +27,11 @@ from scas4d_core.robust.update_input import UpdateInput
 from scas4d_core.settings import UpdateSettings
 from scas4d_core.update.best_state import by_size, committed_errors, slow, within
 from scas4d_core.update.frame_update import Updater
-from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
+from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
 from scas4d_core.update.rates import all_begun
 from scas4d_core.update.result import AS_SET, AttemptOptions, UpdateResult, UpdateTrace
 from scas4d_core.update.schedule import MOST_TIMED, PROBE, Stopping
+from scas4d_core.update.training_view import TrainingView
 from scas4d_core.update.warm_start import Motion
 
 LADDER = (

@@ -21,8 +21,9 @@ from scas4d_core.frame_outcome import CameraTiming, Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.rasterize.shading import features_seen
 from scas4d_core.robust.outliers import Past
-from scas4d_core.update.picture_loss import PictureLoss, TrainingView
+from scas4d_core.update.picture_loss import PictureLoss
 from scas4d_core.update.result import UpdateResult
+from scas4d_core.update.training_view import TrainingView
 
 LOOKS, ITERATIONS = 4, 25
 """Cameras that are looked at in a frame at most, one for so many iterations of its update: two renderings each."""

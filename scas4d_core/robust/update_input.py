@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scas4d_core.effects.parts import Arrays
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust.outliers import Past
-from scas4d_core.update.picture_loss import TrainingView
+from scas4d_core.update.training_view import TrainingView
 from scas4d_core.update.warm_start import Motion
 
 RESTING = 10

@@ -29,8 +29,9 @@ from scas4d_core.robust.outliers import Past
 from scas4d_core.storage.frame_files import checkpoint_file, checkpoint_of
 from scas4d_core.storage.history import NEWEST_KEPT, History, HistoryError
 from scas4d_core.storage.npz import read_npz, write_npz
-from scas4d_core.update.picture_loss import TrainingView, ViewFactory
+from scas4d_core.update.picture_loss import ViewFactory
 from scas4d_core.update.result import UpdateResult
+from scas4d_core.update.training_view import TrainingView
 from scas4d_core.update.warm_start import Motion
 
 FORMAT = 2

@@ -19,7 +19,8 @@ from scipy.ndimage import maximum_filter
 from scas4d_core.cameras import Rig
 from scas4d_core.first_frame.points.posed_pictures import pixels_inside
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.update.picture_loss import PictureLoss, TrainingView
+from scas4d_core.update.picture_loss import PictureLoss
+from scas4d_core.update.training_view import TrainingView
 
 Array = NDArray[np.float32]
 

@@ -31,10 +31,11 @@ from scas4d_core.update import deformation, schedule
 from scas4d_core.update.best_state import BestState, ProbeViews
 from scas4d_core.update.deformation import CpuDeformation, first_lengths, length_bounds
 from scas4d_core.update.free_tables import freed
-from scas4d_core.update.picture_loss import LABEL, PictureLoss, TrainingView, ViewFactory
+from scas4d_core.update.picture_loss import LABEL, PictureLoss, ViewFactory
 from scas4d_core.update.rates import Rates
 from scas4d_core.update.result import AS_SET, AttemptOptions, Stopwatch, UpdateResult, UpdateTrace, camera_fit
 from scas4d_core.update.schedule import Stopping, ViewPlan, plan_samples
+from scas4d_core.update.training_view import TrainingView
 from scas4d_core.update.warm_start import Motion, predicted
 
 Array = NDArray[np.float32]

@@ -7,7 +7,7 @@
 
 The values that one update passes through, from ``Reconstruction.step`` to the commit:
 
-1. ``picture_loss.TrainingView``: one camera's pictures of the frame.
+1. ``training_view.TrainingView``: one camera's pictures of the frame.
 2. ``storage.checkpoint.CarryOver``: all that the update before left beside Θ_{t−1}; in the end, that of this one.
 3. ``robust.outliers.Past``: the usual figures of the scene and its cameras; a part of the carry-over.
 4. ``warm_start.Motion``: the motion that was found; a part of the carry-over.

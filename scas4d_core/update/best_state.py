@@ -17,7 +17,8 @@ from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.rasterize.shading import features_seen, without_turn
 from scas4d_core.update.deformation import CpuDeformation
-from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
+from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
+from scas4d_core.update.training_view import TrainingView
 from scas4d_core.update.warm_start import Motion, warm_start
 
 Array = NDArray[np.float32]

@@ -23,7 +23,8 @@ from scas4d_core.kernels import image_loss, tiles
 from scas4d_core.rasterize.blocks import pixels_of, widened
 from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Drawing, Gradients, Picture
 from scas4d_core.rasterize.limits import DEFAULT, Limits
-from scas4d_core.update.picture_loss import LABEL, PictureLoss, TrainingView, ViewFactory, means, no_lap
+from scas4d_core.update.picture_loss import LABEL, PictureLoss, ViewFactory, no_lap
+from scas4d_core.update.training_view import TrainingView, means
 
 Array = NDArray[np.float32]
 State = tuple[Array, Array, Array, Array]

@@ -27,10 +27,11 @@ from scas4d_core.update.best_state import BestState, ProbeViews
 from scas4d_core.update.changed_pixels import MOST, ChangedPixels
 from scas4d_core.update.deformation import CpuDeformation, length_bounds
 from scas4d_core.update.free_tables import free_tables, freed
-from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
+from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
 from scas4d_core.update.rates import Rates
 from scas4d_core.update.result import AS_SET, REPORT, AttemptOptions, Stopwatch, UpdateResult, UpdateTrace
 from scas4d_core.update.schedule import Stopping, ViewPlan, plan_samples
+from scas4d_core.update.training_view import TrainingView
 from scas4d_core.update.warm_start import Motion, predicted
 
 Array = NDArray[np.float32]

@@ -1,13 +1,8 @@
-"""Training views, and the loss of one: rendered, compared and carried back, in frame 0 and in every iteration.
-
-Views hold the pictures of a frame in CPU buffers, prepared once.
-"""
+"""Makes training views, and the loss of one: rendered, compared and carried back, in frame 0 and in every iteration."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from math import log10, prod
 
 import numpy as np
@@ -21,6 +16,7 @@ from scas4d_core.guards import SMALLEST_SQUARE
 from scas4d_core.kernels import image_loss
 from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Drawing, Gradients, Picture
 from scas4d_core.rasterize.limits import DEFAULT, Limits
+from scas4d_core.update.training_view import TrainingView, means
 
 Array = NDArray[np.float32]
 
@@ -28,43 +24,6 @@ CHANNELS = 4
 """Red, green, blue, label."""
 LABEL = 3
 """The label's channel."""
-
-
-@dataclass(frozen=True, eq=False)
-class TrainingView:
-    """One camera's pictures of one frame.
-
-    Attributes:
-        name: the camera's. camera: as kernels read it.
-        target: [C, H, W] float32, RGB in 0…1 and, where the frame has a mask, the mask; C is 3 or 4.
-        exposure: [C, 2] gain and offset of the camera; the label's are 1 and 0.
-        scratch: of the image loss, for pictures of this size.
-    """
-
-    name: str
-    camera: CameraArrays
-    target: Array
-    exposure: Array
-    scratch: Array
-
-    @cached_property
-    def moments(self) -> tuple[Array, Array]:
-        """[C, H, W] twice: SSIM's windowed means of the target and of its square; made when first asked for."""
-        means, squares = np.empty_like(self.target), np.empty_like(self.target)
-        image_loss.target_moments(self.target, self.scratch, means, squares)
-        return means, squares
-
-    @cached_property
-    def mean(self) -> NDArray[np.float64]:
-        """[3] of the picture, RGB in 0…1; made when first asked for."""
-        return means(self.target[:3])
-
-
-def means(planes: Array) -> NDArray[np.float64]:
-    """[C] mean of each of [C, H, W] planes; summed along rows in float32, which is twice as fast."""
-    _, height, width = planes.shape
-    result: NDArray[np.float64] = planes.sum(axis=2).sum(axis=1, dtype=np.float64) / (height * width)
-    return result
 
 
 class ViewFactory:

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from scas4d_core.effects.parts import Array, Arrays
 from scas4d_core.frame_outcome import Alarm, CameraTiming, Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.update.picture_loss import PictureLoss, TrainingView
+from scas4d_core.update.picture_loss import PictureLoss
 from scas4d_core.update.schedule import Stopping
+from scas4d_core.update.training_view import TrainingView
 from scas4d_core.update.warm_start import Motion
 
 REPORT = "report"

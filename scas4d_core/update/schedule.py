@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.settings import UpdateSettings
-from scas4d_core.update.picture_loss import TrainingView, view_order
+from scas4d_core.update.picture_loss import view_order
+from scas4d_core.update.training_view import TrainingView
 
 NEIGHBOUR_SAMPLE = 4000
 """Gaussians whose neighbours are looked at an iteration: what the neighbour terms cost does not grow with the scene."""

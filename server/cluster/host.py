@@ -38,7 +38,7 @@ class Gone:
 
 @dataclass(frozen=True)
 class Manner:
-    """How processes run on the service's machine; Ray starts its own otherwise.
+    """Sets how processes run: as on the machine of the service; Ray starts its own otherwise.
 
     Attributes:
         threads: OMP_NUM_THREADS, which Ray sets to an actor's CPUs. nice: niceness, which Ray raises by 15: a worker

@@ -22,6 +22,8 @@ from scas4d_core.storage.history import History
 from studies.options import Echo
 from studies.scale.footage import Size, known, rig, shown, wall
 
+SCENE = {"metres_per_unit": 1.0, "background": (0.0, 0.0, 0.0)}
+"""That of the footage: with another background, what stands would be found to be wrong, and mended."""
 ITERATIONS = 100
 """Of an update, at every size: those of the paper."""
 FIRST_ITERATIONS = 100
@@ -81,7 +83,7 @@ def cost(size: Size) -> Cost:
     """Measures a size in this process."""
     settings = Settings.model_validate(
         {
-            "scene": {"metres_per_unit": 1.0},
+            "scene": SCENE,
             "static": {"iterations": FIRST_ITERATIONS, "max_gaussians": size.gaussians},
             "update": {"iterations": ITERATIONS},
         }
@@ -114,7 +116,7 @@ def growth(frames: Sequence[int], *, folder: bool) -> dict[int, float]:
     from tempfile import TemporaryDirectory
 
     size = Size(gaussians=2_000, width=64, height=64, cameras=4)
-    settings = Settings.model_validate({"scene": {"metres_per_unit": 1.0}, "update": {"iterations": 2}})
+    settings = Settings.model_validate({"scene": SCENE, "update": {"iterations": 2}})
     state, cameras = wall(size), rig(size)
     there = [shown(state, way, cameras) for way in range(TURN + 1)]
     found: dict[int, float] = {}

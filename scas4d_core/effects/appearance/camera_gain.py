@@ -27,7 +27,8 @@ from scas4d_core.gaussians import Gaussians
 if TYPE_CHECKING:
     from scas4d_core.rasterize.cpu import Gradients
     from scas4d_core.settings import Settings
-    from scas4d_core.update.picture_loss import PictureLoss, TrainingView
+    from scas4d_core.update.picture_loss import PictureLoss
+    from scas4d_core.update.training_view import TrainingView
 
 NAME = "camera_gain"
 FOOT = np.float32(0.055)

@@ -20,7 +20,8 @@ from scas4d_core.cameras import farthest_first
 from scas4d_core.gaussians import Gaussians
 
 if TYPE_CHECKING:
-    from scas4d_core.update.picture_loss import PictureLoss, TrainingView
+    from scas4d_core.update.picture_loss import PictureLoss
+    from scas4d_core.update.training_view import TrainingView
 
 SUBSETS = 6
 """Steps a frame, each from as many of the views as the others."""

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from scas4d_core.rasterize.cpu import Gradients
     from scas4d_core.rasterize.shading import Shading
     from scas4d_core.settings import Settings
-    from scas4d_core.update.picture_loss import PictureLoss, TrainingView
+    from scas4d_core.update.picture_loss import PictureLoss
+    from scas4d_core.update.training_view import TrainingView
 
 RATE_GLOSS, RATE_ENVIRONMENT, RATE_NEARNESS = 2e-3, 1e-2, 1e-3
 """Adam rates in an update, falling to a tenth; of the gloss see ``shading.gloss_rate``."""

@@ -22,11 +22,10 @@ from scas4d_core.gaussians import Gaussians
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Seen
     from scas4d_core.settings import Settings
-    from scas4d_core.update.picture_loss import PictureLoss, TrainingView
+    from scas4d_core.update.picture_loss import PictureLoss
+    from scas4d_core.update.training_view import TrainingView
 
 NAME = "shadows"
-SIDE = 8
-"""Pixels of the side of the squares whose mean colours are compared with frame 0's: their noise is small."""
 CHANGED = 0.02
 """Difference of a mean colour, RGB in 0…1, from which a square looks other than in frame 0."""
 HARDLY = 0.005
@@ -110,10 +109,8 @@ class Shadows(Effect):
 
 def _means(view: TrainingView) -> Array:
     """[h, w, 3] mean colours of the picture's whole squares, without the camera's exposure."""
-    height, width = view.target.shape[1] // SIDE, view.target.shape[2] // SIDE
-    part = view.target[:3, : height * SIDE, : width * SIDE].reshape(3, height, SIDE, width, SIDE)
-    gain, offset = view.exposure[:3, 0, None, None], view.exposure[:3, 1, None, None]
-    return np.ascontiguousarray(np.moveaxis((part.mean(axis=(2, 4)) - offset) / gain, 0, -1))
+    gain, offset = view.exposure[:3, 0], view.exposure[:3, 1]
+    return (view.squares - offset) / gain
 
 
 def _compared(
@@ -128,6 +125,7 @@ def _hidden(view: TrainingView, state: Gaussians, picture: PictureLoss) -> NDArr
     """[h, w] squares that what moves reaches."""
     from scas4d_core.rasterize.blocks import BLOCK, as_grid  # these load the kernels
     from scas4d_core.update.changed_pixels import reached
+    from scas4d_core.update.training_view import SIDE
 
     given = (state.means, state.factors, state.opacities, np.zeros((len(state), 4), np.float32))
     blocks = reached(picture.rasterizer, given, np.flatnonzero(state.moving), view.camera)

@@ -47,7 +47,7 @@ from scas4d_core.frame_outcome import Candidate
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Seen
     from scas4d_core.settings import Settings
-    from scas4d_core.update.picture_loss import TrainingView
+    from scas4d_core.update.training_view import TrainingView
 
 NAME = "pose_drift"
 CAMERAS = 4

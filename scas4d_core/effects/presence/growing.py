@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from scas4d_core.effects.evidence import FitTime
     from scas4d_core.effects.presence.novelty import Novelty
     from scas4d_core.gaussians import Gaussians
-    from scas4d_core.update.picture_loss import PictureLoss, TrainingView
+    from scas4d_core.update.picture_loss import PictureLoss
+    from scas4d_core.update.training_view import TrainingView
 
 Array = NDArray[np.float32]
 Float = NDArray[np.float64]

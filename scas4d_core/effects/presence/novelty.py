@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     from scas4d_core.cameras import Camera, Rig
     from scas4d_core.effects.evidence import Seen
     from scas4d_core.gaussians import Gaussians
-    from scas4d_core.update.picture_loss import PictureLoss, TrainingView
+    from scas4d_core.update.picture_loss import PictureLoss
     from scas4d_core.update.result import Thinned, UpdateTrace
+    from scas4d_core.update.training_view import TrainingView
 
 Bool = NDArray[np.bool_]
 Array = NDArray[np.float32]

@@ -21,9 +21,10 @@ from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.structure.neighbours import build_neighbours
 from scas4d_core.update import schedule
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.picture_loss import TrainingView, ViewFactory
+from scas4d_core.update.picture_loss import ViewFactory
 from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.schedule import ViewPlan
+from scas4d_core.update.training_view import TrainingView
 
 MADE = make_box()
 JITTER = np.random.default_rng(1).normal(0, 0.003, MADE.means.shape).astype(np.float32)

@@ -30,8 +30,9 @@ from scas4d_core.torch_backend.device_update import DeviceUpdate
 from scas4d_core.update import schedule
 from scas4d_core.update.deformation import CpuDeformation
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
+from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
 from scas4d_core.update.result import UpdateResult
+from scas4d_core.update.training_view import TrainingView
 from scas4d_core.update.warm_start import Motion
 
 MADE = make_box()

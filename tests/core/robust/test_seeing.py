@@ -19,9 +19,10 @@ from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.update.best_state import VIEWS, BestState, ProbeViews, by_size, mean_error, spread
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
+from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
 from scas4d_core.update.result import AttemptOptions
 from scas4d_core.update.schedule import Stopping
+from scas4d_core.update.training_view import TrainingView
 from studies.hard_frames.footage import ANGLE, SyntheticFootage
 from studies.hard_frames.scene import BALL, GOES, first_state, gone
 

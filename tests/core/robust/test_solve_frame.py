@@ -23,8 +23,9 @@ from scas4d_core.robust.update_input import UpdateInput
 from scas4d_core.settings import UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.update.best_state import COMMITTED, CONFIRMING
-from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
+from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
 from scas4d_core.update.result import AS_SET, AttemptOptions, UpdateResult, UpdateTrace, camera_fit
+from scas4d_core.update.training_view import TrainingView
 from scas4d_core.update.warm_start import Motion
 from studies.hard_frames.footage import SyntheticFootage
 from studies.hard_frames.scene import first_state, gone

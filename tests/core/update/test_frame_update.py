@@ -25,10 +25,11 @@ from scas4d_core.torch_backend import update as update_torch
 from scas4d_core.update import rates, schedule
 from scas4d_core.update.deformation import MAX_SCALE, CpuDeformation
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory, view_order
+from scas4d_core.update.picture_loss import PictureLoss, ViewFactory, view_order
 from scas4d_core.update.rates import Adam, Rates
 from scas4d_core.update.result import REPORT, AttemptOptions, Stopwatch, UpdateResult
 from scas4d_core.update.schedule import Stopping, ViewPlan, plan_samples
+from scas4d_core.update.training_view import TrainingView
 
 BEFORE = make_box()
 AFTER = moved(BEFORE)

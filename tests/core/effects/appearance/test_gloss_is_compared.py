@@ -24,9 +24,10 @@ from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.update.best_state import BestState, ProbeViews, mean_error
 from scas4d_core.update.deformation import CpuDeformation
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.picture_loss import PictureLoss, TrainingView, ViewFactory
+from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
 from scas4d_core.update.result import AttemptOptions, UpdateResult
 from scas4d_core.update.schedule import Stopping
+from scas4d_core.update.training_view import TrainingView
 
 BALL = sphere()
 PLAIN = BALL.replace(gloss=None, environment=None)

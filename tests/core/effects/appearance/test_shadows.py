@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from box_scene import make_box, make_rig, take_frame
@@ -13,6 +15,8 @@ from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
+from scas4d_core.update.picture_loss import ViewFactory
+from scas4d_core.update.training_view import SIDE
 
 RIG = make_rig()
 BOX = make_box()
@@ -109,3 +113,11 @@ def test_without_masks_it_waits_until_it_is_known_what_stands() -> None:
     assert scene._carried.effects[NAME]["c0"][..., 3].max() == 0  # nothing is known to hide anything
     known = Reconstruction.start(RIG, first, settings("auto"), static=StaticResult(STATE, {}, []))
     assert known._carried.switches[NAME].on
+
+
+def test_squares_are_means_of_whole_squares() -> None:
+    rng = np.random.default_rng(3)
+    view = ViewFactory(RIG).views(take_frame(0, 0, STATE, RIG), {})[0]
+    view = replace(view, target=rng.random((4, 21, 35), np.float32))
+    expected = view.target[:3, :16, :32].astype(np.float64).reshape(3, 2, SIDE, 4, SIDE).mean(axis=(2, 4))
+    np.testing.assert_allclose(view.squares, np.moveaxis(expected, 0, -1), rtol=1e-6)

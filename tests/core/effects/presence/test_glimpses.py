@@ -13,8 +13,9 @@ from scas4d_core.effects.presence.novelty import GLANCE, glance
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.rasterize.cpu import Picture
-from scas4d_core.update.picture_loss import PictureLoss, TrainingView
+from scas4d_core.update.picture_loss import PictureLoss
 from scas4d_core.update.result import ROWS, SHOWN, UpdateTrace
+from scas4d_core.update.training_view import TrainingView
 from tests.helpers.effect_cases.visited_room import known, scene, seen, visitor
 
 
