@@ -42,8 +42,8 @@ WINDOWS, LOSS, SPREAD, GRADIENT = np.uint8(1), np.uint8(2), np.uint8(4), np.uint
 """Bits of that which is computed of sixteen columns of a row: windowed quantities, the loss, its gradients filtered
 along the row, and those across rows, which are the gradient of the picture."""
 EVERYWHERE = np.full((1, 1), WINDOWS | LOSS | SPREAD | GRADIENT)
-LOSS_ALONE = np.full((1, 1), WINDOWS | LOSS)
-"""Of the whole picture."""
+LOSSES = WINDOWS | LOSS
+"""No gradient."""
 
 
 def near(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
@@ -58,16 +58,18 @@ def near(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
     [[1, 1, 0], [7, 7, 0], [7, 15, 0]]
     """
     height, width = shown.shape
-    sums = np.zeros((height + 1, width + 1), np.int32)
-    sums[1:, 1:] = shown.cumsum(axis=0, dtype=np.int32).cumsum(axis=1)
-    rows, columns = np.arange(height)[:, None], np.arange(0, width, lanes.COUNT)
-    result = np.zeros((height, len(columns)), np.uint8)
-    for what, up, across in ((WINDOWS, 2, 1), (LOSS, 1, 1), (SPREAD, 1, 1), (GRADIENT, 0, 0)):
-        top, bottom = np.maximum(rows - up * REACH, 0), np.minimum(rows + 1 + up * REACH, height)
-        left = np.maximum(columns - across * REACH, 0)
-        right = np.minimum(columns + lanes.COUNT + across * REACH, width)
-        count = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
-        result |= np.where(count > 0, what, np.uint8(0))
+    columns = stride(width) // lanes.COUNT
+    bytes_of_rows = np.zeros((height, (columns + 2) * lanes.COUNT), np.uint8)  # and sixteen columns on either side
+    bytes_of_rows[:, lanes.COUNT : lanes.COUNT + width] = shown
+    eights = bytes_of_rows.view("<u8").reshape(height, columns + 2, 2)
+    inside = (eights[:, 1:-1, 0] | eights[:, 1:-1, 1]) != 0
+    beside = (eights[:, :-2, 1] >> np.uint64(8 * (8 - REACH))) | (eights[:, 2:, 0] << np.uint64(8 * (8 - REACH)))
+    sums = np.zeros((height + 1, columns), np.int32)
+    np.cumsum(inside | (beside != 0), axis=0, out=sums[1:])
+    rows, result = np.arange(height), np.where(inside, GRADIENT, np.uint8(0))
+    for what, up in ((WINDOWS, 2 * REACH), (LOSS | SPREAD, REACH)):
+        some = sums[np.minimum(rows + 1 + up, height)] > sums[np.maximum(rows - up, 0)]
+        result |= np.where(some, what, np.uint8(0))
     return result
 
 
@@ -260,12 +262,13 @@ def loss_of_row(
         b2 = square - m1 * m1 + lanes.load_first(target_squares, there + x, width - x) - m2 * m2 + C2
         inverse = lanes.fill(ONE) / (b1 * b2)
         ssim = a1 * a2 * inverse
-        by_cross = TWO * a1 * inverse
-        by_square = -ssim * b1 * inverse
-        by_mean = TWO * (m2 * a2 * inverse - ssim * m1 * b2 * inverse - m1 * by_square) - m2 * by_cross
-        lanes.store(rows, PAD + x, lanes.only_first(by_mean, width - x))
-        lanes.store(rows, pitch + 3 * PAD + x, lanes.only_first(by_square, width - x))
-        lanes.store(rows, 2 * pitch + 5 * PAD + x, lanes.only_first(by_cross, width - x))
+        if asked(SPREAD, wanted, y, x):
+            by_cross = TWO * a1 * inverse
+            by_square = -ssim * b1 * inverse
+            by_mean = TWO * (m2 * a2 * inverse - ssim * m1 * b2 * inverse - m1 * by_square) - m2 * by_cross
+            lanes.store(rows, PAD + x, lanes.only_first(by_mean, width - x))
+            lanes.store(rows, pitch + 3 * PAD + x, lanes.only_first(by_square, width - x))
+            lanes.store(rows, 2 * pitch + 5 * PAD + x, lanes.only_first(by_cross, width - x))
         difference = exposed(lanes.load_first(image, here + x, width - x), gain, offset)
         difference = lanes.only_first(difference - lanes.load_first(target, there + x, width - x), width - x)
         squared += difference * difference
@@ -325,7 +328,7 @@ def image_loss(
         target, target_means, target_squares: [C, H, W]. weights: [C] weight of each channel's mean.
         pixels: that the mean is taken over; H W for a whole picture.
         scratch: [6, C, H + 10, stride(W)], its upper and lower 5 rows 0: three windowed quantities, their gradients.
-        wanted: see ``near``, ``EVERYWHERE``, ``LOSS_ALONE``.
+        wanted: see ``near``, ``EVERYWHERE``.
         g_image: out [>= C, >= H, >= W] dL/dimage, where it is wanted; elsewhere anything. losses: out [C, H, 2], each
             row's share of the loss and its sum of squared differences.
         g_exposure: out [C, H, 2], each row's share of the gradient of gain and offset.

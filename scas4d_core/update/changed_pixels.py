@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import SMALLEST_SQUARE
-from scas4d_core.kernels import image_loss, tiles
+from scas4d_core.kernels import image_loss, lanes, tiles
 from scas4d_core.rasterize.blocks import pixels_of, widened
 from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Drawing, Gradients, Picture
 from scas4d_core.rasterize.limits import DEFAULT, Limits
@@ -46,10 +46,11 @@ class Region:
         rows: [R] int64, the Gaussians drawn, ascending. learnt: [R] uint8, 1 for the moving. moving: [M] int64, which
             of the R these are.
         box: rows and columns of the picture that hold the blocks and ``REACH`` around.
-        near: [h, columns] uint8, where in the box the losses can change, see ``image_loss.near``.
+        near: [h, columns] uint8, where in the box the losses can change, see ``image_loss.near``: elsewhere they are
+            in ``rest``.
         view: whose pictures the following belong to; None: nobody's yet.
         target: [C, h, w], moments: twice the same, of the view in the box. rest: image loss, mask loss and squared
-            error of the view outside of the box.
+            error of the view where they cannot change.
     """
 
     blocks: NDArray[np.uint64]
@@ -206,11 +207,8 @@ class ChangedPixels(PictureLoss):
         where = (slice(None), *region.box)
         region.view, region.target = view, np.ascontiguousarray(view.target[where])
         region.moments = (np.ascontiguousarray(view.moments[0][where]), np.ascontiguousarray(view.moments[1][where]))
-        whole = self._losses(base, view, view.target, view.moments, image_loss.LOSS_ALONE, base)
+        region.rest = self._losses(base, view, view.target, view.moments, _around(region, view), base)
         view.__dict__.pop("moments", None)  # those of the box are kept, and nobody needs both
-        part = np.ascontiguousarray(base[where])
-        near = region.near & (image_loss.WINDOWS | image_loss.LOSS)
-        region.rest = whole - self._losses(part, view, region.target, region.moments, near, part)
 
     def _base(self, view: TrainingView) -> Array:
         """[4, H, W] of what stands alone."""
@@ -306,12 +304,29 @@ def _key(view: TrainingView) -> tuple[str, int, int]:
 
 
 def _box(shown: NDArray[np.bool_]) -> tuple[slice, slice]:
-    """Smallest box around what is shown, with ``REACH`` pixels around; of nothing a corner."""
+    """Box around what is shown that has the windows of all losses which that changes; of nothing a corner.
+
+    Its first column is one of the sixteens of the picture, so that those of ``image_loss.near`` are the picture's.
+    """
     rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
     if len(rows) == 0:
         return slice(0, 1), slice(0, 1)
     height, width = shown.shape
+    left, right = max(0, columns[0] - image_loss.REACH), columns[-1] + 1 + image_loss.REACH
     return (
         slice(max(0, rows[0] - REACH), min(height, rows[-1] + 1 + REACH)),
-        slice(max(0, columns[0] - REACH), min(width, columns[-1] + 1 + REACH)),
+        slice(
+            max(0, left // lanes.COUNT - 1) * lanes.COUNT,
+            min(width, image_loss.stride(right) + image_loss.REACH),
+        ),
     )
+
+
+def _around(region: Region, view: TrainingView) -> NDArray[np.uint8]:
+    """[H, columns] uint8, see ``image_loss.image_loss``: the losses of a view that are not those of a region."""
+    wanted = np.full((view.camera.height, image_loss.stride(view.camera.width) // lanes.COUNT), image_loss.LOSSES)
+    (rows, columns), near = region.box, region.near
+    first = columns.start // lanes.COUNT
+    here = wanted[rows, first : first + near.shape[1]]
+    here[near & image_loss.LOSS != 0] &= ~image_loss.LOSS
+    return wanted

@@ -130,7 +130,7 @@ def test_a_part_has_the_bits_of_the_whole(black: bool) -> None:
     assert np.isnan(gradient).mean() > 0.5  # little else was computed
     untouched, base = found(before, near & (image_loss.WINDOWS | image_loss.LOSS))
     assert np.isnan(untouched).all()
-    _, alone = found(before, image_loss.LOSS_ALONE)
+    _, alone = found(before, np.full((1, 1), image_loss.LOSSES))
     np.testing.assert_allclose(alone, found(before, image_loss.EVERYWHERE)[1])
     np.testing.assert_allclose(alone - base + losses, whole, rtol=1e-6)
     assert abs(whole[0] - alone[0]) > 1e-4
