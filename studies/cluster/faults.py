@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 
 from server.storage.fencing import epoch_read, epochs
 from server.storage.layout import DataFolder, epoch_folder
@@ -44,10 +45,11 @@ def killed_nodes(
             thread.start()
             for _ in range(moments.count(index)):
                 time.sleep(random_.uniform(0, 1.5 * update_s))
-                nodes.kill(_node_of(service, nodes, scene, killed))
+                node, before = _node_of(service, nodes, scene, killed), service.worker_pid(scene)
+                nodes.kill(node)
                 began = time.monotonic()
                 nodes.add()
-                _until(lambda: _works(service, scene), "the scene did not go on")
+                _until(partial(_works, service, scene, before), "the scene did not go on")
                 pauses.append(time.monotonic() - began)
                 echo(f"killed the node at frame {index}: {len(pauses)} of {count}, on after {pauses[-1]:.1f} s")
             thread.join()
@@ -175,8 +177,10 @@ def _send(sender: FrameSender, indices: range) -> None:
         sender.send(index)
 
 
-def _works(service: Service, scene: str) -> bool:
-    """True where the worker has a frame again, or nothing left to do."""
+def _works(service: Service, scene: str, before: int | None) -> bool:
+    """True where another worker than that before has a frame, or nothing left to do."""
+    if service.worker_pid(scene) in (None, before):
+        return False
     status = service.status(scene)
     return status.state == "updating" or status.queued == 0
 
