@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 import time
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -14,6 +15,8 @@ from server.cluster.needs import Needs
 
 RAYS_OWN = "ray.io/"
 """Prefix of labels that Ray gives a node."""
+LISTENS_S = 3.0
+"""A node that is there takes a connection within so long."""
 
 
 @dataclass(frozen=True)
@@ -37,11 +40,23 @@ def living_nodes() -> list[dict[str, Any]]:
 
 
 def is_lost(id: str) -> bool:
-    """True where a node is dead, or the head of the cluster does not say. Blocking."""
+    """True where a node is dead, nobody listens at its address, or the head of the cluster does not say. Blocking.
+
+    The head takes some seconds to find a node dead, and an actor of it is missed at once.
+    """
     try:
-        return id not in {node["NodeID"] for node in living_nodes()}
+        found = [node for node in living_nodes() if node["NodeID"] == id]
+        return not any(_listens(node["NodeManagerAddress"], node["NodeManagerPort"]) for node in found)
     except Exception:  # whatever Ray raises without its head
         return True
+
+
+def _listens(host: str, port: int) -> bool:
+    try:
+        with socket.create_connection((host, port), timeout=LISTENS_S):
+            return True
+    except OSError:
+        return False
 
 
 def cluster_of(

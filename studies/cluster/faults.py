@@ -54,12 +54,15 @@ def killed_nodes(
                 echo(f"killed the node at frame {index}: {len(pauses)} of {count}, on after {pauses[-1]:.1f} s")
             thread.join()
         service.finish(scene, len(study.frames))
-        faults = sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
+        folder = DataFolder(service.data).scene(scene)
+        faults = sender.check() + compare(digests(folder.states), expected)
+        if blamed := folder.journal.read_bytes().count(b'"fact":"died"'):
+            faults.append(f"a frame was held to blame for {blamed} of the nodes")
         faults += [f"the scene went on after {pause:.0f} s" for pause in pauses if pause > GOES_ON_S]
         lost = len(study.frames) - len(sender.receipts)
         longest = max(pauses, default=0.0)
         found = f"{lost} acknowledged frames lost, {len(expected)} states compared, on after at most {longest:.1f} s"
-        target = f"0 acknowledged frames lost, final state bit-identical, on within {GOES_ON_S:g} s"
+        target = f"0 acknowledged frames lost, final state bit-identical, no frame to blame, on within {GOES_ON_S:g} s"
         return ScenarioResult(f"a node killed at {count} random moments", target, found, faults)
 
 

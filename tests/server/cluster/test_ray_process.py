@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 import threading
 from collections.abc import Awaitable, Callable
 from typing import Any
@@ -17,6 +18,7 @@ from ray.exceptions import RayActorError, RayError  # noqa: E402
 
 from server.cluster.host import Gone, Started  # noqa: E402
 from server.cluster.needs import Needs  # noqa: E402
+from server.cluster.nodes import is_lost  # noqa: E402
 from server.processes.placement import Ended  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("default")
@@ -116,6 +118,19 @@ def run(test: Callable[[FakePlacement], Awaitable[None]]) -> None:
 
 def dies(words: str = "The actor died.\nmore") -> RayActorError:
     return RayActorError(error_msg=words)
+
+
+def test_a_node_at_whose_address_nobody_listens_is_lost_before_ray_finds_it_dead(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Else the frame at work is held to blame: Ray takes seconds to find a node dead, its actor is missed at once."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        node = {"NodeID": "a", "Alive": True, "NodeManagerAddress": "127.0.0.1", "NodeManagerPort": port}
+        monkeypatch.setattr("server.cluster.nodes.all_nodes", lambda: [node])
+        assert not is_lost("a")
+        assert is_lost("b")
+    assert is_lost("a")
 
 
 @pytest.mark.parametrize(("alive", "lost"), [(False, True), (True, False)])
