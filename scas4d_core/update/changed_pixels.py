@@ -207,7 +207,8 @@ class ChangedPixels(PictureLoss):
         where = (slice(None), *region.box)
         region.view, region.target = view, np.ascontiguousarray(view.target[where])
         region.moments = (np.ascontiguousarray(view.moments[0][where]), np.ascontiguousarray(view.moments[1][where]))
-        region.rest = self._losses(base, view, view.target, view.moments, _around(region, view), base)
+        wanted = _around(region.box, region.near, view.camera.height, view.camera.width)
+        region.rest = self._losses(base, view, view.target, view.moments, wanted, base)
         view.__dict__.pop("moments", None)  # those of the box are kept, and nobody needs both
 
     def _base(self, view: TrainingView) -> Array:
@@ -322,11 +323,14 @@ def _box(shown: NDArray[np.bool_]) -> tuple[slice, slice]:
     )
 
 
-def _around(region: Region, view: TrainingView) -> NDArray[np.uint8]:
-    """[H, columns] uint8, see ``image_loss.image_loss``: the losses of a view that are not those of a region."""
-    wanted = np.full((view.camera.height, image_loss.stride(view.camera.width) // lanes.COUNT), image_loss.LOSSES)
-    (rows, columns), near = region.box, region.near
-    first = columns.start // lanes.COUNT
+def _around(box: tuple[slice, slice], near: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
+    """[height, columns] uint8, see ``image_loss.image_loss``: the losses of a picture that a part does not have.
+
+    Args:
+        box, near: of the part, see ``Region``.
+    """
+    wanted = np.full((height, image_loss.stride(width) // lanes.COUNT), image_loss.LOSSES)
+    rows, first = box[0], box[1].start // lanes.COUNT
     here = wanted[rows, first : first + near.shape[1]]
     here[near & image_loss.LOSS != 0] &= ~image_loss.LOSS
     return wanted

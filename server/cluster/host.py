@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from server.cluster.marks import is_marked
+from server.health.oom import oom_kills
 from server.processes.placement import AnyProcess, Ended, Entry, Placement
 
 
@@ -31,9 +32,10 @@ class Started:
 
 @dataclass(frozen=True)
 class Gone:
-    """The process ended without being asked to, with this exit code."""
+    """The process ended without being asked to, with this exit code; `starved`: see `Ended`."""
 
     exit_code: int | None
+    starved: bool = False
 
 
 @dataclass(frozen=True)
@@ -97,6 +99,7 @@ class Host:
         self._process: AnyProcess | None = None
         self._early: dict[int, Any] = {}
         self._next = 0
+        self._oom_kills = oom_kills()
 
     async def start(self, entry: Entry, spec: Any) -> Started:
         """Starts the process."""
@@ -138,4 +141,4 @@ class Host:
 
     def _ended(self, why: Ended) -> None:
         self._process = None
-        self._said.put_nowait(Gone(why.exit_code))
+        self._said.put_nowait(Gone(why.exit_code, oom_kills() > self._oom_kills))

@@ -19,7 +19,7 @@ from server.cluster.folder import check_folder
 from server.cluster.host import Gone, Host, Manner, Started
 from server.cluster.marks import mark
 from server.cluster.needs import Needs, needs_of
-from server.cluster.nodes import Place, all_nodes, cluster_of, is_lost
+from server.cluster.nodes import Place, all_nodes, cluster_of, is_lost, living_nodes
 from server.cluster.services import announced, others
 from server.cluster.watch import NodeWatch
 from server.processes import worker
@@ -70,7 +70,7 @@ class RayPlacement(Placement):
         self._token = secrets.token_hex(3)
         self._started = 0
         self._announced: Any = None
-        self._siblings: Mapping[str, str] = {}
+        self._siblings: Mapping[str, str] | None = None
 
     async def open(self) -> None:
         """Joins the cluster, and checks that all nodes see the data folder.
@@ -99,8 +99,7 @@ class RayPlacement(Placement):
         data = self._server.data.resolve()
         await asyncio.to_thread(check_folder, data)
         await asyncio.to_thread(mark, data, self._token)
-        await self._watch.look()
-        log.info("scenes run on a Ray cluster of %d nodes", sum(node["Alive"] for node in self._watch.nodes))
+        log.info("scenes run on a Ray cluster of %d nodes", len(await asyncio.to_thread(living_nodes)))
 
     async def cluster(self) -> Cluster:
         """See `Placement`."""
@@ -205,8 +204,7 @@ class RayProcess:
         if started and not over:
             with contextlib.suppress(RayError, TimeoutError):
                 await asyncio.wait_for(self._actor.stop.remote(seconds), seconds + STOPPED_S)
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(self._kill(), STOPPED_S)
+        await asyncio.wait({self._beside(self._kill())}, timeout=STOPPED_S)  # it goes on where the head is silent
 
     async def _run(self, entry: Entry, spec: Any) -> None:
         role = self._needs.role
@@ -215,21 +213,21 @@ class RayProcess:
             while not self._over:
                 for message in await self._actor.take.remote():
                     if isinstance(message, Gone):
-                        self._end(Ended(message.exit_code))
+                        self._end(Ended(message.exit_code, starved=message.starved))
                     elif not self._over:
                         self._tell(message)
         except RayActorError as error:
             log.warning("actor %s is lost: %s", self._name, error)
             if self._node is not None and await self._is_lost(self._node):
-                self._end(Ended(None, f"the node of its {role} is lost", lost=True))
+                self._give_up(f"the node of its {role} is lost", lost=True)
             else:
-                self._end(Ended(None, f"the actor of its {role} ended: {_first_line(error)}"))
+                self._give_up(f"the actor of its {role} ended: {_first_line(error)}")
         except (RayError, _NotStarted) as error:
             log.warning("actor %s did not start: %s", self._name, error)
-            self._end(Ended(None, f"its {role} could not be started: {_first_line(error)}"))
+            self._give_up(f"its {role} could not be started: {_first_line(error)}")
         except Exception as error:  # whatever it is, the scene must not stand still
             log.exception("actor %s", self._name)
-            self._end(Ended(None, f"its {role} was given up: {type(error).__name__}: {error}"))
+            self._give_up(f"its {role} was given up: {type(error).__name__}: {error}")
 
     async def _begin(self, entry: Entry, spec: Any) -> None:
         """Starts the process, and says what it waits for as long as no node has room."""
@@ -248,6 +246,8 @@ class RayProcess:
         if started.fault is not None:
             raise _NotStarted(started.fault)
         self._pid, self._node = started.pid, started.node
+        if self._over:  # it was given up meanwhile
+            return
         self._placement.places[self._name] = Place(self._needs, started.node)
 
     async def _is_lost(self, node: str) -> bool:
@@ -268,7 +268,10 @@ class RayProcess:
         except RayActorError:
             pass  # `_run` learns of it, too, and says what became of it
         except RayError as error:  # it did not get the message, so it must not go on
-            self._end(Ended(None, f"a message did not reach its {self._needs.role}: {_first_line(error)}"))
+            self._give_up(f"a message did not reach its {self._needs.role}: {_first_line(error)}")
+
+    def _give_up(self, why: str, *, lost: bool = False) -> None:
+        self._end(Ended(None, why, lost=lost, starved=False))
 
     def _end(self, why: Ended) -> None:
         if not self._over:
@@ -281,10 +284,11 @@ class RayProcess:
         with contextlib.suppress(RayError, ValueError, OSError):
             await self._placement.asked(ray.kill, await asyncio.shield(self._making))
 
-    def _beside(self, coroutine: Coroutine[Any, Any, None]) -> None:
+    def _beside(self, coroutine: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         task = asyncio.get_running_loop().create_task(coroutine)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
+        return task
 
 
 def _first_line(error: BaseException) -> str:

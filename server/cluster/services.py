@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import socket
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import ray
@@ -56,32 +57,41 @@ def _authority(host: str, port: int) -> str:
     return f"[{number}]:{port}" if ":" in number else f"{number}:{port}"
 
 
-def others(word: str, known: Mapping[str, str]) -> dict[str, str]:
+def others(word: str, known: Mapping[str, str] | None) -> dict[str, str]:
     """Returns the addresses of the other services by the names of their actors. Blocking.
+
+    One that does not tell its address, as it begins or ends, has its name in place of it, which nobody answers.
 
     Args:
         word: of this service. known: what was returned before; returned again where Ray does not say.
+
+    Raises:
+        RuntimeError: Ray does not say, and nothing is known.
     """
     try:
         names = [name for name in ray.util.list_named_actors() if name.startswith(PREFIX) and name != PREFIX + word]
         node = str(ray.get_runtime_context().get_node_id())
     except (RayError, RuntimeError, ConnectionError) as error:
+        if known is None:
+            raise RuntimeError(f"the head of the cluster does not say which services there are: {error}") from error
         log.warning("the head of the cluster does not say which services there are: %s", error)
         return dict(known)
-    found: dict[str, str] = {}
+    before = {name: url for name, url in (known or {}).items() if name in names and url != name}
+    asked = _asked([name for name in names if name not in before])
+    return before | {name: url for name, (url, only) in asked.items() if only in (None, node)}
+
+
+def _asked(names: Sequence[str]) -> dict[str, tuple[str, str | None]]:
+    """What services tell of themselves; those that do not tell, with their name as address."""
+    found: dict[str, tuple[str, str | None]] = {name: (name, None) for name in names}
+    asked: dict[Any, str] = {}
     for name in names:
+        with contextlib.suppress(ValueError, RayError):  # it has ended meanwhile
+            actor: Any = ray.get_actor(name)
+            asked[actor.get.remote()] = name
+    for answer in ray.wait(list(asked), num_returns=len(asked), timeout=ASK_S)[0] if asked else ():
         try:
-            url, only = (known[name], None) if name in known else _asked(name)
-        except (RayError, ValueError) as error:  # it ends, or begins
-            log.info("service %s does not tell its address: %s", name, error)
-            continue
-        if only in (None, node):
-            found[name] = url
+            found[asked[answer]] = ray.get(answer)
+        except RayError as error:  # it ends, or begins
+            log.info("service %s does not tell its address: %s", asked[answer], error)
     return found
-
-
-def _asked(name: str) -> tuple[str, str | None]:
-    actor: Any = ray.get_actor(name)
-    found: Any = ray.get(actor.get.remote(), timeout=ASK_S)
-    url, only = found
-    return str(url), only

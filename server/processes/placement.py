@@ -37,16 +37,18 @@ class Ended(str):
 
     Attributes:
         exit_code: as in multiprocessing: −N for signal N; None where it is not known.
-        lost: its machine is gone, or cannot be reached.
+        lost: its machine is gone, or cannot be reached. starved: the kernel killed processes beside it for want of
+            memory; None: this machine's control group tells.
     """
 
     exit_code: int | None
     lost: bool
+    starved: bool | None
 
-    def __new__(cls, exit_code: int | None, why: str = "", *, lost: bool = False) -> Ended:
+    def __new__(cls, exit_code: int | None, why: str = "", *, lost: bool = False, starved: bool | None = None) -> Ended:
         """Makes the sentence for an exit code, or takes another."""
         self = super().__new__(cls, why or f"its process ended by itself (exit code {exit_code})")
-        self.exit_code, self.lost = exit_code, lost
+        self.exit_code, self.lost, self.starved = exit_code, lost, starved
         return self
 
 

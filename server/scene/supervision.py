@@ -12,11 +12,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Coroutine
 from dataclasses import replace
-from pathlib import Path
 from statistics import median
 from typing import Any
 
 from scas4d_core.errors import message_of
+from server.health.oom import oom_kills
 from server.processes import worker
 from server.processes.messages import SceneSpec
 from server.processes.placement import AnyProcess, Ended, Placement
@@ -51,20 +51,6 @@ OVERDUE = 0.25
 """A frame that takes longer than predicted is predicted to take this share of its time so far again."""
 
 
-def oom_kills() -> int:
-    """Returns how many processes of this control group the kernel has killed for want of memory."""
-    try:
-        for line in Path("/proc/self/cgroup").read_text().splitlines():
-            number, _, path = line.partition("::")
-            if number == "0":
-                events = Path("/sys/fs/cgroup") / path.lstrip("/") / "memory.events"
-                counts = dict(pair.split() for pair in events.read_text().splitlines())
-                return int(counts.get("oom_kill", 0))
-    except (OSError, ValueError):  # no control groups here
-        pass
-    return 0
-
-
 class WorkerDeaths:
     """Counts the deaths of one scene's worker."""
 
@@ -81,17 +67,17 @@ class WorkerDeaths:
         """Notes that the worker works: it has committed a frame."""
         self._in_a_row = self._lost_in_a_row = 0
 
-    def died(self, exit_code: int | None, *, lost: bool = False) -> tuple[bool, float]:
-        """Notes that the worker is gone; `lost`: with its machine, and another one is waited for less.
+    def died(self, why: Ended) -> tuple[bool, float]:
+        """Notes that the worker is gone; where it is with its machine, another one is waited for less.
 
         Returns:
             True where it died by its own doing (it exited, or by a signal that only a fault of its own sends, or it was
             killed for want of memory); and the seconds to wait before it is started again.
         """
-        own = exit_code is not None and (exit_code > 0 or -exit_code in OWN_SIGNALS)
-        own = own or oom_kills() > self._oom_kills
+        own = why.exit_code is not None and (why.exit_code > 0 or -why.exit_code in OWN_SIGNALS)
+        own = own or (oom_kills() > self._oom_kills if why.starved is None else why.starved)
         self.count += 1
-        if lost:
+        if why.lost:
             self._lost_in_a_row += 1
             return False, min(LONGEST_DELAY_S, FIRST_DELAY_S * 2 ** max(0, self._lost_in_a_row - LOST_AT_ONCE))
         delay = min(LONGEST_DELAY_S, FIRST_DELAY_S * 2**self._in_a_row)

@@ -324,7 +324,7 @@ class Updates:
         if self._ledger.fatal is not None:
             return
         metrics.RESTARTS.labels("worker").inc()
-        own, delay = self.worker.deaths.died(reason.exit_code, lost=reason.lost)
+        own, delay = self.worker.deaths.died(reason)
         self.trouble = f"the worker is gone: {reason}; it is started again in {delay:g} s"
         log.error("scene %s: %s", self._ledger.scene, self.trouble)
         self._background.run(self._after_death(reason, own, delay))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import re
 from collections.abc import AsyncIterator, Callable, Iterator
@@ -29,6 +28,8 @@ KEPT_HERE = HOP_BY_HOP | {b"authorization", b"cookie", b"expect", b"forwarded", 
 """Headers of a request that this service has looked at: it asks the sibling in its own name."""
 OF_THE_SERVER = frozenset({b"date", b"server"})
 """Headers of an answer that the server of this service writes itself."""
+
+NOT_FOUND = 404
 
 log = logging.getLogger("scas4d.server")
 
@@ -62,7 +63,9 @@ class PassOn:
                 await self.app(scope, receive, send)
             elif scope["type"] == "websocket":
                 headers = siblings.headers(scope[PERMISSION])
-                await relay(address(owner, scope), scene, headers, self._most_bytes, scope, receive, send)
+                status = await relay(address(owner, scope), scene, headers, self._most_bytes, scope, receive, send)
+                if status == NOT_FOUND:
+                    siblings.forget(scene)
             else:
                 await self._pass(siblings, owner, scene, scope, receive, send)
         except Problem as problem:
@@ -92,13 +95,12 @@ class PassOn:
         leaving = asyncio.ensure_future(body.hung_up())
         try:
             await asyncio.wait({answering, leaving}, return_when=asyncio.FIRST_COMPLETED)
-            if answering.done() and answering.result() == 404 and scope["path"].endswith(scene):
+            if answering.done() and answering.result() == NOT_FOUND:  # of the scene, or of something in it
                 siblings.forget(scene)
         finally:
             for task in (answering, leaving):
                 task.cancel()
-                with contextlib.suppress(asyncio.CancelledError):
-                    await task
+            await asyncio.gather(answering, leaving, return_exceptions=True)
 
 
 class _Body:

@@ -18,6 +18,8 @@ from server.connections.websocket import limit_messages
 from server.problems import Problem
 from server.siblings.siblings import CONNECT_S, SILENT_S, unreachable
 
+SWITCHED = 101
+"""Of a handshake that is accepted."""
 RESTARTS, ABNORMAL = 1012, 1006
 """The service restarts; what stands for a connection that ended without a word, and is never sent."""
 
@@ -30,8 +32,8 @@ async def relay(
     scope: Scope,
     receive: Receive,
     send: Send,
-) -> None:
-    """Relays until either end closes.
+) -> int:
+    """Relays until either end closes; returns the status with which the sibling answered the handshake.
 
     Args:
         address: at the sibling, `http://…`. headers: for it. most_bytes: of a message of the client.
@@ -54,7 +56,7 @@ async def relay(
         )
     except InvalidStatus as refused:
         await _refused(refused, scope, receive, send)
-        return
+        return refused.response.status_code
     except (OSError, TimeoutError, WebSocketException):
         raise unreachable(scene) from None
     limit_messages(scope, most_bytes)
@@ -68,6 +70,7 @@ async def relay(
             for end in ends:
                 end.cancel()
             await asyncio.gather(*ends, return_exceptions=True)
+    return SWITCHED
 
 
 async def _connected(address: str) -> socket.socket:

@@ -65,8 +65,10 @@ class Siblings:
         self._addresses: Sequence[str] | None = None
         self._asked = -FRESH_S
         self._listing: asyncio.Task[None] | None = None
-        self._owners: OrderedDict[str, tuple[str, float]] = OrderedDict()
-        """Addresses by scene, and when they were last among the siblings."""
+        self._owners: OrderedDict[str, str] = OrderedDict()
+        """Addresses by scene."""
+        self._seen: dict[str, float] = {}
+        """When an address was last among the siblings."""
         self._unknown: OrderedDict[str, float] = OrderedDict()
 
     async def close(self) -> None:
@@ -86,6 +88,9 @@ class Siblings:
     async def _list(self) -> None:
         try:
             self._addresses = await self._listed()
+            now = time.monotonic()
+            seen = {address: when for address, when in self._seen.items() if now - when < REMEMBERED_S}
+            self._seen = seen | dict.fromkeys(self._addresses, now)
         except Exception:  # the cluster's head does not answer, or in words that nobody expects
             log.exception("siblings cannot be listed; those before are asked")
         finally:
@@ -105,19 +110,19 @@ class Siblings:
             Problem: 503, the one that had it, or one that may have it, does not answer.
         """
         siblings, now = await self.addresses(), time.monotonic()
-        known, when = self._owners.get(scene, (None, 0.0))
+        known = self._owners.get(scene)
         if known in siblings:
-            assert known is not None
-            _keep(self._owners, scene, (known, now), MOST_KNOWN)
             return known
+        if self._addresses is None:  # it is not known yet whom to ask
+            raise unreachable(scene)
         if now - self._unknown.get(scene, -FRESH_S) < FRESH_S:
             return None
         answers = await asyncio.gather(*(self._has(address, scene) for address in siblings))
         for address, has in zip(siblings, answers, strict=True):
             if has:
-                _keep(self._owners, scene, (address, now), MOST_KNOWN)
+                _keep(self._owners, scene, address, MOST_KNOWN)
                 return address
-        if None in answers or (known is not None and now - when < REMEMBERED_S):
+        if None in answers or (known in self._seen and now - self._seen[known] < REMEMBERED_S):
             raise unreachable(scene)
         self.forget(scene)
         _keep(self._unknown, scene, now, MOST_UNKNOWN)

@@ -68,6 +68,8 @@ def begin_epoch(states: Path, lock: Path) -> int:
             the same epoch. OSError: the disk does not do. Nothing is changed then.
     """
     heal(states)
+    for link in states.parent.glob(f".{states.name}.*.link"):  # that were never moved
+        link.unlink(missing_ok=True)
     if states.is_dir() and not states.is_symlink():
         _wait_for(lock)
         states.rename(epoch_folder(states, 0))
@@ -78,7 +80,8 @@ def begin_epoch(states: Path, lock: Path) -> int:
     try:
         _point(states, epoch)
     except OSError:
-        shutil.rmtree(epoch_folder(states, epoch), ignore_errors=True)
+        if epoch_read(states) != epoch:  # the link may have moved, and the disk not say so
+            shutil.rmtree(epoch_folder(states, epoch), ignore_errors=True)
         raise
     for early in sorted(epochs(states))[:-MOST_KEPT]:  # `sweep` waits for a worker that works
         shutil.rmtree(epoch_folder(states, early), ignore_errors=True)
@@ -86,12 +89,10 @@ def begin_epoch(states: Path, lock: Path) -> int:
 
 
 def sweep(states: Path, epoch: int) -> list[str]:
-    """Removes the folders of earlier epochs, whole or not, and links that were never moved; returns their names."""
+    """Removes the folders of earlier epochs, whole or not; returns their names."""
     gone = [path for path, number in _folders(states) if number < epoch]
     for path in gone:
         shutil.rmtree(path, ignore_errors=True)
-    for link in states.parent.glob(f".{states.name}.*.link"):
-        link.unlink(missing_ok=True)
     return sorted(path.name for path in gone)
 
 

@@ -53,18 +53,15 @@ def measure(
     try:
         for service in services.values():
             service.start()
-        lone = {name: _begun(study, service) for name, service in services.items()}
         for turn in range(turns):
+            lone = {name: _begun(study, service) for name, service in services.items()}
             for name in (PLACEMENTS, PLACEMENTS[::-1])[turn % 2]:
                 found[name].views += _views(services[name], lone[name], study.capture.full_rig.names[0], views)
             for name, seconds in _updates(study, services, lone).items():
                 found[name].updates += seconds
             for name, scene in lone.items():
                 services[name].http.delete(f"/v1/scenes/{scene}")
-            lone = {name: _begun(study, service) for name, service in services.items()}
             echo(f"turn {turn + 1} of {turns}: one scene")
-        for name, scene in lone.items():
-            services[name].http.delete(f"/v1/scenes/{scene}")
         for turn in range(turns):
             for name in (PLACEMENTS, PLACEMENTS[::-1])[turn % 2]:
                 found[name].throughput.append(_together(study, services[name], scenes))

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
+import os
 import random
 import shutil
 import threading
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 from server.storage.fencing import epoch_read, epochs
 from server.storage.layout import DataFolder, epoch_folder
 from studies.cluster.nodes import Nodes
 from studies.options import Echo
-from studies.service.faults import KILLS_OF_A_WORKER_AT_A_FRAME
 from studies.service.outcome import ScenarioResult
 from studies.service.process import PATIENCE_S, Service, StudyError
 from studies.service.study import AGAIN_S, FrameSender, Study, compare, digests, undisturbed
@@ -38,14 +38,13 @@ def killed_nodes(
     random_ = random.Random(seed)
     moments = [random_.randrange(1, len(study.frames)) for _ in range(count)]
     pauses: list[float] = []
-    killed: Counter[int] = Counter()
     with _running(study, "nodes") as (service, scene, sender):
         for index in range(len(study.frames)):
             thread = threading.Thread(target=sender.send, args=(index,))
             thread.start()
             for _ in range(moments.count(index)):
                 time.sleep(random_.uniform(0, 1.5 * update_s))
-                node, before = _node_of(service, nodes, scene, killed), service.worker_pid(scene)
+                node, before = _node_of(service, nodes, scene)
                 nodes.kill(node)
                 began = time.monotonic()
                 nodes.add()
@@ -74,7 +73,7 @@ def stopped_node(
         states = DataFolder(service.data).scene(scene).states
         _send(sender, _second_half(study, service, scene, sender))
         time.sleep(0.5 * update_s)
-        node = _node_of(service, nodes, scene)
+        node, _ = _node_of(service, nodes, scene)
         stale = epoch_read(states)
         assert stale is not None
         nodes.stop(node)
@@ -83,17 +82,17 @@ def stopped_node(
         pause = time.monotonic() - began
         echo(f"on after {pause:.1f} s; the node is continued")
         folder = epoch_folder(states, stale)
-        before = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
+        before = _changed(folder)
         nodes.resume(node)
         written: set[str] = set()
         until = time.monotonic() + 5 * update_s + 5
         while time.monotonic() < until:
-            if folder.is_dir():
-                now = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
-                written |= {name for name, changed in now.items() if before.get(name) != changed}
+            written |= {name for name, changed in _changed(folder).items() if before.get(name) != changed}
             time.sleep(AGAIN_S / 5)
         service.finish(scene, len(study.frames))
         faults = sender.check() + compare(digests(states), expected)
+        if not written:
+            faults.append("the old worker wrote nothing, so nothing was tried: run it again")
         until = time.monotonic() + SWEPT_S
         while len(epochs(states)) > 1 and time.monotonic() < until:
             time.sleep(AGAIN_S)
@@ -122,7 +121,7 @@ def restarted_head(
         sending.join()
         service.finish(scene, len(study.frames))
         deaths = service.status(scene).worker_deaths
-        node = _node_of(service, nodes, scene)
+        node, _ = _node_of(service, nodes, scene)
         nodes.kill(node)  # whether the head that came back places and watches
         nodes.add()
         _until(lambda: service.status(scene).worker_deaths > deaths, "a lost node was not noticed")
@@ -156,23 +155,24 @@ def _second_half(study: Study, service: Service, scene: str, sender: FrameSender
     return range(half, len(study.frames))
 
 
-def _node_of(service: Service, nodes: Nodes, scene: str, killed: Counter[int] | None = None) -> int:
-    """The node of the scene's worker, as soon as there is one.
-
-    Args:
-        killed: nodes by the frame at work; one that has had its share of kills is let through.
-    """
+def _node_of(service: Service, nodes: Nodes, scene: str) -> tuple[int, int]:
+    """The node of the scene's worker, and its process id, as soon as there is one."""
     until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
-        pid, status = service.worker_pid(scene), service.status(scene)
-        at_work = status.next_frame - status.queued
-        open_ = killed is None or killed[at_work] < KILLS_OF_A_WORKER_AT_A_FRAME
-        if pid is not None and open_ and (node := nodes.of(pid)) is not None:
-            if killed is not None:
-                killed[at_work] += 1
-            return node
+        pid = service.worker_pid(scene)
+        if pid is not None and (node := nodes.of(pid)) is not None:
+            return node, pid
         time.sleep(AGAIN_S)
     raise StudyError("the scene's worker is on no node")
+
+
+def _changed(folder: Path) -> dict[str, int]:
+    """When each file of a folder was changed last, by name; of one that goes meanwhile, nothing."""
+    found = {}
+    for name in os.listdir(folder) if folder.is_dir() else ():
+        with suppress(FileNotFoundError):
+            found[name] = (folder / name).stat().st_mtime_ns
+    return found
 
 
 def _send(sender: FrameSender, indices: range) -> None:

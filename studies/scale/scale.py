@@ -12,6 +12,7 @@ from pathlib import Path
 from statistics import median
 from time import perf_counter
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 
@@ -191,12 +192,15 @@ def plot(found: Mapping[str, Any], path: Path) -> None:
 def _kept(work: Path, asked: Mapping[str, Any]) -> Any:
     """The figures of a size, or of frames, from the folder; measured in a new process where it has none."""
     name = "-".join(f"{key}_{value}" for key, value in asked.items()).replace(" ", "").replace("[", "").replace("]", "")
-    file = work / f"{name}.json"
+    ways = crc32(json.dumps([SCENE, ITERATIONS, FIRST_ITERATIONS, UPDATES]).encode())  # what was measured otherwise
+    file = work / f"{name}-{ways:08x}.json"
     if not file.exists():
         done = subprocess.run(
             [sys.executable, "-m", "studies.scale.scale", json.dumps(asked)], capture_output=True, text=True, check=True
         )
-        file.write_text(done.stdout.splitlines()[-1])
+        part = file.with_suffix(".part")
+        part.write_text(done.stdout.splitlines()[-1])
+        part.replace(file)
     return json.loads(file.read_text())
 
 

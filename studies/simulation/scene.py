@@ -151,7 +151,7 @@ class SimulatedScene:
 
     def _worker_ended(self, reason: Ended) -> None:
         self._times.want(self.plan.name, "loss", self.plan.kind)
-        _, delay = self.worker.deaths.died(reason.exit_code, lost=reason.lost)
+        _, delay = self.worker.deaths.died(reason)
         self.trouble = f"the worker is gone: {reason}"
         self._background.run(self._after_death(reason, delay))
 

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.kernels import image_loss
 from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.rasterize.blocks import as_blocks, as_grid
 from scas4d_core.rasterize.cpu import CpuRasterizer
@@ -171,3 +172,43 @@ def test_blocks_and_their_grid_are_the_same() -> None:
     seen = np.repeat(np.repeat(grid, 4, 0), 4, 1)[: camera.height, : camera.width]
     assert picture.features[0].max() > 0.1
     assert not picture.features[0][~seen].any()
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_losses_of_the_box_and_around_it_are_those_of_the_whole_picture(seed: int) -> None:
+    """Of pictures of any size, whose width is no multiple of sixteen, with what changes anywhere."""
+    rng = np.random.default_rng(seed)
+    height, width = (int(size) for size in rng.integers((6, 6), (60, 100)))
+    shown = np.zeros((height, width), bool)
+    for _ in range(rng.integers(1, 4)):
+        row, column = rng.integers(0, (height, width))
+        shown[row : row + 6, column : column + 9] = True
+    before, target = rng.uniform(size=(2, 3, height, width)).astype(np.float32)
+    after = np.where(shown, rng.uniform(size=before.shape).astype(np.float32), before)
+    means, squares = np.empty_like(target), np.empty_like(target)
+    image_loss.target_moments(target, scratch_of(height, width), means, squares)
+
+    def found(image: np.ndarray, box: tuple[slice, slice], wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        image, truth, mean, square = (np.ascontiguousarray(array[:, *box]) for array in (image, target, means, squares))
+        rows, gradient = np.empty((3, image.shape[1], 2), np.float32), np.full_like(image, np.nan)
+        exposure = np.tile(np.array([1.1, 0], np.float32), (3, 1))
+        image_loss.image_loss(
+            image, exposure, truth, mean, square, np.ones(3, np.float32), height * width,
+            scratch_of(*image.shape[1:]), wanted, gradient, rows, np.empty_like(rows),
+        )  # fmt: skip
+        return rows.sum(axis=(0, 1), dtype=np.float64), gradient
+
+    all_of, box = (slice(height), slice(width)), changed_pixels._box(shown)
+    near = image_loss.near(shown[box])
+    rest, _ = found(before, all_of, changed_pixels._around(box, near, height, width))
+    changed, gradient = found(after, box, near)
+    whole, wanted = found(after, all_of, image_loss.EVERYWHERE)
+    np.testing.assert_allclose(rest + changed, whole, rtol=1e-5)
+    np.testing.assert_array_equal(gradient[:, shown[box]], wanted[:, shown])
+
+
+def scratch_of(height: int, width: int) -> np.ndarray:
+    """Scratch of the image loss for a picture, with what another one left in it."""
+    scratch = np.zeros((6, 3, height + 2 * image_loss.REACH, image_loss.stride(width)), np.float32)
+    scratch[:, :, image_loss.REACH : -image_loss.REACH] = np.nan
+    return scratch

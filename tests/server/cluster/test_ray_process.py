@@ -6,6 +6,7 @@ import asyncio
 import socket
 import threading
 from collections.abc import Awaitable, Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -20,6 +21,7 @@ from server.cluster.host import Gone, Started  # noqa: E402
 from server.cluster.needs import Needs  # noqa: E402
 from server.cluster.nodes import is_lost  # noqa: E402
 from server.processes.placement import Ended  # noqa: E402
+from server.settings import ServerSettings  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("default")
 NEEDS = Needs("worker", "scene", 1, 0, 1)
@@ -187,6 +189,53 @@ def test_a_message_that_cannot_be_taken_in_does_not_end_the_others(killed: list[
         assert running.ends[0].exit_code == 3
 
     run(test)
+
+
+def test_one_that_is_given_up_before_it_has_begun_is_not_listed(killed: list[Any]) -> None:
+    async def test(placement: FakePlacement) -> None:
+        placement.actor.begins.clear()
+
+        async def refused(number: int, message: Any) -> None:
+            raise RayError("no")
+
+        placement.actor.post = Remote(refused)
+        running = Running(placement)
+        running.process.send("a")
+        await until(lambda: running.ends)
+        placement.actor.begins.set()
+        await until(lambda: running.process.pid)
+        assert not placement.places
+
+    run(test)
+
+
+def test_one_that_is_stopped_while_the_head_is_silent_is_killed_later(
+    killed: list[Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ray_placement, "STOPPED_S", 0.05)
+
+    async def test(placement: FakePlacement) -> None:
+        placement.may_make.clear()
+        running = Running(placement)
+        await running.process.stop(0.05)
+        assert not killed
+        placement.may_make.set()
+        await until(lambda: killed == [placement.actor])
+
+    run(test)
+
+
+def test_nodes_are_not_asked_for_in_another_loop_than_they_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`open` runs in a loop of its own: an answer that came after its end was waited for without end."""
+    for name in ("check_folder", "mark"):
+        monkeypatch.setattr(ray_placement, name, lambda *arguments: None)
+    monkeypatch.setattr(ray_placement, "living_nodes", list)
+    monkeypatch.setattr(ray_placement.ray, "is_initialized", lambda: False)
+    monkeypatch.setattr(ray_placement.ray, "init", lambda **options: None)
+    placement = ray_placement.RayPlacement(None, None, ServerSettings(data=Path("data")))
+    asyncio.run(placement.open())
+    assert placement._watch._answer is None
+    assert placement._watch._asked < 0
 
 
 def test_messages_before_the_actor_is_made_are_posted_in_order_and_nothing_waits(killed: list[Any]) -> None:

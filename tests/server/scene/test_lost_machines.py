@@ -117,8 +117,8 @@ def test_states_go_to_other_machines_and_back(tmp_path):
 def test_machines_that_are_lost_one_after_another_are_given_more_and_more_time():
     """A frame may be what takes them down."""
     deaths = WorkerDeaths()
-    pauses = [deaths.died(None, lost=True)[1] for _ in range(12)]
+    pauses = [deaths.died(Ended(None, lost=True))[1] for _ in range(12)]
     assert pauses[:4] == [0.5, 0.5, 0.5, 1.0]
     assert pauses[-1] == LONGEST_DELAY_S
     deaths.committed()
-    assert deaths.died(None, lost=True) == (False, 0.5)
+    assert deaths.died(Ended(None, lost=True)) == (False, 0.5)

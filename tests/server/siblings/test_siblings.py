@@ -9,6 +9,7 @@ import json
 import socket
 import threading
 import time
+import types
 
 import httpx
 import numpy as np
@@ -20,9 +21,10 @@ from websockets.sync.client import connect
 
 from client.sdk import Client
 from client.wire.stream import STREAM_PROTOCOL
-from server.http.permissions import ALL, Permission
+from server.http.permissions import ALL, PERMISSION, Permission
 from server.processes.placement import Placement
 from server.siblings import siblings as module
+from server.siblings.passing import PassOn
 from server.siblings.siblings import Siblings
 
 TOKEN = "the token of all services 0123456789".replace(" ", "-")
@@ -269,6 +271,116 @@ def test_one_that_was_known_and_is_gone_is_waited_for(monkeypatch):
             await siblings.owner("x")
         monkeypatch.setattr(module, "REMEMBERED_S", 0.0)
         assert await siblings.owner("x") is None
+
+    asyncio.run(test())
+
+
+def test_it_is_seen_among_the_siblings_that_counts_not_when_its_scene_was_asked_for(monkeypatch):
+    monkeypatch.setattr(module, "FRESH_S", 0.0)
+    there, now = ["http://other"], [0.0]
+    monkeypatch.setattr(module, "time", types.SimpleNamespace(monotonic=lambda: now[0], time=time.time))
+
+    async def listed():
+        return list(there)
+
+    async def test():
+        client = httpx.AsyncClient(transport=httpx.MockTransport(lambda request: httpx.Response(200)))
+        siblings = Siblings(listed, None, client)
+        assert await siblings.owner("x") == "http://other"
+        now[0] = 700.0
+        assert await siblings.owner("y") == "http://other"
+        await asyncio.sleep(0.01)
+        there.clear()
+        now[0] = 701.0
+        with pytest.raises(module.Problem):
+            await siblings.owner("x")
+
+    asyncio.run(test())
+
+
+@pytest.mark.parametrize("fails", [True, False])
+def test_before_anybody_is_known_no_scene_is_known_not_to_be_there(monkeypatch, *, fails):
+    """A rig that sends at the service's start would be told that its scene is gone."""
+    monkeypatch.setattr(module, "LIST_S", 0.05)
+
+    async def listed():
+        if fails:
+            raise RuntimeError("the head does not answer")
+        await asyncio.Event().wait()
+
+    async def test():
+        siblings = Siblings(listed, None)
+        for _ in range(2):
+            with pytest.raises(module.Problem) as refused:
+                await siblings.owner("x")
+            assert refused.value.document.status == 503
+        await siblings.close()
+
+    asyncio.run(test())
+
+
+def test_one_that_does_not_tell_its_address_may_have_the_scene():
+    async def listed():
+        return ["service.a1b2c3"]
+
+    async def test():
+        siblings = Siblings(listed, None)
+        with pytest.raises(module.Problem):
+            await siblings.owner("x")
+        assert await siblings.scenes(ALL) == ([], ["service.a1b2c3"])
+        await siblings.close()
+
+    asyncio.run(test())
+
+
+def test_nothing_is_left_of_a_request_whose_sibling_goes():
+    """One task stayed for each frame that a rig sent meanwhile."""
+
+    class Gone(httpx.AsyncBaseTransport):
+        async def handle_async_request(self, request):
+            if request.method == "PUT":
+                raise httpx.ConnectError("gone")
+            return httpx.Response(200)
+
+    async def listed():
+        return ["http://other"]
+
+    async def test():
+        siblings, sent = Siblings(listed, None, httpx.AsyncClient(transport=Gone())), []
+
+        async def send(message):
+            sent.append(message)
+
+        passing = PassOn(None, lambda: siblings, lambda scene: False, 1000)
+        path = f"/v1/scenes/{NOBODYS}/frames/0"
+        headers = [(b"content-length", b"5")]
+        scope = {"type": "http", "method": "PUT", "path": path, "headers": headers, PERMISSION: ALL}
+        await passing(scope, lambda: asyncio.Event().wait(), send)
+        assert sent[0]["status"] == 503
+        assert asyncio.all_tasks() == {asyncio.current_task()}
+
+    asyncio.run(test())
+
+
+def test_an_owner_that_has_a_scene_no_more_is_forgotten():
+    """Its folder may be served at another address by now; a rig asks for nothing but its frames."""
+    answers = iter([200, 404])
+
+    class Nothing(httpx.AsyncByteStream):
+        async def __aiter__(self):
+            yield b""
+
+    async def test():
+        siblings = asked(lambda request: httpx.Response(next(answers), stream=Nothing()))
+
+        async def send(message):
+            pass
+
+        passing = PassOn(None, lambda: siblings, lambda scene: False, 1000)
+        path = f"/v1/scenes/{NOBODYS}/frames/0"
+        scope = {"type": "http", "method": "GET", "path": path, "headers": [], PERMISSION: ALL}
+        await passing(scope, lambda: asyncio.Event().wait(), send)
+        assert NOBODYS not in siblings._owners
 
     asyncio.run(test())
 
