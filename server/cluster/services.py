@@ -82,7 +82,7 @@ def others(word: str, known: Mapping[str, str] | None) -> dict[str, str]:
 
 
 def _asked(names: Sequence[str]) -> dict[str, tuple[str, str | None]]:
-    """What services tell of themselves; those that do not tell, with their name as address."""
+    """Asks services for their addresses; one that does not tell has its name as address."""
     found: dict[str, tuple[str, str | None]] = {name: (name, None) for name in names}
     asked: dict[Any, str] = {}
     for name in names:

@@ -167,7 +167,7 @@ def _node_of(service: Service, nodes: Nodes, scene: str) -> tuple[int, int]:
 
 
 def _changed(folder: Path) -> dict[str, int]:
-    """When each file of a folder was changed last, by name; of one that goes meanwhile, nothing."""
+    """Returns when each file of a folder was changed last, by name; nothing of one that goes meanwhile."""
     found = {}
     for name in os.listdir(folder) if folder.is_dir() else ():
         with suppress(FileNotFoundError):
