@@ -37,6 +37,8 @@ FIRST_DELAY_S, LONGEST_DELAY_S = 0.5, 30.0
 
 LOST_AT_ONCE = 3
 """Machines that are lost one after another without a pause; a frame may be what takes them down."""
+LONGEST_AFTER_LOST_S = 8.0
+"""The pause then: a scene whose machines go for other reasons goes on within half a minute."""
 
 SWEEP_AFTER_S = 120.0
 """The states of a worker that was given up are kept for so long: NFS shows a link as it was for up to a minute."""
@@ -79,7 +81,8 @@ class WorkerDeaths:
         self.count += 1
         if why.lost:
             self._lost_in_a_row += 1
-            return False, min(LONGEST_DELAY_S, FIRST_DELAY_S * 2 ** max(0, self._lost_in_a_row - LOST_AT_ONCE))
+            times = max(0, self._lost_in_a_row - LOST_AT_ONCE)
+            return False, min(LONGEST_AFTER_LOST_S, FIRST_DELAY_S * 2**times)
         delay = min(LONGEST_DELAY_S, FIRST_DELAY_S * 2**self._in_a_row)
         self._in_a_row += 1
         return own, delay

@@ -15,7 +15,7 @@ from scas4d_core.storage.history import History
 from server.processes import worker
 from server.processes.placement import Ended, Placement
 from server.scene import supervision
-from server.scene.supervision import LONGEST_DELAY_S, OTHER_DEATHS, WorkerDeaths
+from server.scene.supervision import LONGEST_AFTER_LOST_S, OTHER_DEATHS, WorkerDeaths
 from server.storage.fencing import epoch_read
 from server.storage.layout import DataFolder
 
@@ -119,6 +119,6 @@ def test_machines_that_are_lost_one_after_another_are_given_more_and_more_time()
     deaths = WorkerDeaths()
     pauses = [deaths.died(Ended(None, lost=True))[1] for _ in range(12)]
     assert pauses[:4] == [0.5, 0.5, 0.5, 1.0]
-    assert pauses[-1] == LONGEST_DELAY_S
+    assert pauses[-1] == LONGEST_AFTER_LOST_S
     deaths.committed()
     assert deaths.died(Ended(None, lost=True)) == (False, 0.5)
