@@ -69,7 +69,7 @@ class Node(Model):
     labels: dict[str, str] = Field(default_factory=dict, description="Those it was started with; none of Ray's own.")
     alive: bool
     cpus: float
-    cpus_taken: float = Field(description="By processes of this service's scenes, as they were estimated.")
+    cpus_taken: float = Field(description="By processes of all services that answer, as estimated.")
     gpus: float
     memory_mb: float
     memory_taken_mb: float

@@ -5,22 +5,39 @@ from __future__ import annotations
 import os
 import socket
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Request, Response
 
 from client.wire import Cluster, Node, RigModel
 from server.health.estimate import estimate, machine_mb
 from server.processes.placement import Placement
 from server.routes.access import AllScenes, TheSettings
+from server.scene.scenes import Scenes
+from server.settings import ServerSettings
+from server.siblings.clusters import together
+from server.siblings.siblings import PASSED, Siblings
 
 router = APIRouter(prefix="/v1/cluster", tags=["service"])
 
 
 @router.get("")
-async def get(request: Request, scenes: AllScenes, server: TheSettings) -> Cluster:
-    """Returns the machines on which scenes run. What they take is by the estimates of the scenes, not measured."""
+async def get(request: Request, response: Response, scenes: AllScenes, server: TheSettings) -> Cluster:
+    """Returns the machines on which scenes run. What they take is by the estimates of the scenes, not measured.
+
+    On a cluster with several services it is that of all their scenes; X-Unreachable names those that do not answer.
+    """
     placement: Placement = request.app.state.placement
-    if (found := await placement.cluster()) is not None:
-        return found
+    siblings: Siblings | None = request.app.state.siblings
+    found = await placement.cluster() or _alone(scenes, server)
+    if siblings is not None and PASSED not in request.headers:
+        others, silent = await siblings.clusters()
+        found = together(found, others)
+        if silent:
+            response.headers["X-Unreachable"] = ", ".join(silent)
+    return found
+
+
+def _alone(scenes: Scenes, server: ServerSettings) -> Cluster:
+    """Returns this machine, as the only one."""
     awake = sorted(id for id, scene in scenes.by_id.items() if scene.has_place)
     made = [scenes[id].spec for id in awake]
     taken = sum(estimate(RigModel.of(spec.rig), spec.settings, server).memory_mb for spec in made)

@@ -10,9 +10,9 @@ from collections.abc import Awaitable, Callable, Sequence
 from typing import TypeVar
 
 import httpx
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
-from client.wire import SceneList, SceneStatus
+from client.wire import Cluster, SceneList, SceneStatus
 from server.http.permissions import ALL, Permission
 from server.http.sharing import LONGEST_SECONDS, Sharing
 from server.problems import Problem
@@ -35,6 +35,7 @@ MOST_UNKNOWN = 1_000
 """Ids that nobody has, remembered for a moment: whoever tries out ids does not reach every sibling with each."""
 
 T = TypeVar("T")
+M = TypeVar("M", bound=BaseModel)
 
 log = logging.getLogger("scas4d.server")
 
@@ -134,18 +135,25 @@ class Siblings:
 
     async def scenes(self, permission: Permission) -> tuple[list[SceneStatus], list[str]]:
         """Returns the scenes of all siblings, and the addresses of those that do not answer."""
+        lists, silent = await self._every("/v1/scenes", permission, SceneList)
+        return list({status.id: status for found in lists for status in found.scenes}.values()), silent
+
+    async def clusters(self) -> tuple[list[Cluster], list[str]]:
+        """Returns what the siblings' scenes take of nodes, and the addresses of those that do not answer."""
+        return await self._every("/v1/cluster", ALL, Cluster)
+
+    async def _every(self, path: str, permission: Permission, model: type[M]) -> tuple[list[M], list[str]]:
         siblings = await self.addresses()
-        answers = await asyncio.gather(*(self._get(address, "/v1/scenes", permission) for address in siblings))
-        found: dict[str, SceneStatus] = {}
-        silent = []
+        answers = await asyncio.gather(*(self._get(address, path, permission) for address in siblings))
+        found, silent = [], []
         for address, answer in zip(siblings, answers, strict=True):
             try:
                 if answer is None or answer.status_code != 200:
                     raise ValueError(answer)
-                found |= {status.id: status for status in SceneList.model_validate_json(answer.content).scenes}
+                found.append(model.model_validate_json(answer.content))
             except (ValueError, ValidationError):  # a service of another version may have other words
                 silent.append(address)
-        return list(found.values()), silent
+        return found, silent
 
     async def _has(self, address: str, scene: str) -> bool | None:
         """Returns whether a sibling has a scene; None: it does not say."""

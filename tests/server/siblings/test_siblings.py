@@ -140,6 +140,23 @@ def test_all_scenes_are_listed_by_every_service(services, other):
     assert problem(third.get(f"/v1/scenes/{mine}"), 404)
 
 
+def test_the_cluster_is_told_with_the_scenes_of_every_service(services, other):
+    (first, second, third), _ = services
+    _, id = other
+    told = [client.get("/v1/cluster").json() for client in (first, second, third)]
+    assert all(id in found["nodes"][0]["scenes"] for found in told)
+    assert len({json.dumps(found["nodes"]) for found in told}) == 1
+    own = [client.get("/v1/cluster", headers={module.PASSED: "1"}).json()["nodes"][0] for client in (first, second)]
+    assert id in own[0]["scenes"]
+    assert id not in own[1]["scenes"]
+    assert told[1]["nodes"][0]["cpus_taken"] >= own[0]["cpus_taken"] + own[1]["cpus_taken"] >= 1
+    GONE.append("http://127.0.0.1:9")
+    try:
+        wait_for(lambda: "x-unreachable" in second.get("/v1/cluster").headers, PATIENCE_S)
+    finally:
+        GONE.clear()
+
+
 def test_streams_and_ingest_by_websocket(services, other):
     second, id = other
     _, token = services
