@@ -122,8 +122,8 @@ class RayPlacement(Placement):
 
     async def close(self) -> None:
         """Leaves the cluster; actors that are left end."""
+        self._threads.shutdown(wait=False, cancel_futures=True)  # what asks later would join a cluster again
         await asyncio.to_thread(ray.shutdown)
-        self._threads.shutdown(wait=False, cancel_futures=True)
 
     def start(
         self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[Ended], None]
@@ -281,7 +281,7 @@ class RayProcess:
             self._on_end(why)
 
     async def _kill(self) -> None:
-        with contextlib.suppress(RayError, ValueError, OSError):
+        with contextlib.suppress(RayError, ValueError, OSError, RuntimeError):
             await self._placement.asked(ray.kill, await asyncio.shield(self._making))
 
     def _beside(self, coroutine: Coroutine[Any, Any, None]) -> asyncio.Task[None]:

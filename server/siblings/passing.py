@@ -65,7 +65,7 @@ class PassOn:
                 headers = siblings.headers(scope[PERMISSION])
                 status = await relay(address(owner, scope), scene, headers, self._most_bytes, scope, receive, send)
                 if status == NOT_FOUND:
-                    siblings.forget(scene)
+                    await siblings.check(owner, scene)
             else:
                 await self._pass(siblings, owner, scene, scope, receive, send)
         except Problem as problem:
@@ -95,8 +95,8 @@ class PassOn:
         leaving = asyncio.ensure_future(body.hung_up())
         try:
             await asyncio.wait({answering, leaving}, return_when=asyncio.FIRST_COMPLETED)
-            if answering.done() and answering.result() == NOT_FOUND:  # of the scene, or of something in it
-                siblings.forget(scene)
+            if answering.done() and answering.result() == NOT_FOUND:  # the scene, or something in it
+                await siblings.check(owner, scene)
         finally:
             for task in (answering, leaving):
                 task.cancel()

@@ -71,6 +71,7 @@ class Siblings:
         self._seen: dict[str, float] = {}
         """When an address was last among the siblings."""
         self._unknown: OrderedDict[str, float] = OrderedDict()
+        self._checked: OrderedDict[str, float] = OrderedDict()
 
     async def close(self) -> None:
         """Ends connections to siblings."""
@@ -88,10 +89,10 @@ class Siblings:
 
     async def _list(self) -> None:
         try:
-            self._addresses = await self._listed()
+            before, self._addresses = self._addresses or (), await self._listed()
             now = time.monotonic()
             seen = {address: when for address, when in self._seen.items() if now - when < REMEMBERED_S}
-            self._seen = seen | dict.fromkeys(self._addresses, now)
+            self._seen = seen | dict.fromkeys((*before, *self._addresses), now)  # those before were there until now
         except Exception:  # the cluster's head does not answer, or in words that nobody expects
             log.exception("siblings cannot be listed; those before are asked")
         finally:
@@ -132,6 +133,14 @@ class Siblings:
     def forget(self, scene: str) -> None:
         """Forgets who has a scene: that one says it has it no more."""
         self._owners.pop(scene, None)
+
+    async def check(self, owner: str, scene: str) -> None:
+        """Forgets the owner of a scene where it says that it does not have it; asks once in a while."""
+        now = time.monotonic()
+        if now - self._checked.get(scene, -FRESH_S) >= FRESH_S:
+            _keep(self._checked, scene, now, MOST_UNKNOWN)
+            if await self._has(owner, scene) is False:
+                self.forget(scene)
 
     async def scenes(self, permission: Permission) -> tuple[list[SceneStatus], list[str]]:
         """Returns the scenes of all siblings, and the addresses of those that do not answer."""

@@ -22,8 +22,8 @@ from studies.captures import open_measured
 from studies.service.process import Service
 
 PACKAGES = ("scas4d_core", "server", "client")
-MOST_OF_A_FRAME, MOST_OF_A_RENDER = 61, 26
-"""They are 61 and 26. The tail of what came before a frame would cross files of its own."""
+MOST_OF_A_FRAME, MOST_OF_A_RENDER = 62, 26
+"""They are 62 and 26. The tail of what came before a frame would cross files of its own."""
 LATER = (3, 4)
 """The frames that are followed: frame 0 and the first updates have work of their own."""
 SETTINGS = {

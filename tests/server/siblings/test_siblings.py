@@ -381,7 +381,7 @@ def test_nothing_is_left_of_a_request_whose_sibling_goes():
 
 def test_an_owner_that_has_a_scene_no_more_is_forgotten():
     """Its folder may be served at another address by now; a rig asks for nothing but its frames."""
-    answers = iter([200, 404])
+    answers = iter([200, 404, 404])
 
     class Nothing(httpx.AsyncByteStream):
         async def __aiter__(self):
@@ -398,6 +398,35 @@ def test_an_owner_that_has_a_scene_no_more_is_forgotten():
         scope = {"type": "http", "method": "GET", "path": path, "headers": [], PERMISSION: ALL}
         await passing(scope, lambda: asyncio.Event().wait(), send)
         assert NOBODYS not in siblings._owners
+
+    asyncio.run(test())
+
+
+def test_a_frame_that_has_not_come_is_no_scene_that_is_gone():
+    """Else a viewer that asks for it makes each request of the rig ask all services again."""
+    calls = []
+
+    class Nothing(httpx.AsyncByteStream):
+        async def __aiter__(self):
+            yield b""
+
+    def handler(request):
+        calls.append(request.url.path)
+        return httpx.Response(404 if "frames" in request.url.path else 200, stream=Nothing())
+
+    async def test():
+        siblings = asked(handler)
+
+        async def send(message):
+            pass
+
+        passing = PassOn(None, lambda: siblings, lambda scene: False, 1000)
+        path = f"/v1/scenes/{NOBODYS}/frames/7"
+        scope = {"type": "http", "method": "GET", "path": path, "headers": [], PERMISSION: ALL}
+        for _ in range(4):
+            await passing(scope, lambda: asyncio.Event().wait(), send)
+        assert siblings._owners == {NOBODYS: "http://other"}
+        assert [found for found in calls if found != path] == [f"/v1/scenes/{NOBODYS}"] * 2
 
     asyncio.run(test())
 
