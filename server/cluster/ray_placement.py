@@ -19,7 +19,7 @@ from server.cluster.folder import check_folder
 from server.cluster.host import Gone, Host, Manner, Started
 from server.cluster.marks import mark
 from server.cluster.needs import Needs, needs_of
-from server.cluster.nodes import Place, all_nodes, cluster_of, is_lost, living_nodes
+from server.cluster.nodes import Place, all_nodes, cluster_of, is_lost
 from server.cluster.services import announced, others
 from server.cluster.watch import NodeWatch
 from server.processes import worker
@@ -99,7 +99,8 @@ class RayPlacement(Placement):
         data = self._server.data.resolve()
         await asyncio.to_thread(check_folder, data)
         await asyncio.to_thread(mark, data, self._token)
-        log.info("scenes run on a Ray cluster of %d nodes", len(await asyncio.to_thread(living_nodes)))
+        self._watch.saw(await asyncio.to_thread(all_nodes))  # not `look`: this loop ends, and an answer would be lost
+        log.info("scenes run on a Ray cluster of %d nodes", sum(node["Alive"] for node in self._watch.nodes))
 
     async def cluster(self) -> Cluster:
         """See `Placement`."""

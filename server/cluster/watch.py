@@ -68,9 +68,9 @@ class NodeWatch:
         self._answer = None
         self.answers = not answer.cancelled() and answer.exception() is None
         if self.answers:
-            self._compare(answer.result())
+            self.saw(answer.result())
 
-    def _compare(self, nodes: AllNodes) -> None:
+    def saw(self, nodes: AllNodes) -> None:
         """Notes which nodes are lost since the answer before."""
         self.nodes = nodes
         hosts = {node["NodeID"]: node["NodeManagerHostname"] for node in nodes}

@@ -53,9 +53,8 @@ def killed_nodes(
                 echo(f"killed the node at frame {index}: {len(pauses)} of {count}, on after {pauses[-1]:.1f} s")
             thread.join()
         service.finish(scene, len(study.frames))
-        folder = DataFolder(service.data).scene(scene)
-        faults = sender.check() + compare(digests(folder.states), expected)
-        if blamed := folder.journal.read_bytes().count(b'"fact":"died"'):
+        faults = sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
+        if blamed := service.deaths(scene):
             faults.append(f"a frame was held to blame for {blamed} of the nodes")
         faults += [f"the scene went on after {pause:.0f} s" for pause in pauses if pause > GOES_ON_S]
         lost = len(study.frames) - len(sender.receipts)

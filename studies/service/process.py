@@ -115,8 +115,12 @@ class Service:
         """The report of a frame."""
         return FrameReportModel.model_validate_json(self.http.get(f"/v1/scenes/{scene}/frames/{index}").content)
 
-    def finish(self, scene: str, frames: int) -> SceneStatus:
-        """Waits until so many frames are finished."""
+    def deaths(self, scene: str) -> int:
+        """Of workers, that frames of a scene are held to blame for."""
+        return DataFolder(self.data).scene(scene).journal.read_bytes().count(b'"fact":"died"')
+
+    def finish(self, scene: str, frames: int, every: float = EVERY_S) -> SceneStatus:
+        """Waits until so many frames are finished; looks every so many seconds."""
         until = time.monotonic() + PATIENCE_S
         while time.monotonic() < until:
             status = self.status(scene)
@@ -124,5 +128,5 @@ class Service:
                 return status
             if status.state == "failed":
                 raise StudyError(f"the scene failed: {status.error}")
-            time.sleep(EVERY_S)
+            time.sleep(every)
         raise StudyError(f"frames were not finished within {PATIENCE_S:g} s")

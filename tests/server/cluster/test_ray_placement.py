@@ -73,11 +73,6 @@ def states(service: Service, scene: str) -> Path:
     return DataFolder(service.data).scene(scene).states
 
 
-def deaths(service: Service, scene: str) -> int:
-    """Of workers, that frames are held to blame for."""
-    return DataFolder(service.data).scene(scene).journal.read_bytes().count(b'"fact":"died"')
-
-
 def cluster(service: Service) -> Cluster:
     return Cluster.model_validate_json(service.http.get("/v1/cluster").content)
 
@@ -137,7 +132,7 @@ def test_a_worker_that_dies_is_followed_by_one_of_the_next_epoch(service: Servic
     until(lambda: committed(service, scene) == 4)
     assert epoch_read(states(service, scene)) == 1
     assert service.status(scene).worker_deaths == 1
-    assert deaths(service, scene) == 1
+    assert service.deaths(scene) == 1
 
 
 def test_a_scene_goes_on_when_its_node_is_lost(service: Service, nodes: Nodes, scene: str) -> None:
@@ -148,7 +143,7 @@ def test_a_scene_goes_on_when_its_node_is_lost(service: Service, nodes: Nodes, s
     until(lambda: service.status(scene).state == "updating")
     nodes.kill(lost)
     until(lambda: committed(service, scene) == 5)
-    assert deaths(service, scene) == 0  # no frame is to blame
+    assert service.deaths(scene) == 0  # no frame is to blame
     assert node_of(service, nodes, scene) != lost
     assert [node.alive for node in cluster(service).nodes].count(False) == 1
     told = service.http.get("/metrics").text.splitlines()

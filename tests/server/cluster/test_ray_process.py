@@ -229,13 +229,15 @@ def test_nodes_are_not_asked_for_in_another_loop_than_they_are_looked_at(monkeyp
     """`open` runs in a loop of its own: an answer that came after its end was waited for without end."""
     for name in ("check_folder", "mark"):
         monkeypatch.setattr(ray_placement, name, lambda *arguments: None)
-    monkeypatch.setattr(ray_placement, "living_nodes", list)
+    node = {"NodeID": "a", "NodeManagerHostname": "host", "Alive": True}
+    monkeypatch.setattr(ray_placement, "all_nodes", lambda: [node])
     monkeypatch.setattr(ray_placement.ray, "is_initialized", lambda: False)
     monkeypatch.setattr(ray_placement.ray, "init", lambda **options: None)
     placement = ray_placement.RayPlacement(None, None, ServerSettings(data=Path("data")))
     asyncio.run(placement.open())
     assert placement._watch._answer is None
     assert placement._watch._asked < 0
+    assert list(placement._watch.nodes) == [node]  # one that is lost before anybody looks is known
 
 
 def test_messages_before_the_actor_is_made_are_posted_in_order_and_nothing_waits(killed: list[Any]) -> None:

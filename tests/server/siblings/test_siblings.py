@@ -350,6 +350,25 @@ def test_one_that_does_not_tell_its_address_may_have_the_scene():
     asyncio.run(test())
 
 
+class Nothing(httpx.AsyncByteStream):
+    """The body of an answer that has none, read as it comes."""
+
+    async def __aiter__(self):
+        yield b""
+
+
+async def passed_on(siblings, method, path, *headers):
+    """What the service sends that passes a request on; the client waits, and sends no more."""
+    sent = []
+
+    async def send(message):
+        sent.append(message)
+
+    scope = {"type": "http", "method": method, "path": path, "headers": list(headers), PERMISSION: ALL}
+    await PassOn(None, lambda: siblings, lambda scene: False, 1000)(scope, lambda: asyncio.Event().wait(), send)
+    return sent
+
+
 def test_nothing_is_left_of_a_request_whose_sibling_goes():
     """One task stayed for each frame that a rig sent meanwhile."""
 
@@ -363,16 +382,8 @@ def test_nothing_is_left_of_a_request_whose_sibling_goes():
         return ["http://other"]
 
     async def test():
-        siblings, sent = Siblings(listed, None, httpx.AsyncClient(transport=Gone())), []
-
-        async def send(message):
-            sent.append(message)
-
-        passing = PassOn(None, lambda: siblings, lambda scene: False, 1000)
-        path = f"/v1/scenes/{NOBODYS}/frames/0"
-        headers = [(b"content-length", b"5")]
-        scope = {"type": "http", "method": "PUT", "path": path, "headers": headers, PERMISSION: ALL}
-        await passing(scope, lambda: asyncio.Event().wait(), send)
+        siblings = Siblings(listed, None, httpx.AsyncClient(transport=Gone()))
+        sent = await passed_on(siblings, "PUT", f"/v1/scenes/{NOBODYS}/frames/0", (b"content-length", b"5"))
         assert sent[0]["status"] == 503
         assert asyncio.all_tasks() == {asyncio.current_task()}
 
@@ -383,20 +394,9 @@ def test_an_owner_that_has_a_scene_no_more_is_forgotten():
     """Its folder may be served at another address by now; a rig asks for nothing but its frames."""
     answers = iter([200, 404, 404])
 
-    class Nothing(httpx.AsyncByteStream):
-        async def __aiter__(self):
-            yield b""
-
     async def test():
         siblings = asked(lambda request: httpx.Response(next(answers), stream=Nothing()))
-
-        async def send(message):
-            pass
-
-        passing = PassOn(None, lambda: siblings, lambda scene: False, 1000)
-        path = f"/v1/scenes/{NOBODYS}/frames/0"
-        scope = {"type": "http", "method": "GET", "path": path, "headers": [], PERMISSION: ALL}
-        await passing(scope, lambda: asyncio.Event().wait(), send)
+        await passed_on(siblings, "GET", f"/v1/scenes/{NOBODYS}/frames/0")
         assert NOBODYS not in siblings._owners
 
     asyncio.run(test())
@@ -406,25 +406,15 @@ def test_a_frame_that_has_not_come_is_no_scene_that_is_gone():
     """Else a viewer that asks for it makes each request of the rig ask all services again."""
     calls = []
 
-    class Nothing(httpx.AsyncByteStream):
-        async def __aiter__(self):
-            yield b""
-
     def handler(request):
         calls.append(request.url.path)
         return httpx.Response(404 if "frames" in request.url.path else 200, stream=Nothing())
 
     async def test():
         siblings = asked(handler)
-
-        async def send(message):
-            pass
-
-        passing = PassOn(None, lambda: siblings, lambda scene: False, 1000)
         path = f"/v1/scenes/{NOBODYS}/frames/7"
-        scope = {"type": "http", "method": "GET", "path": path, "headers": [], PERMISSION: ALL}
         for _ in range(4):
-            await passing(scope, lambda: asyncio.Event().wait(), send)
+            await passed_on(siblings, "GET", path)
         assert siblings._owners == {NOBODYS: "http://other"}
         assert [found for found in calls if found != path] == [f"/v1/scenes/{NOBODYS}"] * 2
 
