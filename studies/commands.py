@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from studies.cluster.commands import cluster
+from studies.cluster.commands import cluster, head
 from studies.compact.commands import compact, opening
 from studies.effort.commands import effort
 from studies.exports.commands import exports
@@ -34,7 +34,7 @@ STUDIES = {
     "Accuracy against time": (frontier, effort, paper, variants),
     "Speed of the code": (kernels, device, moving, scale, startup),
     "Hard cases": (stability, timing),
-    "The running service": (faults, ingest, views, memory, sleeping, crossing, cluster, simulate),
+    "The running service": (faults, ingest, views, memory, sleeping, crossing, cluster, head, simulate),
 }
 """The commands by the heading under which `scripts/bench --help` lists them."""
 

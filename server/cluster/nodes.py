@@ -42,13 +42,32 @@ def living_nodes() -> list[dict[str, Any]]:
 def is_lost(id: str) -> bool:
     """True where a node is dead, nobody listens at its address, or the head of the cluster does not say. Blocking.
 
-    The head takes some seconds to find a node dead, and an actor of it is missed at once.
+    The head takes some seconds to find a node dead, and an actor of it is missed at once. Where this machine's own node
+    is dead, all actors of this service are lost with it.
     """
     try:
-        found = [node for node in living_nodes() if node["NodeID"] == id]
+        living = living_nodes()
+        found = [node for node in living if node["NodeID"] == id] if _own_is_in(living) else []
         return not any(_listens(node["NodeManagerAddress"], node["NodeManagerPort"]) for node in found)
     except Exception:  # whatever Ray raises without its head
         return True
+
+
+def own_node_is_lost() -> bool:
+    """True where the head of the cluster says that the node of this machine is dead. Blocking."""
+    try:
+        return not _own_is_in(living_nodes())
+    except Exception:  # whatever Ray raises without its head
+        return False
+
+
+def _own_is_in(nodes: Iterable[Mapping[str, Any]]) -> bool:
+    own = _own()
+    return any(node["NodeID"] == own for node in nodes)
+
+
+def _own() -> str:
+    return str(ray.get_runtime_context().get_node_id())
 
 
 def _listens(host: str, port: int) -> bool:

@@ -6,10 +6,10 @@ import asyncio
 import contextlib
 import logging
 import secrets
-import socket
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
+from weakref import WeakSet
 
 import ray
 from ray.exceptions import RayActorError, RayError
@@ -18,6 +18,7 @@ from client.wire import Cluster
 from server.cluster.folder import check_folder
 from server.cluster.host import Gone, Host, Manner, Started
 from server.cluster.marks import mark
+from server.cluster.membership import Membership
 from server.cluster.needs import Needs, needs_of
 from server.cluster.nodes import Place, all_nodes, cluster_of, is_lost
 from server.cluster.services import announced, others
@@ -27,11 +28,8 @@ from server.processes.messages import WaitsForNode
 from server.processes.placement import STOP_SECONDS, AnyProcess, Ended, Entry, Placement
 from server.settings import ServerSettings
 
-NAMESPACE = "scas4d"
 WAIT_S = 3.0
 """A worker that is not placed after so long says what it waits for."""
-REACH_S = 5.0
-"""The head of the cluster answers within so long."""
 LOST_S = 10.0
 """The head says within so long whether a node is lost."""
 THREADS = 8
@@ -65,11 +63,14 @@ class RayPlacement(Placement):
         # Of its own: the journals are written by those of the event loop, and the head of the cluster may not answer.
         self._threads = ThreadPoolExecutor(THREADS, "ray")
         self._watch = NodeWatch(all_nodes, threads=self._threads)
-        self._address = address
         self._server = server
+        self._membership = Membership(address)
+        self._processes: WeakSet[RayProcess] = WeakSet()
         self._token = secrets.token_hex(3)
         self._started = 0
+        self._listens: tuple[str, int] | None = None
         self._announced: Any = None
+        self._keeping: asyncio.Task[None] | None = None
         self._siblings: Mapping[str, str] | None = None
 
     async def open(self) -> None:
@@ -78,29 +79,20 @@ class RayPlacement(Placement):
         Raises:
             RuntimeError: there is no cluster, or a node does not see the folder.
         """
-        if ray.is_initialized():
-            return
-        try:
-            if self._address is not None:
-                await asyncio.to_thread(_reach, self._address)  # Ray would end this process where nobody listens
-            await asyncio.to_thread(
-                ray.init,
-                address=self._address or "auto",
-                namespace=NAMESPACE,
-                log_to_driver=True,
-                configure_logging=False,
-            )
-        except (OSError, ValueError, RayError) as error:
-            where = "on this machine" if self._address is None else f"at {self._address}"
-            raise RuntimeError(
-                f"there is no Ray cluster {where} ({error}); start one with `ray start --head`, or name its address: "
-                "--placement ray=HOST:6379"
-            ) from None
         data = self._server.data.resolve()
-        await asyncio.to_thread(check_folder, data)
-        await asyncio.to_thread(mark, data, self._token)
-        self._watch.saw(await asyncio.to_thread(all_nodes))  # not `look`: this loop ends, and an answer would be lost
-        log.info("scenes run on a Ray cluster of %d nodes", sum(node["Alive"] for node in self._watch.nodes))
+        if not ray.is_initialized():  # `serve` opens it in a loop of its own, to say what is wrong
+            await asyncio.to_thread(self._membership.join)
+            await asyncio.to_thread(check_folder, data)
+            await asyncio.to_thread(mark, data, self._token)
+            self._watch.saw(await asyncio.to_thread(all_nodes))  # not `look`: the answer would be lost with the loop
+            log.info("scenes run on a Ray cluster of %d nodes", sum(node["Alive"] for node in self._watch.nodes))
+        self._keeping = asyncio.get_running_loop().create_task(
+            self._membership.keep(on_loss=self._lose_all, on_return=self._announce)
+        )
+
+    def _lose_all(self) -> None:
+        for process in tuple(self._processes):
+            process.lose()
 
     async def cluster(self) -> Cluster:
         """See `Placement`."""
@@ -110,7 +102,12 @@ class RayPlacement(Placement):
 
     async def announce(self, host: str, port: int) -> None:
         """See `Placement`: an actor has the address, and goes with this service."""
-        self._announced = await self.asked(announced, self._token, host, port)
+        self._listens = host, port
+        await self._announce()
+
+    async def _announce(self) -> None:
+        if self._listens is not None:
+            self._announced = await self.asked(announced, self._token, *self._listens)
 
     async def siblings(self) -> Sequence[str]:
         """See `Placement`; what was known before where the head does not answer."""
@@ -124,7 +121,9 @@ class RayPlacement(Placement):
     async def close(self) -> None:
         """Leaves the cluster; actors that are left end."""
         self._threads.shutdown(wait=False, cancel_futures=True)  # what asks later would join a cluster again
-        await asyncio.to_thread(ray.shutdown)
+        if self._keeping is not None:
+            self._keeping.cancel()
+        await asyncio.to_thread(self._membership.leave)
 
     def start(
         self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[Ended], None]
@@ -137,21 +136,17 @@ class RayPlacement(Placement):
         epoch = spec.folder.epoch if entry is worker.main else self._started
         name = f"{needs.scene}.{needs.role}.{epoch}.{self._token}"
         self.places[name] = Place(needs)
-        return RayProcess(self, name, needs, (entry, spec), on_message, on_end)
+        process = RayProcess(self, name, needs, (entry, spec), on_message, on_end)
+        self._processes.add(process)
+        return process
 
     def host(self, name: str, needs: Needs) -> Any:
         """An actor for a process. Blocking: the head registers its name."""
+        self._membership.wait()
         made: Any = ray.remote(Host)
         return made.options(name=name, **needs.options()).remote(
             self.prepare, self._server.data.resolve(), self._token, Manner.here()
         )
-
-
-def _reach(address: str) -> None:
-    """Connects to the cluster's head and goes; an OSError where nobody answers."""
-    host, _, port = address.removeprefix("ray://").rpartition(":")
-    with socket.create_connection((host, int(port)), timeout=REACH_S):
-        pass
 
 
 class RayProcess:
@@ -177,6 +172,7 @@ class RayProcess:
         """Messages before there is an actor."""
         self._sent = 0
         self._over = False
+        self._lost = False
         self._actor: Any = None
         self._making: asyncio.Future[Any] = placement.asked(placement.host, name, needs)
         self._tasks: set[asyncio.Task[None]] = set()
@@ -199,13 +195,19 @@ class RayProcess:
 
     async def stop(self, seconds: float = STOP_SECONDS) -> None:
         """See `AnyProcess`."""
-        started, over, self._over = self._pid is not None, self._over, True
+        started, over, self._over = self._pid is not None, self._over or self._lost, True
         self._task.cancel()
         self._placement.places.pop(self._name, None)
         if started and not over:
             with contextlib.suppress(RayError, TimeoutError):
                 await asyncio.wait_for(self._actor.stop.remote(seconds), seconds + STOPPED_S)
         await asyncio.wait({self._beside(self._kill())}, timeout=STOPPED_S)  # it goes on where the head is silent
+
+    def lose(self) -> None:
+        """Gives it up with the cluster on which it ran, of which nothing can be asked any more."""
+        self._lost = True
+        self._task.cancel()
+        self._give_up("the Ray node of the service's machine is lost", lost=True)
 
     async def _run(self, entry: Entry, spec: Any) -> None:
         role = self._needs.role
@@ -282,6 +284,8 @@ class RayProcess:
             self._on_end(why)
 
     async def _kill(self) -> None:
+        if self._lost:
+            return
         with contextlib.suppress(RayError, ValueError, OSError, RuntimeError):
             await self._placement.asked(ray.kill, await asyncio.shield(self._making))
 

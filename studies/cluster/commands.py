@@ -42,3 +42,18 @@ def cluster(
     text = told(found, scenes)
     typer.echo(text)
     write_page(out, text)
+
+
+def head(
+    times: Annotated[int, typer.Option(min=1, help="Kills of the head.")] = 20,
+    out: Page = None,
+) -> None:
+    """Measures for how long nothing is placed when a cluster's head, with Redis, is killed and started again at once.
+
+    Example: scripts/bench head --times 20
+    """
+    from studies.cluster.silence import silences, told
+
+    text = told(silences(times, typer.echo))
+    typer.echo(text)
+    write_page(out, text)

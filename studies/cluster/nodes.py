@@ -34,7 +34,7 @@ class Nodes:
     def __init__(self, count: int = 3, cpus: float = 2, redis_server: str | None = None) -> None:
         from ray.cluster_utils import Cluster
 
-        self._redis = None if redis_server is None else _redis(redis_server)
+        self._redis = None if redis_server is None else redis(redis_server)
         os.environ.update({f"RAY_health_check_{name}": str(value) for name, value in HEALTH.items()})
         self._cpus = cpus
         self._cluster: Any = Cluster(
@@ -91,12 +91,17 @@ class Nodes:
         for pid in (node, *_below(node)):
             _signal(pid, signal.SIGSTOP)
 
+    def kill_node_of_head(self) -> None:
+        """`kill -9` of the node that the head's machine is; services that joined by it lose all their actors."""
+        self._cluster.head_node.kill_raylet()
+
     def stop_head(self) -> None:
-        """`kill -9` of the head's process."""
+        """`kill -9` of the head's process, and of its node: `ray start --block` ends both when one does."""
         self._cluster.head_node.kill_gcs_server()
+        self.kill_node_of_head()
 
     def start_head(self) -> None:
-        """Starts it again, at its address."""
+        """Starts it again, at its address; its node stays away, services join by another one of this machine."""
         self._cluster.head_node.start_gcs_server()
 
     def resume(self, node: int) -> None:
@@ -105,7 +110,7 @@ class Nodes:
             _signal(pid, signal.SIGCONT)
 
 
-def _redis(program: str) -> subprocess.Popen[bytes]:
+def redis(program: str) -> subprocess.Popen[bytes]:
     """A server of Redis in memory; Ray finds it by the environment."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -15,6 +15,10 @@ def simulate(
     failures: Annotated[int, typer.Option(min=20, help="Failures, of nodes, workers, the service, the head.")] = 1000,
     frames: Annotated[int, typer.Option(min=2, help="Frames of each scene.")] = 40,
     seed: Annotated[int, typer.Option(help="Of all that is drawn.")] = 0,
+    silent: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="The head of the cluster does not answer for so long, from and to, seconds.  [as measured]"),
+    ] = None,
     out: Page = None,
 ) -> None:
     """Simulates a big cluster by a virtual clock: is a frame lost or run twice, and how soon have scenes a place?
@@ -26,11 +30,12 @@ def simulate(
     from client.cli.extras import need_server
 
     need_server()
+    from studies.simulation.delays import HEAD_S
     from studies.simulation.simulate import Sizes
     from studies.simulation.simulate import simulate as run
     from studies.simulation.targets import rows, told
 
-    outcome = run(Sizes(scenes, nodes, failures, frames, seed))
+    outcome = run(Sizes(scenes, nodes, failures, frames, seed, silent or HEAD_S))
     text = told(outcome)
     typer.echo(text)
     write_page(out, text)

@@ -13,6 +13,9 @@ NOTICED_S: Range = (3.0, 9.0)
 TOLD_S: Range = (3.0, 6.0)
 """From then until the service is told: the rest of the 14 to 18 s that pass in all until a scene goes on."""
 
+HEAD_S: Range = (3.0, 4.5)
+"""The head does not answer for so long after its end: `scripts/bench head`, with Redis and a supervisor."""
+
 # Of Ray.
 
 PLACED_PER_S = 550.0
@@ -38,8 +41,6 @@ PAUSE_S: Range = (1.0, 240.0)
 """A node is stopped, or cut off, for so long; for less than Ray takes to notice, too."""
 REPLACED_S: Range = (30.0, 120.0)
 """A new node joins so long after one was killed, or came back too late."""
-HEAD_S: Range = (5.0, 20.0)
-"""The head does not answer for so long."""
 DOWN_S: Range = (1.0, 20.0)
 """From the service's end to its next start."""
 RECOVER_S = 5.0

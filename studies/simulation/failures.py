@@ -8,7 +8,7 @@ from enum import StrEnum
 from random import Random
 
 from studies.simulation.cluster import SimulatedCluster
-from studies.simulation.delays import HEAD_S, PAUSE_S
+from studies.simulation.delays import PAUSE_S, Range
 from studies.simulation.service import SimulatedService
 
 AGAIN_S = 5.0
@@ -54,13 +54,16 @@ def drawn(total: int, begin: float, end: float, random: Random) -> list[tuple[fl
 class Failures:
     """Lets them happen.
 
+    Args:
+        silent: the head does not answer for so long.
+
     Attributes:
         happened: number by kind.
     """
 
-    def __init__(self, cluster: SimulatedCluster, service: SimulatedService) -> None:
+    def __init__(self, cluster: SimulatedCluster, service: SimulatedService, silent: Range) -> None:
         self.happened: Counter[Failure] = Counter()
-        self._cluster, self._service = cluster, service
+        self._cluster, self._service, self._silent = cluster, service, silent
         self._restart: asyncio.Task[None] | None = None
 
     def plan(self, moments: list[tuple[float, Failure]]) -> None:
@@ -84,7 +87,7 @@ class Failures:
             case Failure.HEAD:
                 if not cluster.answers:
                     return False
-                cluster.head_down(random.uniform(*HEAD_S))
+                cluster.head_down(random.uniform(*self._silent))
             case Failure.WORKER:
                 if not (working := self._service.placement.working()):
                     return False

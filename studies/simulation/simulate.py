@@ -21,6 +21,7 @@ from server.storage.layout import DataFolder
 from studies.scale.footage import Size, rig
 from studies.simulation.clock import run_virtual
 from studies.simulation.cluster import SimulatedCluster
+from studies.simulation.delays import HEAD_S, Range
 from studies.simulation.failures import Failure, Failures, drawn
 from studies.simulation.record import FrameCounts, FrameRecord, TimeRecord, left_over
 from studies.simulation.scene import ScenePlan
@@ -57,7 +58,7 @@ class Sizes:
     """The size of a simulation.
 
     Attributes:
-        frames: of a scene.
+        frames: of a scene. silent: the head of the cluster does not answer for so long, seconds.
     """
 
     scenes: int = 5000
@@ -65,6 +66,7 @@ class Sizes:
     failures: int = 1000
     frames: int = 40
     seed: int = 0
+    silent: Range = HEAD_S
 
     @property
     def cpus(self) -> int:
@@ -134,7 +136,7 @@ async def _run(sizes: Sizes, data: DataFolder) -> Outcome:
     plans = _plans(sizes, data, specs, random)
     for plan, created in plans:
         loop.call_at(created, service.create, plan)
-    failures = Failures(cluster, service)
+    failures = Failures(cluster, service, sizes.silent)
     failures.plan(drawn(sizes.failures, CREATED_S, sizes.seconds, random))
     with takeovers.watched():
         await asyncio.sleep(sizes.seconds)

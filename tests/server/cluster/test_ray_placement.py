@@ -246,6 +246,26 @@ def test_another_service_of_the_cluster_passes_on_what_is_not_its_own(
     assert service.http.get(f"/v1/scenes/{scene}").status_code == 200
 
 
+def test_a_scene_goes_on_when_the_node_of_its_service_is_lost(service: Service, nodes: Nodes, scene: str) -> None:
+    """Ray ends all that was started by that node, wherever it runs; it places nothing more for a service that stays."""
+    other = Service(service.data.parent / "other", fakes.environment(SCAS4D_PLACEMENT=f"ray={nodes.address}"))
+    other.start()
+    try:
+        late = create(other.http)
+        sent(service, scene, range(2))
+        until(lambda: committed(service, scene) == 2)
+        nodes.kill_node_of_head()
+        sent(service, scene, range(2, 5))
+        until(lambda: committed(service, scene) == 5)
+        assert service.deaths(scene) == 0  # no frame is to blame
+        view = service.http.post(f"/v1/scenes/{scene}/render", json={"camera": "c0", "frame": 4})
+        assert view.status_code == 200, view.text
+        until(lambda: service.http.get(f"/v1/scenes/{late}").status_code == 200)  # they find one another again
+        other.http.delete(f"/v1/scenes/{late}")
+    finally:
+        other.stop()
+
+
 @pytest.mark.parametrize(
     ("placement", "words"),
     [

@@ -19,7 +19,7 @@ from ray.exceptions import RayActorError, RayError  # noqa: E402
 
 from server.cluster.host import Gone, Started  # noqa: E402
 from server.cluster.needs import Needs  # noqa: E402
-from server.cluster.nodes import is_lost  # noqa: E402
+from server.cluster.nodes import is_lost, own_node_is_lost  # noqa: E402
 from server.processes.placement import Ended  # noqa: E402
 from server.settings import ServerSettings  # noqa: E402
 
@@ -130,9 +130,23 @@ def test_a_node_at_whose_address_nobody_listens_is_lost_before_ray_finds_it_dead
         port = server.getsockname()[1]
         node = {"NodeID": "a", "Alive": True, "NodeManagerAddress": "127.0.0.1", "NodeManagerPort": port}
         monkeypatch.setattr("server.cluster.nodes.all_nodes", lambda: [node])
+        monkeypatch.setattr("server.cluster.nodes._own", lambda: "a")
         assert not is_lost("a")
         assert is_lost("b")
     assert is_lost("a")
+
+
+def test_all_nodes_are_lost_to_a_service_whose_own_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        node = {"NodeID": "a", "Alive": True, "NodeManagerAddress": "127.0.0.1", "NodeManagerPort": port}
+        monkeypatch.setattr("server.cluster.nodes.all_nodes", lambda: [node, {"NodeID": "own", "Alive": False}])
+        monkeypatch.setattr("server.cluster.nodes._own", lambda: "own")
+        assert is_lost("a")
+        assert own_node_is_lost()
+        monkeypatch.setattr("server.cluster.nodes._own", lambda: "a")
+        assert not is_lost("a")
+        assert not own_node_is_lost()
 
 
 @pytest.mark.parametrize(("alive", "lost"), [(False, True), (True, False)])
@@ -151,6 +165,22 @@ def test_a_node_is_lost_only_if_ray_says_so(
         assert end.lost is lost
         assert "\n" not in end
         await until(lambda: killed == [placement.actor])
+
+    run(test)
+
+
+def test_one_that_is_lost_with_its_cluster_is_told_and_not_asked_again(killed: list[Any]) -> None:
+    async def test(placement: FakePlacement) -> None:
+        running = Running(placement)
+        await until(lambda: running.process.pid)
+        running.process.lose()
+        (end,) = running.ends
+        assert end.lost
+        await running.process.stop(0.05)
+        running.process.lose()
+        assert running.ends == [end]
+        assert placement.places == {}
+        assert killed == []
 
     run(test)
 
@@ -232,7 +262,7 @@ def test_nodes_are_not_asked_for_in_another_loop_than_they_are_looked_at(monkeyp
     node = {"NodeID": "a", "NodeManagerHostname": "host", "Alive": True}
     monkeypatch.setattr(ray_placement, "all_nodes", lambda: [node])
     monkeypatch.setattr(ray_placement.ray, "is_initialized", lambda: False)
-    monkeypatch.setattr(ray_placement.ray, "init", lambda **options: None)
+    monkeypatch.setattr("server.cluster.membership.ray.init", lambda **options: None)
     placement = ray_placement.RayPlacement(None, None, ServerSettings(data=Path("data")))
     asyncio.run(placement.open())
     assert placement._watch._answer is None

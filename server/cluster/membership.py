@@ -1,0 +1,114 @@
+"""The service's membership of a Ray cluster: it joins by the node of its machine, and again once that is lost."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import socket
+import threading
+from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import ray
+from ray.exceptions import RayError
+
+from server.cluster.nodes import own_node_is_lost
+
+NAMESPACE = "scas4d"
+REACH_S = 5.0
+"""The head of the cluster answers within so long."""
+EVERY_S = 2.0
+"""Between two looks at whether the node of this machine is there, and between two tries to join again."""
+
+log = logging.getLogger("scas4d.server")
+
+
+class Membership:
+    """Joins, and stays.
+
+    A node that goes takes all actors with it that a service has started by it, wherever they run. The head's does each
+    time that its supervisor starts it again.
+
+    Args:
+        address: of the cluster's head, or None: that which runs on this machine, or that of RAY_ADDRESS.
+    """
+
+    def __init__(self, address: str | None) -> None:
+        self._address = address
+        self._is_member = threading.Event()
+        self._thread = ThreadPoolExecutor(1, "membership")
+        """Of its own: it waits for the head of the cluster as long as that takes."""
+
+    def join(self) -> None:
+        """Joins, unless this process has. Blocking.
+
+        Raises:
+            RuntimeError: there is no cluster, or this machine has no node of it.
+        """
+        if not ray.is_initialized():
+            try:
+                if self._address is not None:
+                    _reach(self._address)  # Ray would end this process where nobody listens
+                ray.init(
+                    address=self._address or "auto", namespace=NAMESPACE, log_to_driver=True, configure_logging=False
+                )
+            except (OSError, ValueError, RuntimeError, RayError) as error:
+                where = "on this machine" if self._address is None else f"at {self._address}"
+                raise RuntimeError(
+                    f"there is no Ray cluster {where} ({error}); start one with `ray start --head`, or name its "
+                    "address: --placement ray=HOST:6379"
+                ) from None
+        self._is_member.set()
+
+    def wait(self) -> None:
+        """Waits while the service joins again. Blocking."""
+        self._is_member.wait()
+
+    async def keep(self, on_loss: Callable[[], None], on_return: Callable[[], Awaitable[None]]) -> None:
+        """Looks after the node of this machine, for ever.
+
+        Args:
+            on_loss: called once the node, and so every actor of this service, is lost. on_return: called once the
+                service is a member again; tried again where it fails.
+        """
+        while True:
+            await asyncio.sleep(EVERY_S)
+            if await self._asked(own_node_is_lost):
+                log.error("the Ray node of this machine is lost, and all processes of scenes with it; joining again")
+                self._is_member.clear()
+                on_loss()
+                await self._until_done(lambda: self._asked(self._join_again))
+                await self._until_done(on_return)
+                log.info("the service has joined the cluster again")
+
+    def leave(self) -> None:
+        """Leaves; actors that are left end. Blocking."""
+        self._thread.shutdown(wait=False, cancel_futures=True)
+        ray.shutdown()
+        self._is_member.set()  # who waits gets an error of Ray's
+
+    def _join_again(self) -> None:
+        ray.shutdown()
+        self.join()
+
+    def _asked(self, function: Callable[[], Any]) -> asyncio.Future[Any]:
+        return asyncio.get_running_loop().run_in_executor(self._thread, function)
+
+    async def _until_done(self, call: Callable[[], Awaitable[None]]) -> None:
+        said = ""
+        while True:
+            try:
+                return await call()
+            except Exception as error:  # whatever Ray raises: the service must not stand still
+                if str(error) != said:
+                    said = str(error)
+                    log.warning("not a member of the cluster yet: %s", error)
+            await asyncio.sleep(EVERY_S)
+
+
+def _reach(address: str) -> None:
+    """Connects to the cluster's head and goes; an OSError where nobody answers."""
+    host, _, port = address.removeprefix("ray://").rpartition(":")
+    with socket.create_connection((host, int(port)), timeout=REACH_S):
+        pass

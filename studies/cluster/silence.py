@@ -1,0 +1,151 @@
+"""``scripts/bench head``: for how long a cluster's head is silent which a supervisor starts again as soon as it ends.
+
+The head, with Redis, and a node run on this machine, each with process ids and an address of its own, as on two
+machines: `ray start --head` refuses to start beside processes of another node.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from signal import SIGKILL
+from types import TracebackType
+from typing import Any, Self
+
+from studies.cluster.nodes import HEALTH, REDIS, STORE_BYTES, redis
+from studies.service.process import StudyError
+
+HEAD, NODE, PORT = "127.0.0.1", "127.0.0.2", 6397
+APART = ("unshare", "--pid", "--fork", "--mount-proc", "--kill-child")
+BETWEEN_S = (8.0, 14.0)
+"""The head is let alone for so long between two kills."""
+PATIENCE_S = 60.0
+
+
+class SupervisedCluster:
+    """A head whose end is followed by its start, and a node."""
+
+    def __init__(self) -> None:
+        if os.geteuid() != 0:
+            raise StudyError("this study needs root: it gives the head process ids of its own")
+        if (program := shutil.which("redis-server")) is None:
+            raise StudyError("this study needs redis-server: apt-get install redis-server")
+        os.environ.update({f"RAY_health_check_{name}": str(value) for name, value in HEALTH.items()})
+        self._redis = redis(program)
+        self._address_of_redis = os.environ.pop(REDIS)
+        self._over = False
+        self._running: list[subprocess.Popen[bytes]] = []
+        self._supervisor = threading.Thread(target=self._supervise, daemon=True)
+        self._supervisor.start()
+        _wait_for(lambda: _listens(PORT))
+        self._start("--address", f"{HEAD}:{PORT}", "--node-ip-address", NODE, "--num-cpus", "1")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._over = True
+        for process in self._running:
+            process.kill()
+            process.wait()
+        self._supervisor.join()
+        self._redis.kill()
+        self._redis.wait()
+
+    def _supervise(self) -> None:
+        while not self._over:
+            self._start("--head", "--node-ip-address", HEAD, "--port", str(PORT), "--num-cpus", "0").wait()
+
+    def _start(self, *options: str) -> subprocess.Popen[bytes]:
+        store = ("--object-store-memory", str(STORE_BYTES), "--block", "--disable-usage-stats")
+        started = subprocess.Popen(
+            [*APART, str(Path(sys.executable).with_name("ray")), "start", *options, *store],
+            env=os.environ | ({REDIS: self._address_of_redis} if "--head" in options else {}),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        self._running.append(started)
+        return started
+
+
+class Answers:
+    """An actor that says that it is there."""
+
+    def is_there(self) -> bool:
+        """True."""
+        return True
+
+
+def silences(count: int, echo: Callable[[str], None]) -> list[float]:
+    """Kills the head `count` times; seconds from each kill until an actor that was asked for then answers."""
+    import ray
+
+    found = []
+    with SupervisedCluster():
+        _wait_for(lambda: _joined(ray))
+        made: Any = ray.remote(Answers)
+        try:
+            for number in range(count):
+                time.sleep(random.uniform(*BETWEEN_S))
+                for pid in _heads():
+                    os.kill(pid, SIGKILL)
+                began = time.monotonic()
+                actor = made.options(num_cpus=0.1).remote()
+                ray.get(actor.is_there.remote(), timeout=PATIENCE_S)
+                found.append(time.monotonic() - began)
+                ray.kill(actor)
+                echo(f"{number + 1} of {count}: {found[-1]:.2f} s")
+        finally:
+            ray.shutdown()
+    return found
+
+
+def told(found: Sequence[float]) -> str:
+    """A sentence."""
+    ordered = sorted(found)
+    return (
+        f"An actor asked for when the head had been killed answered after {ordered[len(ordered) // 2]:.1f} s "
+        f"({ordered[0]:.1f} to {ordered[-1]:.1f} s; {len(ordered)} times)"
+    )
+
+
+def _joined(ray: Any) -> bool:
+    """True once this process is a member by the node, not by the head, and an actor answers."""
+    with contextlib.suppress(Exception):  # whatever Ray raises while the node begins
+        ray.init(address=f"{HEAD}:{PORT}", _node_ip_address=NODE, log_to_driver=False, logging_level="ERROR")
+        ray.get(ray.remote(Answers).options(num_cpus=0.1).remote().is_there.remote(), timeout=PATIENCE_S)
+        return True
+    ray.shutdown()
+    return False
+
+
+def _heads() -> Iterator[int]:
+    for path in Path("/proc").iterdir():
+        with contextlib.suppress(OSError):
+            if path.name.isdecimal() and (path / "comm").read_text().startswith("gcs_server"):
+                yield int(path.name)
+
+
+def _listens(port: int) -> bool:
+    with contextlib.suppress(OSError), socket.create_connection((HEAD, port), timeout=1):
+        return True
+    return False
+
+
+def _wait_for(done: Callable[[], bool]) -> None:
+    until = time.monotonic() + PATIENCE_S
+    while not done():
+        if time.monotonic() > until:
+            raise StudyError("the cluster did not start")
+        time.sleep(0.5)

@@ -1,0 +1,110 @@
+"""A service that loses the node of its machine: it gives up what ran, joins again, and is announced again."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable
+
+import pytest
+
+membership = pytest.importorskip("server.cluster.membership", reason="Ray is not installed: pip install 'scas4d[ray]'")
+
+
+class Cluster:
+    """A cluster that a service can lose."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.events: list[str] = []
+        self.lost = False
+        self.refuses = 0
+        self.inits = 0
+        self.joined = False
+        monkeypatch.setattr(membership, "EVERY_S", 0.01)
+        monkeypatch.setattr(membership, "own_node_is_lost", lambda: self.lost)
+        monkeypatch.setattr(membership.ray, "is_initialized", lambda: self.joined)
+        monkeypatch.setattr(membership.ray, "init", self._init)
+        monkeypatch.setattr(membership.ray, "shutdown", self._shutdown)
+
+    def _init(self, **options: object) -> None:
+        self.inits += 1
+        if self.refuses:
+            self.refuses -= 1
+            raise ConnectionError("no node on this machine")
+        self.joined, self.lost = True, False
+        self.events.append("joined")
+
+    def _shutdown(self) -> None:
+        self.joined = False
+        self.events.append("left")
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Cluster:
+    return Cluster(monkeypatch)
+
+
+async def until(done: Callable[[], object]) -> None:
+    for _ in range(500):
+        if done():
+            return
+        await asyncio.sleep(0.01)
+    raise AssertionError("it did not come")
+
+
+def test_what_ran_is_given_up_first_and_the_service_is_announced_last(cluster: Cluster) -> None:
+    member = membership.Membership(None)
+    member.join()
+    fails = [True]
+
+    async def announce() -> None:
+        if fails:
+            fails.pop()
+            raise ValueError("the name is taken")
+        cluster.events.append("announced")
+
+    async def test() -> None:
+        keeping = asyncio.ensure_future(member.keep(lambda: cluster.events.append("given up"), announce))
+        await asyncio.sleep(0.1)
+        assert cluster.events == ["joined"]  # nothing is lost
+        cluster.refuses = 2
+        cluster.lost = True
+        await until(lambda: "announced" in cluster.events)
+        keeping.cancel()
+
+    asyncio.run(test())
+    assert cluster.events == ["joined", "given up", "left", "left", "left", "joined", "announced"]
+    assert cluster.inits == 4
+
+
+def test_what_is_started_meanwhile_waits(cluster: Cluster) -> None:
+    member = membership.Membership(None)
+    member.join()
+    waited = threading.Event()
+
+    def start() -> None:
+        member.wait()
+        waited.set()
+
+    async def nothing() -> None:
+        pass
+
+    async def test() -> None:
+        cluster.refuses = 10**6
+        cluster.lost = True
+        keeping = asyncio.ensure_future(member.keep(lambda: None, nothing))
+        await until(lambda: cluster.inits > 2)
+        threading.Thread(target=start, daemon=True).start()
+        assert not waited.wait(0.1)
+        cluster.refuses = 0
+        await until(waited.is_set)
+        keeping.cancel()
+
+    asyncio.run(test())
+
+
+def test_who_waits_when_the_service_ends_does_not_wait_for_ever(cluster: Cluster) -> None:
+    member = membership.Membership(None)
+    member.leave()
+    member.wait()
+    assert cluster.events == ["left"]
