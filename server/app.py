@@ -99,7 +99,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     )
     app.state.settings = settings
     app.state.guard = ConnectionGuard(ConnectionLimits.of(settings))
-    app.state.tickets = Tickets()
+    app.state.tickets = Tickets(settings.secret)
     handlers.install(app)
     # The last one added is the first that a request meets.
     app.add_middleware(BodyLimit, limit=int(settings.max_body_mb * 1e6))

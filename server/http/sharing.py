@@ -6,12 +6,10 @@ HMAC-SHA256 of what stands before it. Nothing is kept: another token of the serv
 
 from __future__ import annotations
 
-import base64
-import hashlib
-import hmac
 import time
 
 from server.http.permissions import Permission
+from server.http.signing import Signer
 from server.problems import Problem
 
 PREFIX = "scas4d.read."
@@ -28,13 +26,11 @@ class Sharing:
     """
 
     def __init__(self, secret: str) -> None:
-        # A key of its own: what is signed here is no proof of the token for anything else.
-        self._key = hmac.digest(secret.encode(), b"scas4d tokens that may only read", hashlib.sha256)
+        self._signer = Signer(secret, "scas4d tokens that may only read")
 
     def issue(self, scene: str | None, end: int) -> str:
         """Makes a token for a scene, or for all, that ends then; `end` in seconds since the epoch."""
-        text = f"{PREFIX}{ALL_SCENES if scene is None else scene}.{end}"
-        return f"{text}.{self._signature(text)}"
+        return self._signer.sign(f"{PREFIX}{ALL_SCENES if scene is None else scene}.{end}")
 
     def read(self, token: str) -> Permission | None:
         """Returns what the bearer of a token may do; None where it was not made here.
@@ -42,8 +38,8 @@ class Sharing:
         Raises:
             Problem: 401, it has ended.
         """
-        text, _, signature = token.rpartition(".")
-        if not hmac.compare_digest(signature.encode(), self._signature(text).encode()):
+        text = self._signer.read(token)
+        if text is None:
             return None
         scene, _, end = text.removeprefix(PREFIX).rpartition(".")
         if int(end) <= time.time():
@@ -55,6 +51,3 @@ class Sharing:
                 headers={"WWW-Authenticate": 'Bearer realm="scas4d", error="invalid_token"'},
             )
         return Permission(scene=None if scene == ALL_SCENES else scene, end=int(end))
-
-    def _signature(self, text: str) -> str:
-        return base64.urlsafe_b64encode(hmac.digest(self._key, text.encode(), hashlib.sha256)).decode().rstrip("=")

@@ -1,12 +1,12 @@
 """Tickets: a browser cannot send a bearer token with a WebSocket; it fetches a ticket and offers it as a subprotocol.
 
-A ticket is random, lives for seconds, opens one WebSocket, and is kept in memory as a hash only. It is offered as
-`scas4d.ticket.<ticket>` in Sec-WebSocket-Protocol, never in a URL, where it would end up in logs and histories.
+A ticket lives for seconds and opens one WebSocket. It is offered as `scas4d.ticket.<ticket>` in Sec-WebSocket-Protocol,
+never in a URL, where it would end up in logs and histories. It is signed with the token, so that every service of a
+cluster knows it: a browser behind a load balancer does not choose which of them it reaches.
 """
 
 from __future__ import annotations
 
-import hashlib
 import secrets
 import time
 from collections.abc import Callable
@@ -14,6 +14,7 @@ from collections.abc import Callable
 from starlette.types import Message, Scope, Send
 
 from server.http.permissions import ALL, Permission
+from server.http.signing import Signer
 from server.problems import Problem, counted
 
 SUBPROTOCOL = "scas4d.ticket."
@@ -21,49 +22,54 @@ SUBPROTOCOL = "scas4d.ticket."
 TICKET_SECONDS = 30.0
 """Life of a ticket: a browser opens its WebSocket at once, on a slow link within seconds."""
 MOST_TICKETS = 1024
-"""Tickets that may wait to be used: some 100 bytes each, and no page needs more than a few."""
+"""Tickets that are used in that time: some 100 bytes each, and no page needs more than a few."""
+ALL_SCENES, ALWAYS, WRITE, READ = "*", "0", "w", "r"
 
 
 class Tickets:
-    """The tickets that wait to be used.
+    """Issues tickets, and knows those that were used.
 
     Args:
-        clock: seconds that only rise.
+        secret: the token of the service; None: it has none, and nobody else knows its tickets.
+        clock: seconds since the epoch. Machines of a cluster agree on them to within seconds.
     """
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, secret: str | None = None, clock: Callable[[], float] = time.time) -> None:
         self._clock = clock
-        self._waiting: dict[bytes, tuple[float, Permission]] = {}
+        self._signer = Signer(secret or secrets.token_urlsafe(), "scas4d tickets")
+        self._used: dict[str, float] = {}
 
     def issue(self, permission: Permission = ALL) -> str:
-        """Issues a new ticket; its bearer may do what the bearer of the token may that asked for it.
-
-        Raises:
-            Problem: 429, as many wait as may.
-        """
-        now = self._clock()
-        self._waiting = {digest: ticket for digest, ticket in self._waiting.items() if ticket[0] > now}
-        if len(self._waiting) >= MOST_TICKETS:
-            raise Problem(
-                429,
-                f"{counted(len(self._waiting), 'ticket')} of at most {MOST_TICKETS} wait to be used",
-                field="tickets",
-                value=MOST_TICKETS,
-                remedy=f"use them, or wait {TICKET_SECONDS:g} s",
-                headers={"Retry-After": str(max(1, round(TICKET_SECONDS)))},
-            )
-        ticket = secrets.token_urlsafe(24)
-        self._waiting[_digest(ticket)] = (now + TICKET_SECONDS, permission)
-        return ticket
+        """Issues a new ticket; its bearer may do what the bearer of the token may that asked for it."""
+        may = WRITE if permission.write else READ
+        scene, end = permission.scene or ALL_SCENES, str(permission.end or ALWAYS)
+        until = self._clock() + TICKET_SECONDS
+        return self._signer.sign(".".join((secrets.token_urlsafe(12), may, scene, end, str(round(until)))))
 
     def redeem(self, ticket: str) -> Permission | None:
-        """Uses a ticket; returns what its bearer may do, None if it was not issued, is too old or was used before."""
-        until, permission = self._waiting.pop(_digest(ticket), (0.0, None))
-        return permission if until > self._clock() else None
+        """Uses a ticket; returns what its bearer may do, None if it was not issued, is too old or was used before.
 
-
-def _digest(ticket: str) -> bytes:
-    return hashlib.sha256(ticket.encode("utf-8", "surrogateescape")).digest()
+        Raises:
+            Problem: 429, as many were used lately as may be.
+        """
+        text, now = self._signer.read(ticket), self._clock()
+        if text is None:
+            return None
+        number, may, scene, end, until = text.split(".")
+        self._used = {used: kept for used, kept in self._used.items() if kept > now}
+        if float(until) <= now or number in self._used:
+            return None
+        if len(self._used) >= MOST_TICKETS:
+            raise Problem(
+                429,
+                f"{counted(len(self._used), 'ticket')} of at most {MOST_TICKETS} were used within {TICKET_SECONDS:g} s",
+                field="tickets",
+                value=MOST_TICKETS,
+                remedy=f"wait {TICKET_SECONDS:g} s",
+                headers={"Retry-After": str(max(1, round(TICKET_SECONDS)))},
+            )
+        self._used[number] = float(until)
+        return Permission(may == WRITE, None if scene == ALL_SCENES else scene, None if end == ALWAYS else int(end))
 
 
 def take_offered(scope: Scope) -> list[str]:

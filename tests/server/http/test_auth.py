@@ -17,6 +17,8 @@ from client.wire.stream import STREAM_PROTOCOL
 from server.http import tickets as tickets_module
 from server.http.authentication import AuthMiddleware
 from server.http.origin import check_origin
+from server.http.permissions import ALL, Permission
+from server.http.sharing import Sharing
 from server.http.tickets import SUBPROTOCOL, Tickets
 from server.settings import ServerSettings, SettingsError
 
@@ -263,7 +265,7 @@ def test_a_ticket_alone_is_echoed_so_that_browsers_accept_the_handshake():
     async def send(message):
         sent.append(message)
 
-    tickets = Tickets()
+    tickets = Tickets(TOKEN)
     offered = SUBPROTOCOL + tickets.issue()
     scope = {
         "type": "websocket",
@@ -322,20 +324,35 @@ def test_a_server_that_cannot_answer_a_handshake_closes_it():
 # Tickets by themselves, and the settings.
 
 
-def test_tickets_expire_are_bounded_and_kept_hashed(monkeypatch):
+def test_tickets_expire_and_the_used_ones_are_bounded(monkeypatch):
     monkeypatch.setattr(tickets_module, "MOST_TICKETS", 2)
-    now = [0.0]
-    tickets = Tickets(clock=lambda: now[0])
-    first, second = tickets.issue(), tickets.issue()
-    assert not any(first.encode() in digest for digest in tickets._waiting)
-    with pytest.raises(Exception, match="2 tickets of at most 2 wait"):
-        tickets.issue()
+    now = [1e9]
+    tickets = Tickets(TOKEN, clock=lambda: now[0])
+    first, second, third, late = (tickets.issue() for _ in range(4))
     assert tickets.redeem(first)
     assert not tickets.redeem(first)
-    now[0] = 31.0
-    assert not tickets.redeem(second)
-    assert tickets.issue()
-    assert len(tickets._waiting) == 1
+    assert tickets.redeem(second)
+    with pytest.raises(Exception, match="2 tickets of at most 2 were used within 30 s"):
+        tickets.redeem(third)
+    now[0] += 31.0
+    assert not tickets.redeem(late)
+    assert not tickets.redeem(first)
+    assert tickets.redeem(tickets.issue())
+    assert len(tickets._used) == 1
+
+
+@pytest.mark.parametrize("permission", [ALL, Permission(scene="ab12"), Permission(end=2_000_000_000, scene="ab12")])
+def test_a_ticket_is_known_by_every_service_of_that_token_and_by_no_other(permission):
+    ticket = Tickets(TOKEN).issue(permission)
+    assert Tickets(TOKEN).redeem(ticket) == permission
+    assert Tickets(TOKEN + "x").redeem(ticket) is None
+    assert Tickets().redeem(Tickets().issue()) is None
+    changed = ticket.replace(".r.", ".w.") if not permission.write else ticket.replace(".w.", ".r.")
+    assert changed != ticket
+    for other in (changed, ticket[:-1], "", ".", "a.b.c.d.e.f", "\udcff.ü"):
+        assert Tickets(TOKEN).redeem(other) is None
+    assert Sharing(TOKEN).read(ticket) is None  # what opens a WebSocket is no token for reading
+    assert Tickets(TOKEN).redeem(Sharing(TOKEN).issue("ab12", 2_000_000_000)) is None
 
 
 def test_it_listens_beyond_the_loopback_only_with_a_token(tmp_path):
