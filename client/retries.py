@@ -109,7 +109,7 @@ class Retries:
                 wait = self._busy_wait(asked, response)
             elif response.status_code in OUTAGE_STATUSES:
                 self._lost = True
-                wait = self._outage_wait(asked or 0.0, f"the answer was {response.status_code}")
+                wait = self._outage_wait(asked or 0.0, f"it answered {response.status_code}")
         if wait is None:
             raise error_of(response)
         return wait

@@ -8,6 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
+from client.wire.base import check_labels
+
 PRESETS = "scas4d, adaptive, fast, paper, dynamic3dgs, rigid, articulated, cloth, people or lights."
 """Names of the presets, for the help of commands, which do not load them."""
 Preset = Annotated[str, typer.Option(help=PRESETS)]
@@ -30,7 +32,7 @@ def parse_labels(labels: Sequence[str] | None) -> dict[str, str]:
     """Reads labels of nodes; None gives none.
 
     Raises:
-        ValueError: one without a sign, or two values of one label.
+        ValueError: one without a sign, two values of one label, or one that no node can have.
 
     >>> parse_labels(["rig=stage-a", "disk=fast"])
     {'rig': 'stage-a', 'disk': 'fast'}
@@ -42,7 +44,7 @@ def parse_labels(labels: Sequence[str] | None) -> dict[str, str]:
             raise ValueError(f"label {label!r} cannot be read; write it as rig=stage-a")
         if result.setdefault(name, value) != value:
             raise ValueError(f"label {name!r} has two values, {result[name]!r} and {value!r}; give one of them")
-    return result
+    return check_labels(result)
 
 
 def parse_changes(changes: Sequence[str] | None) -> dict[str, Any]:

@@ -147,7 +147,7 @@ class _listening:
                 self._lateness.outage += retry.seconds
                 self._lateness.outage_count += 1
                 if not self._out:
-                    self._on_message(f"the service does not answer ({retry.detail}); trying on")
+                    self._on_message(f"the service cannot be used ({retry.detail}); trying on")
             self._out = retry.reason == "outage"
         if self._before is not None:
             self._before(retry)
@@ -169,7 +169,8 @@ def _follow(client: Client, id: str, index: int, count: int, on_progress: OnProg
         if status.progress is not None:
             on_progress(status.progress.stage, status.progress.done, status.progress.total)
         elif index == 0 and not _finished(status):
-            on_progress("starting the scene", 0, 1)
+            waits = f"starting the scene: {status.error}" if status.error else "starting the scene"
+            on_progress(waits, 0, 1)
         else:
             on_progress("frames", _finished(status), count)
 

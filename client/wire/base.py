@@ -25,7 +25,7 @@ CameraName = Annotated[
 ]
 
 
-def _checked(labels: dict[str, str]) -> dict[str, str]:
+def check_labels(labels: dict[str, str]) -> dict[str, str]:
     """Raises an InputError for a label that no node can have."""
     for name, value in labels.items():
         for what, text, pattern in (("name", name, f"(?:{LABEL_WORD}/)?{LABEL_WORD}"), ("value", value, LABEL_WORD)):
@@ -38,7 +38,7 @@ def _checked(labels: dict[str, str]) -> dict[str, str]:
     return labels
 
 
-Labels = Annotated[dict[str, str], Field(max_length=MAX_LABELS), AfterValidator(_checked)]
+Labels = Annotated[dict[str, str], Field(max_length=MAX_LABELS), AfterValidator(check_labels)]
 """Labels of nodes, by name."""
 Row3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 Row4 = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]

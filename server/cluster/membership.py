@@ -18,6 +18,8 @@ from server.cluster.nodes import own_node_is_lost
 NAMESPACE = "scas4d"
 REACH_S = 5.0
 """The head of the cluster answers within so long."""
+SILENT_S = 3.0
+"""A head that has not answered for so long is told of."""
 EVERY_S = 2.0
 """Between two looks at whether the node of this machine is there, and between two tries to join again."""
 
@@ -37,6 +39,7 @@ class Membership:
     def __init__(self, address: str | None) -> None:
         self._address = address
         self._is_member = threading.Event()
+        self._silent = False
         self._thread = ThreadPoolExecutor(1, "membership")
         """Of its own: it waits for the head of the cluster as long as that takes."""
 
@@ -50,14 +53,18 @@ class Membership:
             try:
                 if self._address is not None:
                     _reach(self._address)  # Ray would end this process where nobody listens
+            except (OSError, ValueError) as error:
+                raise _no_cluster(f"at {self._address}", error) from None
+            try:
                 ray.init(
                     address=self._address or "auto", namespace=NAMESPACE, log_to_driver=True, configure_logging=False
                 )
             except (OSError, ValueError, RuntimeError, RayError) as error:
-                where = "on this machine" if self._address is None else f"at {self._address}"
+                if self._address is None:
+                    raise _no_cluster("on this machine", error) from None
                 raise RuntimeError(
-                    f"there is no Ray cluster {where} ({error}); start one with `ray start --head`, or name its "
-                    "address: --placement ray=HOST:6379"
+                    f"the Ray cluster at {self._address} cannot be joined ({error}); this machine needs a node of it "
+                    "(`ray start --address`), and, where it asks for a token, RAY_AUTH_MODE=token and that token"
                 ) from None
         self._is_member.set()
 
@@ -74,7 +81,7 @@ class Membership:
         """
         while True:
             await asyncio.sleep(EVERY_S)
-            if await self._asked(own_node_is_lost):
+            if await self._is_lost():
                 log.error("the Ray node of this machine is lost, and all processes of scenes with it; joining again")
                 self._is_member.clear()
                 on_loss()
@@ -87,6 +94,27 @@ class Membership:
         self._thread.shutdown(wait=False, cancel_futures=True)
         ray.shutdown()
         self._is_member.set()  # who waits gets an error of Ray's
+
+    async def _is_lost(self) -> bool:
+        """Asks the head, and logs when it is silent and when it answers again."""
+        answer = self._asked(own_node_is_lost)
+        try:
+            lost: bool = await asyncio.wait_for(asyncio.shield(answer), SILENT_S)
+        except Exception:  # Ray's, or of the time
+            if not self._silent:
+                self._silent = True
+                log.warning(
+                    "the head of the Ray cluster is silent: frames go on, and nothing is placed; if Redis does not "
+                    "keep what it knew, Ray ends this process after a minute"
+                )
+            await asyncio.wait({answer})  # one question at a time
+            if answer.exception() is not None:
+                return False
+            lost = answer.result()
+        if self._silent:
+            self._silent = False
+            log.info("the head of the Ray cluster answers again")
+        return lost
 
     def _join_again(self) -> None:
         ray.shutdown()
@@ -105,6 +133,13 @@ class Membership:
                     said = str(error)
                     log.warning("not a member of the cluster yet: %s", error)
             await asyncio.sleep(EVERY_S)
+
+
+def _no_cluster(where: str, error: Exception) -> RuntimeError:
+    return RuntimeError(
+        f"there is no Ray cluster {where} ({error}); start one with `ray start --head`, or name its address: "
+        "--placement ray=HOST:6379"
+    )
 
 
 def _reach(address: str) -> None:

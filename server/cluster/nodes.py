@@ -54,11 +54,12 @@ def is_lost(id: str) -> bool:
 
 
 def own_node_is_lost() -> bool:
-    """True where the head of the cluster says that the node of this machine is dead. Blocking."""
-    try:
-        return not _own_is_in(living_nodes())
-    except Exception:  # whatever Ray raises without its head
-        return False
+    """True where the head of the cluster says that the node of this machine is dead. Blocking.
+
+    Raises:
+        Exception: whatever Ray raises without its head.
+    """
+    return not _own_is_in(living_nodes())
 
 
 def _own_is_in(nodes: Iterable[Mapping[str, Any]]) -> bool:

@@ -15,7 +15,7 @@ from functools import partial
 from server.health import metrics
 from server.problems import Problem, counted
 from server.processes.messages import Damaged, SceneSpec
-from server.processes.placement import AnyProcess, Entry, Placement
+from server.processes.placement import AnyProcess, Ended, Entry, Placement
 from server.processes.queries import Answer, AskedQuery, Query, Refused
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
@@ -33,11 +33,12 @@ log = logging.getLogger("scas4d.server")
 
 @dataclass(eq=False)
 class _WaitingQuery:
-    """A query and the future of its answer."""
+    """A query, the future of its answer, and whether it was once lost with the machine of a reader."""
 
     number: int
     query: Query
     answer: asyncio.Future[Answer | Refused]
+    lost: bool = False
 
     def end(self, answer: Answer | Refused) -> None:
         if not self.answer.done():
@@ -182,7 +183,7 @@ class QueryQueue:
         self.process = self._at_work = self._life = None
         self._next()
 
-    def _process_ended(self, life: object, reason: str) -> None:
+    def _process_ended(self, life: object, reason: Ended) -> None:
         if life is not self._life or self._closed:
             return
         metrics.RESTARTS.labels("reader").inc()
@@ -190,8 +191,13 @@ class QueryQueue:
         pause = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2**self._failures)
         self._failures += 1
         log.error("scene %s: a reader is gone (%s); the next in %g s", self._spec.folder.name, reason, pause)
-        if turn is not None:
-            turn.end(Refused(turn.number, f"the reader ended while it was busy with this: {reason}", status=500))
+        if turn is not None and not turn.answer.done():
+            if reason.lost and not turn.lost:  # no fault of the query's: the next reader answers it
+                turn.lost = True
+                self._waiting.appendleft(turn)
+            else:
+                fault = f"the reader ended while it was busy with this: {reason}"
+                turn.end(Refused(turn.number, fault, status=503 if reason.lost else 500))
         self._pause = asyncio.get_running_loop().call_later(pause, self._go_on)
 
     def _go_on(self) -> None:

@@ -71,6 +71,8 @@ class Siblings:
         self._seen: dict[str, float] = {}
         """When an address was last among the siblings."""
         self._unknown: OrderedDict[str, float] = OrderedDict()
+        self._refusing: set[str] = set()
+        """Addresses of those that refuse the token."""
         self._checked: OrderedDict[str, float] = OrderedDict()
 
     async def close(self) -> None:
@@ -125,7 +127,7 @@ class Siblings:
                 _keep(self._owners, scene, address, MOST_KNOWN)
                 return address
         if None in answers or (known in self._seen and now - self._seen[known] < REMEMBERED_S):
-            raise unreachable(scene)
+            raise unreachable(scene, refused=not self._refusing.isdisjoint(siblings))
         self.forget(scene)
         _keep(self._unknown, scene, now, MOST_UNKNOWN)
         return None
@@ -171,26 +173,38 @@ class Siblings:
             return None
         if answer.status_code in (200, 404):
             return answer.status_code == 200
-        same = "; all services of a cluster need the same token" if answer.status_code == 401 else ""
-        log.warning("service %s does not say whether it has scene %s: %d%s", address, scene, answer.status_code, same)
+        log.warning("service %s does not say whether it has scene %s: %d", address, scene, answer.status_code)
         return None
 
     async def _get(self, address: str, path: str, permission: Permission) -> httpx.Response | None:
         try:
-            return await self.client.get(address + path, headers=self.headers(permission), timeout=ASK_S)
+            answer = await self.client.get(address + path, headers=self.headers(permission), timeout=ASK_S)
         except httpx.HTTPError as error:
             log.warning("service %s does not answer: %s: %s", address, type(error).__name__, error)
             return None
+        if answer.status_code != 401:
+            self._refusing.discard(address)
+        elif address not in self._refusing:
+            self._refusing.add(address)
+            log.warning("service %s refuses the token; give all services of a cluster the same SCAS4D_TOKEN", address)
+        return answer
 
 
-def unreachable(scene: str) -> Problem:
-    """Makes the answer, 503, where the service that has a scene, or may have it, does not answer."""
+def unreachable(scene: str, *, refused: bool = False) -> Problem:
+    """Makes the answer, 503, where the service that has a scene, or may have it, does not answer.
+
+    Args:
+        refused: it answers, and refuses the token of this one.
+    """
+    fault, remedy = "does not answer", "ask again: what it acknowledged is on disk"
+    if refused:
+        fault, remedy = "refuses this one's token", "give all services of a cluster the same SCAS4D_TOKEN"
     return Problem(
         503,
-        "the service of the cluster that has this scene, or may have it, does not answer",
+        f"the service of the cluster that has this scene, or may have it, {fault}",
         field="id",
         value=scene,
-        remedy="ask again: what it acknowledged is on disk",
+        remedy=remedy,
         headers={"Retry-After": "2"},
     )
 

@@ -85,11 +85,17 @@ def test_playing_slowly_shows_what_is_between_frames(page, service, finished):
     until(page, HERE)
     page.select_option("#speed", "0.1")
     page.click("#play")  # a second a frame
-    shown(page, frame="1")
-    pictures = [seen(page) for _ in range(3) if not page.wait_for_timeout(150)]
-    assert page.locator("#view").get_attribute("data-frame") in ("1", "2")
+    view, found = page.locator("#view"), {}
+    for _ in range(200):  # on a busy machine few pictures are seen of a frame, of some none
+        frame, picture = view.get_attribute("data-frame"), seen(page)
+        if frame == view.get_attribute("data-frame"):
+            found.setdefault(frame, []).append(picture)
+        if any(np.abs(one[0] - one[-1]).mean() > 0.02 for one in found.values()):
+            break
+        page.wait_for_timeout(50)
+    else:
+        raise AssertionError("no two pictures of one frame differ")
     page.click("#play")
-    assert np.abs(pictures[0] - pictures[-1]).mean() > 0.02
     assert page.faults == []
 
 

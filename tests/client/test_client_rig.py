@@ -199,7 +199,7 @@ def test_a_restart_of_the_service_is_waited_out(capture, tmp_path):
             restarting.join()
             assert [client.frame(delivery.scene, index).state for index in range(20)] == ["committed"] * 20
         assert delivery.lateness.outage_count > 0
-        assert any("does not answer" in sentence for sentence in said)
+        assert any("cannot be used" in sentence for sentence in said)
     finally:
         for service in back or [running]:
             service.stop()

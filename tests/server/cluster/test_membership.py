@@ -77,6 +77,43 @@ def test_what_ran_is_given_up_first_and_the_service_is_announced_last(cluster: C
     assert cluster.inits == 4
 
 
+def test_a_silent_head_is_told_of_once_and_is_no_lost_node(
+    cluster: Cluster, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    answers = threading.Event()
+    asked: list[bool] = []
+
+    def ask() -> bool:
+        asked.append(True)
+        if len(asked) == 1:
+            raise RuntimeError("no head")
+        answers.wait(10)
+        return False
+
+    async def nothing() -> None:
+        pass
+
+    async def test() -> None:
+        keeping = asyncio.ensure_future(member.keep(lambda: cluster.events.append("given up"), nothing))
+        await until(lambda: len(asked) == 2)
+        await asyncio.sleep(0.1)
+        assert len(asked) == 2  # one question at a time
+        answers.set()
+        await until(lambda: len(asked) > 3)
+        keeping.cancel()
+
+    monkeypatch.setattr(membership, "own_node_is_lost", ask)
+    monkeypatch.setattr(membership, "SILENT_S", 0.02)
+    member = membership.Membership(None)
+    member.join()
+    with caplog.at_level("INFO", "scas4d.server"):
+        asyncio.run(test())
+    told = [record.message for record in caplog.records]
+    assert len([line for line in told if "is silent" in line]) == 1
+    assert told[-1] == "the head of the Ray cluster answers again"
+    assert cluster.events == ["joined"]
+
+
 def test_what_is_started_meanwhile_waits(cluster: Cluster) -> None:
     member = membership.Membership(None)
     member.join()

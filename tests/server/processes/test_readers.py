@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import concurrent.futures
 import contextlib
 import io
@@ -19,6 +20,8 @@ from running import HEIGHT, WIDTH, Running, fake_settings, make_rig, pictures, p
 from client.sdk import Client
 from client.wire import CameraModel, part_colour
 from server.processes import query_queue, renderer
+from server.processes.placement import Ended
+from server.processes.queries import Answer
 
 PATIENCE_S = 30
 
@@ -296,3 +299,57 @@ def test_a_state_that_went_missing_is_answered_from_a_copy_or_asked_for_later(sc
     while http.get(f"/v1/scenes/{id}/render?frame=1").status_code != 200:
         assert time.monotonic() < until
         time.sleep(0.05)
+
+
+class FakeProcess:
+    """A reader that keeps what it is asked."""
+
+    pid = None
+
+    def __init__(self, on_message, on_end):
+        self.on_message, self.on_end, self.asked = on_message, on_end, []
+
+    def send(self, message):
+        self.asked.append(message)
+
+    async def stop(self, seconds=0.0):
+        pass
+
+
+class FakePlacement:
+    """Starts such readers."""
+
+    def __init__(self):
+        self.started = []
+
+    def start(self, entry, spec, on_message, on_end):
+        self.started.append(FakeProcess(on_message, on_end))
+        return self.started[-1]
+
+
+@pytest.mark.parametrize(("lost", "times", "status"), [(True, 1, None), (True, 2, 503), (False, 1, 500)])
+def test_a_query_whose_reader_is_lost_with_its_machine_goes_to_the_next(monkeypatch, lost, times, status):
+    """A machine that is lost is no fault of the query; one that two of them are lost with may be."""
+    monkeypatch.setattr(query_queue, "FIRST_PAUSE_S", 0.01)
+    placement = FakePlacement()
+    spec = mock.Mock()
+    spec.folder.name = "scene"
+
+    async def asks():
+        queue = query_queue.QueryQueue(None, spec, placement, grace=1.0, damaged=lambda files: None)
+        asking = asyncio.ensure_future(queue.ask(mock.Mock(kind="render")))
+        for number in range(1, times + 1):
+            while len(placement.started) < number or not placement.started[-1].asked:
+                await asyncio.sleep(0.005)
+            placement.started[-1].on_end(Ended(None, "the node of its views is lost", lost=lost))
+        if status is None:
+            while len(placement.started) < 2 or not placement.started[-1].asked:
+                await asyncio.sleep(0.005)
+            (again,) = placement.started[1].asked
+            placement.started[1].on_message(Answer(again.number, b"", "image/png"))
+        answer = await asyncio.wait_for(asking, 10)
+        await queue.stop(0)
+        return answer
+
+    answer = asyncio.run(asks())
+    assert isinstance(answer, Answer) if status is None else answer.status == status

@@ -196,7 +196,7 @@ def test_streams_and_ingest_by_websocket(services, other):
 
 def test_handshakes_are_refused_with_the_others_words(services, other):
     second, id = other
-    (first, *_), token = services
+    _, token = services
     url = str(second.base_url).replace("http", "ws").rstrip("/")
     with pytest.raises(Exception, match="400") as refused:
         connect(f"{url}/v1/scenes/{id}/stream", additional_headers=HEADERS if token else {})
