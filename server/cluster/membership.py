@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import socket
 import threading
 from collections.abc import Awaitable, Callable
@@ -20,6 +21,8 @@ REACH_S = 5.0
 """The head of the cluster answers within so long."""
 SILENT_S = 3.0
 """A head that has not answered for so long is told of."""
+JOIN_S = 60.0
+"""A try to join takes so long at most; without a node on this machine it fails after some 10 s."""
 EVERY_S = 2.0
 """Between two looks at whether the node of this machine is there, and between two tries to join again."""
 
@@ -85,7 +88,7 @@ class Membership:
                 log.error("the Ray node of this machine is lost, and all processes of scenes with it; joining again")
                 self._is_member.clear()
                 on_loss()
-                await self._until_done(lambda: self._asked(self._join_again))
+                await self._until_done(self._join_or_end)
                 await self._until_done(on_return)
                 log.info("the service has joined the cluster again")
 
@@ -115,6 +118,14 @@ class Membership:
             self._silent = False
             log.info("the head of the Ray cluster answers again")
         return lost
+
+    async def _join_or_end(self) -> None:
+        """Joins again. Where Ray stands still, as it once did, this process ends: its supervisor starts another."""
+        joining = self._asked(self._join_again)
+        if not (await asyncio.wait({joining}, timeout=JOIN_S))[0]:
+            log.critical("Ray did not let the service join again within %g s; the service ends, start it again", JOIN_S)
+            os._exit(1)  # what was acknowledged is on disk; an end in order would wait for Ray
+        joining.result()
 
     def _join_again(self) -> None:
         ray.shutdown()

@@ -114,6 +114,33 @@ def test_a_silent_head_is_told_of_once_and_is_no_lost_node(
     assert cluster.events == ["joined"]
 
 
+def test_a_service_that_ray_does_not_let_join_again_ends(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would stay without workers: its supervisor starts another, which finds all scenes in the data folder."""
+    ended: list[int] = []
+    stands_still = threading.Event()
+
+    def end(code: int) -> None:
+        ended.append(code)
+        stands_still.set()
+
+    async def nothing() -> None:
+        pass
+
+    async def test() -> None:
+        cluster.lost = True
+        keeping = asyncio.ensure_future(member.keep(lambda: None, nothing))
+        await until(lambda: ended)
+        keeping.cancel()
+
+    member = membership.Membership(None)
+    member.join()
+    monkeypatch.setattr(membership, "JOIN_S", 0.05)
+    monkeypatch.setattr(membership.os, "_exit", end)
+    monkeypatch.setattr(membership.ray, "shutdown", lambda: stands_still.wait(10))
+    asyncio.run(test())
+    assert ended == [1]
+
+
 def test_what_is_started_meanwhile_waits(cluster: Cluster) -> None:
     member = membership.Membership(None)
     member.join()
