@@ -80,8 +80,9 @@ class RayPlacement(Placement):
             RuntimeError: there is no cluster, or a node does not see the folder.
         """
         data = self._server.data.resolve()
-        if not ray.is_initialized():  # `serve` opens it in a loop of its own, to say what is wrong
-            await asyncio.to_thread(self._membership.join)
+        before = ray.is_initialized()  # `serve` opens it in a loop of its own, to say what is wrong
+        await asyncio.to_thread(self._membership.join)
+        if not before:
             await asyncio.to_thread(check_folder, data)
             await asyncio.to_thread(mark, data, self._token)
             self._watch.saw(await asyncio.to_thread(all_nodes))  # not `look`: the answer would be lost with the loop
@@ -207,6 +208,7 @@ class RayProcess:
         """Gives it up with the cluster on which it ran, of which nothing can be asked any more."""
         self._lost = True
         self._task.cancel()
+        self._making.cancel()  # where it waits for a thread, it would be made on the cluster that is joined next
         self._give_up("the Ray node of the service's machine is lost", lost=True)
 
     async def _run(self, entry: Entry, spec: Any) -> None:
