@@ -23,6 +23,8 @@ SILENT_S = 3.0
 """A head that has not answered for so long is told of."""
 JOIN_S = 60.0
 """A try to join takes so long at most; without a node on this machine it fails after some 10 s."""
+LEAVE_S = 10.0
+"""A service leaves within so long; the head may be silent just then."""
 EVERY_S = 2.0
 """Between two looks at whether the node of this machine is there, and between two tries to join again."""
 
@@ -43,6 +45,7 @@ class Membership:
         self._address = address
         self._is_member = threading.Event()
         self._silent = False
+        self._said = ""
         self._thread = ThreadPoolExecutor(1, "membership")
         """Of its own: it waits for the head of the cluster as long as that takes."""
 
@@ -82,20 +85,32 @@ class Membership:
             on_loss: called once the node, and so every actor of this service, is lost. on_return: called once the
                 service is a member again; tried again where it fails.
         """
+        announced = True
         while True:
             await asyncio.sleep(EVERY_S)
             if await self._is_lost():
                 log.error("the Ray node of this machine is lost, and all processes of scenes with it; joining again")
                 self._is_member.clear()
                 on_loss()
-                await self._until_done(self._join_or_end)
-                await self._until_done(on_return)
+                while not await self._is_done(self._join_or_end):
+                    await asyncio.sleep(EVERY_S)
                 log.info("the service has joined the cluster again")
+                announced = False
+            if not announced:  # the node may be lost again before it is
+                announced = await self._is_done(on_return)
 
     def leave(self) -> None:
-        """Leaves; actors that are left end. Blocking."""
-        self._thread.shutdown(wait=False, cancel_futures=True)
-        ray.shutdown()
+        """Leaves, once a try to join has ended; actors that are left end. Blocking.
+
+        Where Ray does not let it leave, this process ends at once: the interpreter would wait for Ray's threads.
+        """
+        leaving = self._thread.submit(ray.shutdown)
+        self._thread.shutdown(wait=False)
+        try:
+            leaving.result(LEAVE_S)
+        except TimeoutError:
+            log.error("Ray did not let the service leave within %g s; it ends as it is", LEAVE_S)
+            os._exit(1)
         self._is_member.set()  # who waits gets an error of Ray's
 
     async def _is_lost(self) -> bool:
@@ -134,16 +149,16 @@ class Membership:
     def _asked(self, function: Callable[[], Any]) -> asyncio.Future[Any]:
         return asyncio.get_running_loop().run_in_executor(self._thread, function)
 
-    async def _until_done(self, call: Callable[[], Awaitable[None]]) -> None:
-        said = ""
-        while True:
-            try:
-                return await call()
-            except Exception as error:  # whatever Ray raises: the service must not stand still
-                if str(error) != said:
-                    said = str(error)
-                    log.warning("not a member of the cluster yet: %s", error)
-            await asyncio.sleep(EVERY_S)
+    async def _is_done(self, call: Callable[[], Awaitable[None]]) -> bool:
+        try:
+            await call()
+        except Exception as error:  # whatever Ray raises: the service must not stand still
+            if str(error) != self._said:
+                self._said = str(error)
+                log.warning("not a member of the cluster yet: %s", error)
+            return False
+        self._said = ""
+        return True
 
 
 def _no_cluster(where: str, error: Exception) -> RuntimeError:

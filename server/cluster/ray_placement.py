@@ -93,7 +93,10 @@ class RayPlacement(Placement):
 
     def _lose_all(self) -> None:
         for process in tuple(self._processes):
-            process.lose()
+            try:
+                process.lose()
+            except Exception:  # a fault of one scene's keeps none of the others, nor the service, from going on
+                log.exception("a process that is lost with its cluster")
 
     async def cluster(self) -> Cluster:
         """See `Placement`."""

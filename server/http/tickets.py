@@ -1,8 +1,8 @@
 """Tickets: a browser cannot send a bearer token with a WebSocket; it fetches a ticket and offers it as a subprotocol.
 
-A ticket lives for seconds and opens one WebSocket. It is offered as `scas4d.ticket.<ticket>` in Sec-WebSocket-Protocol,
-never in a URL, where it would end up in logs and histories. It is signed with the token, so that every service of a
-cluster knows it: a browser behind a load balancer does not choose which of them it reaches.
+A ticket lives for seconds and opens one WebSocket at each service. It is offered as `scas4d.ticket.<ticket>` in
+Sec-WebSocket-Protocol, never in a URL, where it would end up in logs and histories. It is signed with the token, so
+that every service of a cluster knows it: a browser behind a load balancer does not choose which of them it reaches.
 """
 
 from __future__ import annotations
@@ -55,7 +55,8 @@ class Tickets:
         text, now = self._signer.read(ticket), self._clock()
         if text is None:
             return None
-        number, may, scene, end, until = text.split(".")
+        number, may, rest = text.split(".", 2)
+        scene, end, until = rest.rsplit(".", 2)  # a share may be asked for any word as scene
         self._used = {used: kept for used, kept in self._used.items() if kept > now}
         if float(until) <= now or number in self._used:
             return None

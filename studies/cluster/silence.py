@@ -43,40 +43,52 @@ class SupervisedCluster:
         self._redis = redis(program)
         self._address_of_redis = os.environ.pop(REDIS)
         self._over = False
+        self._starting = threading.Lock()
         self._running: list[subprocess.Popen[bytes]] = []
         self._supervisor = threading.Thread(target=self._supervise, daemon=True)
-        self._supervisor.start()
-        _wait_for(lambda: _listens(PORT))
-        self._start("--address", f"{HEAD}:{PORT}", "--node-ip-address", NODE, "--num-cpus", "1")
 
     def __enter__(self) -> Self:
+        self._supervisor.start()
+        try:
+            _wait_for(lambda: _listens(PORT))
+            self._start("--address", f"{HEAD}:{PORT}", "--node-ip-address", NODE, "--num-cpus", "1")
+        except BaseException:
+            self.__exit__(None, None, None)
+            raise
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._over = True
-        for process in self._running:
-            process.kill()
-            process.wait()
+        with self._starting:
+            self._over = True
+            for process in self._running:
+                process.kill()
+                process.wait()
         self._supervisor.join()
         self._redis.kill()
         self._redis.wait()
 
     def _supervise(self) -> None:
-        while not self._over:
-            self._start("--head", "--node-ip-address", HEAD, "--port", str(PORT), "--num-cpus", "0").wait()
+        while (
+            head := self._start("--head", "--node-ip-address", HEAD, "--port", str(PORT), "--num-cpus", "0")
+        ) is not None:
+            head.wait()
 
-    def _start(self, *options: str) -> subprocess.Popen[bytes]:
+    def _start(self, *options: str) -> subprocess.Popen[bytes] | None:
+        """Starts a node of Ray; None where the study is over."""
         store = ("--object-store-memory", str(STORE_BYTES), "--block", "--disable-usage-stats")
-        started = subprocess.Popen(
-            [*APART, str(Path(sys.executable).with_name("ray")), "start", *options, *store],
-            env=os.environ | ({REDIS: self._address_of_redis} if "--head" in options else {}),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        self._running.append(started)
-        return started
+        with self._starting:
+            if self._over:
+                return None
+            started = subprocess.Popen(
+                [*APART, str(Path(sys.executable).with_name("ray")), "start", *options, *store],
+                env=os.environ | ({REDIS: self._address_of_redis} if "--head" in options else {}),
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+            )
+            self._running.append(started)
+            return started
 
 
 class Answers:
@@ -133,7 +145,8 @@ def _joined(ray: Any) -> bool:
 def _heads() -> Iterator[int]:
     for path in Path("/proc").iterdir():
         with contextlib.suppress(OSError):
-            if path.name.isdecimal() and (path / "comm").read_text().startswith("gcs_server"):
+            told = (path / "cmdline").read_text().split("\0") if path.name.isdecimal() else [""]
+            if told[0].endswith("gcs_server") and f"--gcs_server_port={PORT}" in told:
                 yield int(path.name)
 
 

@@ -13,7 +13,7 @@ NOTICED_S: Range = (3.0, 9.0)
 TOLD_S: Range = (3.0, 6.0)
 """From then until the service is told: the rest of the 14 to 18 s that pass in all until a scene goes on."""
 
-HEAD_S: Range = (3.0, 4.5)
+HEAD_S: Range = (3.0, 5.5)
 """The head does not answer for so long after its end: `scripts/bench head`, with Redis and a supervisor."""
 
 # Of Ray.

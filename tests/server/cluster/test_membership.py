@@ -138,6 +138,37 @@ def test_a_service_that_ray_does_not_let_join_again_ends(cluster: Cluster, monke
     monkeypatch.setattr(membership.os, "_exit", end)
     monkeypatch.setattr(membership.ray, "shutdown", lambda: stands_still.wait(10))
     asyncio.run(test())
+    assert set(ended) == {1}
+
+
+def test_a_node_that_is_lost_before_the_service_is_announced_is_noticed(cluster: Cluster) -> None:
+    lost: list[bool] = []
+
+    async def fails() -> None:
+        raise ValueError("the name is taken")
+
+    async def test() -> None:
+        cluster.lost = True
+        keeping = asyncio.ensure_future(member.keep(lambda: lost.append(True), fails))
+        await until(lambda: cluster.events.count("joined") == 2)
+        cluster.lost = True
+        await until(lambda: cluster.events.count("joined") == 3)
+        keeping.cancel()
+
+    member = membership.Membership(None)
+    member.join()
+    asyncio.run(test())
+    assert len(lost) == 2
+
+
+def test_a_service_that_ray_does_not_let_leave_ends(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    ended: list[int] = []
+    stands_still = threading.Event()
+    monkeypatch.setattr(membership, "LEAVE_S", 0.05)
+    monkeypatch.setattr(membership.os, "_exit", ended.append)
+    monkeypatch.setattr(membership.ray, "shutdown", lambda: stands_still.wait(10))
+    membership.Membership(None).leave()
+    stands_still.set()
     assert ended == [1]
 
 

@@ -255,8 +255,13 @@ def test_a_scene_goes_on_when_the_node_of_its_service_is_lost(service: Service, 
         sent(service, scene, range(2))
         until(lambda: committed(service, scene) == 2)
         nodes.kill_node_of_head()
+        until(lambda: service.status(scene).worker_deaths >= 1)  # Ray takes seconds to find it lost
         sent(service, scene, range(2, 5))
         until(lambda: committed(service, scene) == 5)
+        fresh = create(service.http)
+        sent(service, fresh, range(1))
+        until(lambda: committed(service, fresh) == 1)
+        service.http.delete(f"/v1/scenes/{fresh}")
         assert service.deaths(scene) == 0  # no frame is to blame
         view = service.http.post(f"/v1/scenes/{scene}/render", json={"camera": "c0", "frame": 4})
         assert view.status_code == 200, view.text

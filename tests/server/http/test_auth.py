@@ -341,7 +341,9 @@ def test_tickets_expire_and_the_used_ones_are_bounded(monkeypatch):
     assert len(tickets._used) == 1
 
 
-@pytest.mark.parametrize("permission", [ALL, Permission(scene="ab12"), Permission(end=2_000_000_000, scene="ab12")])
+@pytest.mark.parametrize(
+    "permission", [ALL, Permission(scene="ab12"), Permission(end=2_000_000_000, scene="a.b?x=1.2")]
+)
 def test_a_ticket_is_known_by_every_service_of_that_token_and_by_no_other(permission):
     ticket = Tickets(TOKEN).issue(permission)
     assert Tickets(TOKEN).redeem(ticket) == permission
