@@ -116,9 +116,8 @@ class Membership:
     async def _is_lost(self) -> bool:
         """Asks the head, and logs when it is silent and when it answers again."""
         answer = self._asked(own_node_is_lost)
-        try:
-            lost: bool = await asyncio.wait_for(asyncio.shield(answer), SILENT_S)
-        except Exception:  # Ray's, or of the time
+        done, _ = await asyncio.wait({answer}, timeout=SILENT_S)
+        if not done or answer.exception() is not None:
             if not self._silent:
                 self._silent = True
                 log.warning(
@@ -126,13 +125,12 @@ class Membership:
                     "keep what it knew, Ray ends this process after a minute"
                 )
             await asyncio.wait({answer})  # one question at a time
-            if answer.exception() is not None:
-                return False
-            lost = answer.result()
+        if answer.exception() is not None:
+            return False
         if self._silent:
             self._silent = False
             log.info("the head of the Ray cluster answers again")
-        return lost
+        return bool(answer.result())
 
     async def _join_or_end(self) -> None:
         """Joins again. Where Ray stands still, as it once did, this process ends: its supervisor starts another."""

@@ -62,13 +62,14 @@ def own_node_is_lost() -> bool:
     return not _own_is_in(living_nodes())
 
 
-def _own_is_in(nodes: Iterable[Mapping[str, Any]]) -> bool:
-    own = _own()
-    return any(node["NodeID"] == own for node in nodes)
-
-
-def _own() -> str:
+def own_node() -> str:
+    """The id of the node of this machine by which this process is a member."""
     return str(ray.get_runtime_context().get_node_id())
+
+
+def _own_is_in(nodes: Iterable[Mapping[str, Any]]) -> bool:
+    own = own_node()
+    return any(node["NodeID"] == own for node in nodes)
 
 
 def _listens(host: str, port: int) -> bool:

@@ -199,7 +199,7 @@ class RayProcess:
 
     async def stop(self, seconds: float = STOP_SECONDS) -> None:
         """See `AnyProcess`."""
-        started, over, self._over = self._pid is not None, self._over or self._lost, True
+        started, over, self._over = self._pid is not None, self._over, True
         self._task.cancel()
         self._placement.places.pop(self._name, None)
         if started and not over:

@@ -12,6 +12,7 @@ import ray
 from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+from server.cluster.nodes import own_node
 from server.settings import is_loopback
 
 PREFIX = "service."
@@ -38,7 +39,7 @@ def announced(word: str, host: str, port: int) -> Any:
     Args:
         word: of this service. host, port: it listens there; an address that stands for all is told as this node's.
     """
-    node = str(ray.get_runtime_context().get_node_id())
+    node = own_node()
     if host in ("0.0.0.0", "::", ""):
         host = str(ray.util.get_node_ip_address())  # type: ignore[no-untyped-call]
     elif is_loopback(host):
@@ -70,7 +71,7 @@ def others(word: str, known: Mapping[str, str] | None) -> dict[str, str]:
     """
     try:
         names = [name for name in ray.util.list_named_actors() if name.startswith(PREFIX) and name != PREFIX + word]
-        node = str(ray.get_runtime_context().get_node_id())
+        node = own_node()
     except (RayError, RuntimeError, ConnectionError) as error:
         if known is None:
             raise RuntimeError(f"the head of the cluster does not say which services there are: {error}") from error

@@ -14,6 +14,7 @@ from collections.abc import Callable
 from starlette.types import Message, Scope, Send
 
 from server.http.permissions import ALL, Permission
+from server.http.sharing import ALL_SCENES
 from server.http.signing import Signer
 from server.problems import Problem, counted
 
@@ -23,7 +24,7 @@ TICKET_SECONDS = 30.0
 """Life of a ticket: a browser opens its WebSocket at once, on a slow link within seconds."""
 MOST_TICKETS = 1024
 """Tickets that are used in that time: some 100 bytes each, and no page needs more than a few."""
-ALL_SCENES, ALWAYS, WRITE, READ = "*", "0", "w", "r"
+ALWAYS, WRITE, READ = "0", "w", "r"
 
 
 class Tickets:

@@ -18,7 +18,7 @@ from server.storage.layout import DataFolder, epoch_folder
 from studies.cluster.nodes import Nodes
 from studies.options import Echo
 from studies.service.outcome import ScenarioResult
-from studies.service.process import PATIENCE_S, Service, StudyError
+from studies.service.process import PATIENCE_S, Service, StudyError, wait_until
 from studies.service.study import AGAIN_S, FrameSender, Study, compare, digests, undisturbed
 
 Run = Callable[[Study, Sequence[str]], list[ScenarioResult]]
@@ -48,7 +48,7 @@ def killed_nodes(
                 nodes.kill(node)
                 began = time.monotonic()
                 nodes.add()
-                _until(partial(_works, service, scene, before), "the scene did not go on")
+                wait_until(partial(_works, service, scene, before), "the scene did not go on")
                 pauses.append(time.monotonic() - began)
                 echo(f"killed the node at frame {index}: {len(pauses)} of {count}, on after {pauses[-1]:.1f} s")
             thread.join()
@@ -77,7 +77,7 @@ def stopped_node(
         assert stale is not None
         nodes.stop(node)
         began, committed = time.monotonic(), service.status(scene).committed
-        _until(lambda: service.status(scene).committed > committed, "the scene did not go on")
+        wait_until(lambda: service.status(scene).committed > committed, "the scene did not go on")
         pause = time.monotonic() - began
         echo(f"on after {pause:.1f} s; the node is continued")
         folder = epoch_folder(states, stale)
@@ -123,8 +123,8 @@ def restarted_head(
         node, _ = _node_of(service, nodes, scene)
         nodes.kill(node)  # whether the head that came back places and watches
         nodes.add()
-        _until(lambda: service.status(scene).worker_deaths > deaths, "a lost node was not noticed")
-        _until(lambda: service.worker_pid(scene) is not None, "the scene was not placed again")
+        wait_until(lambda: service.status(scene).worker_deaths > deaths, "a lost node was not noticed")
+        wait_until(lambda: service.worker_pid(scene) is not None, "the scene was not placed again")
         faults = sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
         found = (
             f"{without} frames committed meanwhile, {deaths} workers lost; then a node was killed, and its scene "
@@ -185,14 +185,6 @@ def _works(service: Service, scene: str, before: int | None) -> bool:
         return False
     status = service.status(scene)
     return status.state == "updating" or status.queued == 0
-
-
-def _until(done: Callable[[], bool], fault: str) -> None:
-    until = time.monotonic() + PATIENCE_S
-    while not done():
-        if time.monotonic() > until:
-            raise StudyError(fault)
-        time.sleep(AGAIN_S)
 
 
 ON_NODES = ("nodes", "stopped")

@@ -22,13 +22,14 @@ from types import TracebackType
 from typing import Any, Self
 
 from studies.cluster.nodes import HEALTH, REDIS, STORE_BYTES, redis
-from studies.service.process import StudyError
+from studies.service.process import StudyError, wait_until
 
 HEAD, NODE, PORT = "127.0.0.1", "127.0.0.2", 6397
 APART = ("unshare", "--pid", "--fork", "--mount-proc", "--kill-child")
 BETWEEN_S = (8.0, 14.0)
 """The head is let alone for so long between two kills."""
 PATIENCE_S = 60.0
+NOT_STARTED = "the cluster did not start"
 
 
 class SupervisedCluster:
@@ -50,7 +51,7 @@ class SupervisedCluster:
     def __enter__(self) -> Self:
         self._supervisor.start()
         try:
-            _wait_for(lambda: _listens(PORT))
+            wait_until(lambda: _listens(PORT), NOT_STARTED, PATIENCE_S)
             self._start("--address", f"{HEAD}:{PORT}", "--node-ip-address", NODE, "--num-cpus", "1")
         except BaseException:
             self.__exit__(None, None, None)
@@ -105,7 +106,7 @@ def silences(count: int, echo: Callable[[str], None]) -> list[float]:
 
     found = []
     with SupervisedCluster():
-        _wait_for(lambda: _joined(ray))
+        wait_until(lambda: _joined(ray), NOT_STARTED, PATIENCE_S)
         made: Any = ray.remote(Answers)
         try:
             for number in range(count):
@@ -154,11 +155,3 @@ def _listens(port: int) -> bool:
     with contextlib.suppress(OSError), socket.create_connection((HEAD, port), timeout=1):
         return True
     return False
-
-
-def _wait_for(done: Callable[[], bool]) -> None:
-    until = time.monotonic() + PATIENCE_S
-    while not done():
-        if time.monotonic() > until:
-            raise StudyError("the cluster did not start")
-        time.sleep(0.5)

@@ -19,7 +19,7 @@ from client.sdk import Client
 from client.wire import FrameState
 from scas4d_core.captures import Capture
 from studies.captures import open_measured
-from studies.service.process import Service
+from studies.service.process import Service, wait_until
 
 PACKAGES = ("scas4d_core", "server", "client")
 MOST_OF_A_FRAME, MOST_OF_A_RENDER = 62, 26
@@ -31,7 +31,7 @@ SETTINGS = {
     "static": {"iterations": 300, "max_gaussians": 2500},
     "update": {"iterations": 20},
 }
-POLL_S = 0.05
+COMMITTED_S = 120.0
 SETTLE_S = 0.3
 """After the commit or the answer, for what a process still does about it; before, for what it did. Short: what
 runs in the background every few seconds does not belong to the frame."""
@@ -105,7 +105,9 @@ def crossed(folder: Path, capture: Capture) -> dict[str, list[str]]:
                 state = folder / "data" / "scenes" / scene / "states" / f"frame_{index:06d}.npz"
                 with _phase(folder, f"frame {index}"):
                     put(index)
-                    _until(state.exists)  # asking the service would cross other files
+                    wait_until(
+                        state.exists, "the frame was not committed", COMMITTED_S
+                    )  # asking the service would cross other files
                 assert client.frame(scene, index).state is FrameState.COMMITTED
                 with _phase(folder, f"render {index}"):
                     client.render(scene, camera, index)
@@ -125,14 +127,6 @@ def _phase(folder: Path, name: str) -> Iterator[None]:
         time.sleep(SETTLE_S)
         if text:
             yield
-
-
-def _until(holds: Callable[[], bool], seconds: float = 120.0) -> None:
-    until = time.monotonic() + seconds
-    while not holds():
-        if time.monotonic() > until:
-            raise TimeoutError(f"the frame was not committed within {seconds:g} s")
-        time.sleep(POLL_S)
 
 
 def _files(folder: Path, phase: str, root: Path) -> Iterator[str]:

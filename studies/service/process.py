@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,19 @@ EVERY_S = 0.05
 
 class StudyError(RuntimeError):
     """The service did not do what the study needs."""
+
+
+def wait_until(done: Callable[[], bool], fault: str, seconds: float = PATIENCE_S) -> None:
+    """Waits until something holds.
+
+    Raises:
+        StudyError: with the fault, where it does not within so long.
+    """
+    until = time.monotonic() + seconds
+    while not done():
+        if time.monotonic() > until:
+            raise StudyError(fault)
+        time.sleep(EVERY_S)
 
 
 class Service:

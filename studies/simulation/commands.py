@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from studies.options import Page, write_page
+from studies.simulation.delays import HEAD_S
 
 
 def simulate(
@@ -16,9 +17,9 @@ def simulate(
     frames: Annotated[int, typer.Option(min=2, help="Frames of each scene.")] = 40,
     seed: Annotated[int, typer.Option(help="Of all that is drawn.")] = 0,
     silent: Annotated[
-        tuple[float, float] | None,
-        typer.Option(help="The head of the cluster does not answer for so long, from and to, seconds.  [as measured]"),
-    ] = None,
+        tuple[float, float],
+        typer.Option(help="The head of the cluster does not answer for so long, from and to, seconds."),
+    ] = HEAD_S,
     out: Page = None,
 ) -> None:
     """Simulates a big cluster by a virtual clock: is a frame lost or run twice, and how soon have scenes a place?
@@ -30,12 +31,11 @@ def simulate(
     from client.cli.extras import need_server
 
     need_server()
-    from studies.simulation.delays import HEAD_S
     from studies.simulation.simulate import Sizes
     from studies.simulation.simulate import simulate as run
     from studies.simulation.targets import rows, told
 
-    outcome = run(Sizes(scenes, nodes, failures, frames, seed, silent or HEAD_S))
+    outcome = run(Sizes(scenes, nodes, failures, frames, seed, silent))
     text = told(outcome)
     typer.echo(text)
     write_page(out, text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import io
 import struct
@@ -77,6 +78,15 @@ def wait_for(condition, seconds=20):
     while not condition():
         assert time.monotonic() < until
         time.sleep(0.05)
+
+
+async def wait_for_soon(condition):
+    """The same beside an event loop."""
+    for _ in range(500):
+        if condition():
+            return
+        await asyncio.sleep(0.01)
+    raise AssertionError("it did not come")
 
 
 def declares(width, height):

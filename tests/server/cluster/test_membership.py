@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable
 
 import pytest
+from sending import wait_for_soon
 
 membership = pytest.importorskip("server.cluster.membership", reason="Ray is not installed: pip install 'scas4d[ray]'")
 
@@ -44,14 +44,6 @@ def cluster(monkeypatch: pytest.MonkeyPatch) -> Cluster:
     return Cluster(monkeypatch)
 
 
-async def until(done: Callable[[], object]) -> None:
-    for _ in range(500):
-        if done():
-            return
-        await asyncio.sleep(0.01)
-    raise AssertionError("it did not come")
-
-
 def test_what_ran_is_given_up_first_and_the_service_is_announced_last(cluster: Cluster) -> None:
     member = membership.Membership(None)
     member.join()
@@ -69,7 +61,7 @@ def test_what_ran_is_given_up_first_and_the_service_is_announced_last(cluster: C
         assert cluster.events == ["joined"]  # nothing is lost
         cluster.refuses = 2
         cluster.lost = True
-        await until(lambda: "announced" in cluster.events)
+        await wait_for_soon(lambda: "announced" in cluster.events)
         keeping.cancel()
 
     asyncio.run(test())
@@ -95,11 +87,11 @@ def test_a_silent_head_is_told_of_once_and_is_no_lost_node(
 
     async def test() -> None:
         keeping = asyncio.ensure_future(member.keep(lambda: cluster.events.append("given up"), nothing))
-        await until(lambda: len(asked) == 2)
+        await wait_for_soon(lambda: len(asked) == 2)
         await asyncio.sleep(0.1)
         assert len(asked) == 2  # one question at a time
         answers.set()
-        await until(lambda: len(asked) > 3)
+        await wait_for_soon(lambda: len(asked) > 3)
         keeping.cancel()
 
     monkeypatch.setattr(membership, "own_node_is_lost", ask)
@@ -129,7 +121,7 @@ def test_a_service_that_ray_does_not_let_join_again_ends(cluster: Cluster, monke
     async def test() -> None:
         cluster.lost = True
         keeping = asyncio.ensure_future(member.keep(lambda: None, nothing))
-        await until(lambda: ended)
+        await wait_for_soon(lambda: ended)
         keeping.cancel()
 
     member = membership.Membership(None)
@@ -150,9 +142,9 @@ def test_a_node_that_is_lost_before_the_service_is_announced_is_noticed(cluster:
     async def test() -> None:
         cluster.lost = True
         keeping = asyncio.ensure_future(member.keep(lambda: lost.append(True), fails))
-        await until(lambda: cluster.events.count("joined") == 2)
+        await wait_for_soon(lambda: cluster.events.count("joined") == 2)
         cluster.lost = True
-        await until(lambda: cluster.events.count("joined") == 3)
+        await wait_for_soon(lambda: cluster.events.count("joined") == 3)
         keeping.cancel()
 
     member = membership.Membership(None)
@@ -188,11 +180,11 @@ def test_what_is_started_meanwhile_waits(cluster: Cluster) -> None:
         cluster.refuses = 10**6
         cluster.lost = True
         keeping = asyncio.ensure_future(member.keep(lambda: None, nothing))
-        await until(lambda: cluster.inits > 2)
+        await wait_for_soon(lambda: cluster.inits > 2)
         threading.Thread(target=start, daemon=True).start()
         assert not waited.wait(0.1)
         cluster.refuses = 0
-        await until(waited.is_set)
+        await wait_for_soon(waited.is_set)
         keeping.cancel()
 
     asyncio.run(test())

@@ -6,10 +6,12 @@ import asyncio
 import socket
 import threading
 from collections.abc import Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import pytest
+from sending import wait_for_soon
 
 ray_placement = pytest.importorskip(
     "server.cluster.ray_placement", reason="Ray is not installed: pip install 'scas4d[ray]'"
@@ -103,14 +105,6 @@ def killed(monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return found
 
 
-async def until(done: Callable[[], object]) -> None:
-    for _ in range(500):
-        if done():
-            return
-        await asyncio.sleep(0.01)
-    raise AssertionError("it did not come")
-
-
 def run(test: Callable[[FakePlacement], Awaitable[None]]) -> None:
     async def all_of() -> None:
         await test(FakePlacement())
@@ -130,7 +124,7 @@ def test_a_node_at_whose_address_nobody_listens_is_lost_before_ray_finds_it_dead
         port = server.getsockname()[1]
         node = {"NodeID": "a", "Alive": True, "NodeManagerAddress": "127.0.0.1", "NodeManagerPort": port}
         monkeypatch.setattr("server.cluster.nodes.all_nodes", lambda: [node])
-        monkeypatch.setattr("server.cluster.nodes._own", lambda: "a")
+        monkeypatch.setattr("server.cluster.nodes.own_node", lambda: "a")
         assert not is_lost("a")
         assert is_lost("b")
     assert is_lost("a")
@@ -141,10 +135,10 @@ def test_all_nodes_are_lost_to_a_service_whose_own_is(monkeypatch: pytest.Monkey
         port = server.getsockname()[1]
         node = {"NodeID": "a", "Alive": True, "NodeManagerAddress": "127.0.0.1", "NodeManagerPort": port}
         monkeypatch.setattr("server.cluster.nodes.all_nodes", lambda: [node, {"NodeID": "own", "Alive": False}])
-        monkeypatch.setattr("server.cluster.nodes._own", lambda: "own")
+        monkeypatch.setattr("server.cluster.nodes.own_node", lambda: "own")
         assert is_lost("a")
         assert own_node_is_lost()
-        monkeypatch.setattr("server.cluster.nodes._own", lambda: "a")
+        monkeypatch.setattr("server.cluster.nodes.own_node", lambda: "a")
         assert not is_lost("a")
         assert not own_node_is_lost()
 
@@ -158,13 +152,13 @@ def test_a_node_is_lost_only_if_ray_says_so(
 
     async def test(placement: FakePlacement) -> None:
         running = Running(placement)
-        await until(lambda: running.process.pid)
+        await wait_for_soon(lambda: running.process.pid)
         placement.actor.said.put_nowait(dies())
-        await until(lambda: running.ends)
+        await wait_for_soon(lambda: running.ends)
         (end,) = running.ends
         assert end.lost is lost
         assert "\n" not in end
-        await until(lambda: killed == [placement.actor])
+        await wait_for_soon(lambda: killed == [placement.actor])
 
     run(test)
 
@@ -172,7 +166,7 @@ def test_a_node_is_lost_only_if_ray_says_so(
 def test_one_that_is_lost_with_its_cluster_is_told_and_not_asked_again(killed: list[Any]) -> None:
     async def test(placement: FakePlacement) -> None:
         running = Running(placement)
-        await until(lambda: running.process.pid)
+        await wait_for_soon(lambda: running.process.pid)
         running.process.lose()
         (end,) = running.ends
         assert end.lost
@@ -185,11 +179,34 @@ def test_one_that_is_lost_with_its_cluster_is_told_and_not_asked_again(killed: l
     run(test)
 
 
+def test_one_that_waits_for_a_thread_when_it_is_lost_is_not_made(killed: list[Any]) -> None:
+    """It would be made on the cluster that the service joins next, and nobody would end it."""
+    made: list[str] = []
+
+    async def test(placement: FakePlacement) -> None:
+        thread, busy = ThreadPoolExecutor(1), threading.Event()
+        placement.asked = lambda function, *arguments: asyncio.get_running_loop().run_in_executor(  # type: ignore[method-assign]
+            thread, function, *arguments
+        )
+        placement.host = lambda name, needs: made.append(name)  # type: ignore[method-assign,assignment,return-value]
+        thread.submit(busy.wait, 10)
+        running = Running(placement)
+        await asyncio.sleep(0.05)
+        running.process.lose()
+        await asyncio.sleep(0.05)  # the thread hears of it by the loop
+        busy.set()
+        thread.shutdown(wait=True)
+        assert made == []
+        assert running.ends[0].lost
+
+    run(test)
+
+
 def test_an_actor_that_cannot_be_made_is_no_lost_node(killed: list[Any]) -> None:
     async def test(placement: FakePlacement) -> None:
         placement.actor.refuses = dies("no such environment")
         running = Running(placement)
-        await until(lambda: running.ends)
+        await wait_for_soon(lambda: running.ends)
         (end,) = running.ends
         assert not end.lost
         assert placement.places == {}
@@ -202,7 +219,7 @@ def test_whatever_ends_the_messages_is_told(killed: list[Any], fault: Exception)
     async def test(placement: FakePlacement) -> None:
         running = Running(placement)
         placement.actor.said.put_nowait(fault)
-        await until(lambda: running.ends)
+        await wait_for_soon(lambda: running.ends)
         assert not running.ends[0].lost
 
     run(test)
@@ -214,7 +231,7 @@ def test_a_message_that_cannot_be_taken_in_does_not_end_the_others(killed: list[
         running.raises = KeyError("x")
         for message in ("a", "b", Gone(3)):
             placement.actor.said.put_nowait(message)
-        await until(lambda: running.ends)
+        await wait_for_soon(lambda: running.ends)
         assert running.messages == ["a", "b"]
         assert running.ends[0].exit_code == 3
 
@@ -231,9 +248,9 @@ def test_one_that_is_given_up_before_it_has_begun_is_not_listed(killed: list[Any
         placement.actor.post = Remote(refused)
         running = Running(placement)
         running.process.send("a")
-        await until(lambda: running.ends)
+        await wait_for_soon(lambda: running.ends)
         placement.actor.begins.set()
-        await until(lambda: running.process.pid)
+        await wait_for_soon(lambda: running.process.pid)
         assert not placement.places
 
     run(test)
@@ -250,7 +267,7 @@ def test_one_that_is_stopped_while_the_head_is_silent_is_killed_later(
         await running.process.stop(0.05)
         assert not killed
         placement.may_make.set()
-        await until(lambda: killed == [placement.actor])
+        await wait_for_soon(lambda: killed == [placement.actor])
 
     run(test)
 
@@ -281,9 +298,9 @@ def test_messages_before_the_actor_is_made_are_posted_in_order_and_nothing_waits
         await asyncio.sleep(0.05)
         assert placement.actor.posted == []
         placement.may_make.set()
-        await until(lambda: running.process.pid)
+        await wait_for_soon(lambda: running.process.pid)
         running.process.send("c")
-        await until(lambda: len(placement.actor.posted) == 3)
+        await wait_for_soon(lambda: len(placement.actor.posted) == 3)
         assert placement.actor.posted == [(0, "a"), (1, "b"), (2, "c")]
 
     run(test)
