@@ -67,6 +67,11 @@ def own_node() -> str:
     return str(ray.get_runtime_context().get_node_id())
 
 
+def own_machine() -> str:
+    """The address of this machine in the cluster. It may have several nodes; services of one may be members by each."""
+    return str(ray.util.get_node_ip_address())  # type: ignore[no-untyped-call]
+
+
 def _own_is_in(nodes: Iterable[Mapping[str, Any]]) -> bool:
     own = own_node()
     return any(node["NodeID"] == own for node in nodes)

@@ -12,7 +12,7 @@ import ray
 from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from server.cluster.nodes import own_node
+from server.cluster.nodes import own_machine, own_node
 from server.settings import is_loopback
 
 PREFIX = "service."
@@ -23,10 +23,10 @@ log = logging.getLogger("scas4d.server")
 
 
 class Address:
-    """The actor: it tells where the service listens, and the node from which alone that can be reached, or None."""
+    """The actor: it tells where the service listens, and the machine from which alone that can be reached, or None."""
 
-    def __init__(self, url: str, node: str | None) -> None:
-        self._told = url, node
+    def __init__(self, url: str, machine: str | None) -> None:
+        self._told = url, machine
 
     def get(self) -> tuple[str, str | None]:
         """Returns both."""
@@ -37,18 +37,18 @@ def announced(word: str, host: str, port: int) -> Any:
     """Announces this service; returns the actor, which goes with this process. Blocking.
 
     Args:
-        word: of this service. host, port: it listens there; an address that stands for all is told as this node's.
+        word: of this service. host, port: it listens there; an address that stands for all is told as this machine's.
     """
-    node = own_node()
+    machine = own_machine()
     if host in ("0.0.0.0", "::", ""):
-        host = str(ray.util.get_node_ip_address())  # type: ignore[no-untyped-call]
+        host = machine
     elif is_loopback(host):
         log.warning("other machines of the cluster cannot reach this service at %s; give it an address: --host", host)
     url = f"http://{_authority(host, port)}"
     made: Any = ray.remote(Address)
-    here = NodeAffinitySchedulingStrategy(node, soft=True)
+    here = NodeAffinitySchedulingStrategy(own_node(), soft=True)
     actor = made.options(name=PREFIX + word, num_cpus=0, max_restarts=-1, scheduling_strategy=here)
-    return actor.remote(url, node if is_loopback(host) else None)
+    return actor.remote(url, machine if is_loopback(host) else None)
 
 
 def _authority(host: str, port: int) -> str:
@@ -71,7 +71,7 @@ def others(word: str, known: Mapping[str, str] | None) -> dict[str, str]:
     """
     try:
         names = [name for name in ray.util.list_named_actors() if name.startswith(PREFIX) and name != PREFIX + word]
-        node = own_node()
+        machine = own_machine()
     except (RayError, RuntimeError, ConnectionError) as error:
         if known is None:
             raise RuntimeError(f"the head of the cluster does not say which services there are: {error}") from error
@@ -79,7 +79,7 @@ def others(word: str, known: Mapping[str, str] | None) -> dict[str, str]:
         return dict(known)
     before = {name: url for name, url in (known or {}).items() if name in names and url != name}
     asked = _asked([name for name in names if name not in before])
-    return before | {name: url for name, (url, only) in asked.items() if only in (None, node)}
+    return before | {name: url for name, (url, only) in asked.items() if only in (None, machine)}
 
 
 def _asked(names: Sequence[str]) -> dict[str, tuple[str, str | None]]:
