@@ -6,7 +6,6 @@ import asyncio
 import logging
 import os
 import socket
-import threading
 from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -43,7 +42,6 @@ class Membership:
 
     def __init__(self, address: str | None) -> None:
         self._address = address
-        self._is_member = threading.Event()
         self._silent = False
         self._said = ""
         self._thread = ThreadPoolExecutor(1, "membership")
@@ -72,26 +70,21 @@ class Membership:
                     f"the Ray cluster at {self._address} cannot be joined ({error}); this machine needs a node of it "
                     "(`ray start --address`), and, where it asks for a token, RAY_AUTH_MODE=token and that token"
                 ) from None
-        self._is_member.set()
 
-    def wait(self) -> None:
-        """Waits while the service joins again. Blocking."""
-        self._is_member.wait()
-
-    async def keep(self, on_loss: Callable[[], None], on_return: Callable[[], Awaitable[None]]) -> None:
+    async def keep(self, on_loss: Callable[[], Awaitable[None]], on_return: Callable[[], Awaitable[None]]) -> None:
         """Looks after the node of this machine, for ever.
 
         Args:
-            on_loss: called once the node, and so every actor of this service, is lost. on_return: called once the
-                service is a member again; tried again where it fails.
+            on_loss: called once the node, and so every actor of this service, is lost; when it ends, nothing of Ray's
+                may be left in this process. on_return: called once the service is a member again; tried again where it
+                fails.
         """
         announced = True
         while True:
             await asyncio.sleep(EVERY_S)
             if await self._is_lost():
                 log.error("the Ray node of this machine is lost, and all processes of scenes with it; joining again")
-                self._is_member.clear()
-                on_loss()
+                await on_loss()
                 while not await self._is_done(self._join_or_end):
                     await asyncio.sleep(EVERY_S)
                 log.info("the service has joined the cluster again")
@@ -111,7 +104,6 @@ class Membership:
         except TimeoutError:
             log.error("Ray did not let the service leave within %g s; it ends as it is", LEAVE_S)
             os._exit(1)
-        self._is_member.set()  # who waits gets an error of Ray's
 
     async def _is_lost(self) -> bool:
         """Asks the head, and logs when it is silent and when it answers again."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import logging
 import secrets
 from collections.abc import Callable, Coroutine, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import Any, TypeVar
 from weakref import WeakSet
 
@@ -15,6 +16,7 @@ import ray
 from ray.exceptions import RayActorError, RayError
 
 from client.wire import Cluster
+from server.cluster.calls import Calls
 from server.cluster.folder import check_folder
 from server.cluster.host import Gone, Host, Manner, Started
 from server.cluster.marks import mark
@@ -32,8 +34,8 @@ WAIT_S = 3.0
 """A worker that is not placed after so long says what it waits for."""
 LOST_S = 10.0
 """The head says within so long whether a node is lost."""
-THREADS = 8
-"""That wait for the head at a time."""
+LEFT_S = 20.0
+"""What this process has asked of Ray is over within so long before it leaves the cluster."""
 STOPPED_S = 5.0
 """An actor has so much longer than its process to say that this has ended."""
 
@@ -60,9 +62,8 @@ class RayPlacement(Placement):
     def __init__(self, prepare: Callable[[], None] | None, address: str | None, server: ServerSettings) -> None:
         super().__init__(prepare)
         self.places: dict[str, Place] = {}
-        # Of its own: the journals are written by those of the event loop, and the head of the cluster may not answer.
-        self._threads = ThreadPoolExecutor(THREADS, "ray")
-        self._watch = NodeWatch(all_nodes, threads=self._threads)
+        self._calls = Calls()
+        self._watch = NodeWatch(partial(self.asked, all_nodes))
         self._server = server
         self._membership = Membership(address)
         self._processes: WeakSet[RayProcess] = WeakSet()
@@ -70,6 +71,8 @@ class RayPlacement(Placement):
         self._started = 0
         self._listens: tuple[str, int] | None = None
         self._announced: Any = None
+        self._kept: Any = None
+        """Handles and answers of Ray's: it ends this process, or stands still, where one goes while it leaves."""
         self._keeping: asyncio.Task[None] | None = None
         self._siblings: Mapping[str, str] | None = None
 
@@ -88,15 +91,29 @@ class RayPlacement(Placement):
             self._watch.saw(await asyncio.to_thread(all_nodes))  # not `look`: the answer would be lost with the loop
             log.info("scenes run on a Ray cluster of %d nodes", sum(node["Alive"] for node in self._watch.nodes))
         self._keeping = asyncio.get_running_loop().create_task(
-            self._membership.keep(on_loss=self._lose_all, on_return=self._announce)
+            self._membership.keep(on_loss=self._lose_all, on_return=self._return)
         )
 
-    def _lose_all(self) -> None:
+    async def _lose_all(self) -> None:
+        self._calls.hold()
         for process in tuple(self._processes):
             try:
                 process.lose()
             except Exception:  # a fault of one scene's keeps none of the others, nor the service, from going on
                 log.exception("a process that is lost with its cluster")
+        await self._let_go()
+
+    async def _let_go(self) -> None:
+        """Asks Ray nothing more, and keeps what of its is in this process until the service has left."""
+        self._kept = [self._announced, [await process.let_go() for process in tuple(self._processes)]]
+        if not await self._calls.over(LEFT_S):
+            log.warning("Ray has not answered within %g s; the service leaves the cluster nevertheless", LEFT_S)
+        gc.collect()
+
+    async def _return(self) -> None:
+        self._kept = None
+        self._calls.go_on()
+        await self._announce()
 
     async def cluster(self) -> Cluster:
         """See `Placement`."""
@@ -119,14 +136,16 @@ class RayPlacement(Placement):
         return list(self._siblings.values())
 
     def asked(self, function: Callable[..., T], *arguments: Any) -> asyncio.Future[T]:
-        """Calls what asks the head of the cluster, in a thread."""
-        return asyncio.get_running_loop().run_in_executor(self._threads, function, *arguments)
+        """Calls what asks Ray, in a thread, while the service is a member of the cluster."""
+        return self._calls.asked(function, *arguments)
 
     async def close(self) -> None:
         """Leaves the cluster; actors that are left end."""
-        self._threads.shutdown(wait=False, cancel_futures=True)  # what asks later would join a cluster again
+        self._calls.hold()
         if self._keeping is not None:
             self._keeping.cancel()
+        await self._let_go()
+        self._calls.close()
         await asyncio.to_thread(self._membership.leave)
 
     def start(
@@ -146,7 +165,6 @@ class RayPlacement(Placement):
 
     def host(self, name: str, needs: Needs) -> Any:
         """An actor for a process. Blocking: the head registers its name."""
-        self._membership.wait()
         made: Any = ray.remote(Host)
         return made.options(name=name, **needs.options()).remote(
             self.prepare, self._server.data.resolve(), self._token, Manner.here()
@@ -179,8 +197,10 @@ class RayProcess:
         self._lost = False
         self._actor: Any = None
         self._making: asyncio.Future[Any] = placement.asked(placement.host, name, needs)
+        self._answers: set[Any] = set()
+        """That are waited for, or were when the cluster was lost."""
         self._tasks: set[asyncio.Task[None]] = set()
-        self._task = asyncio.get_running_loop().create_task(self._run(*runs))
+        self._task = self._beside(self._run(*runs))
 
     @property
     def pid(self) -> int | None:
@@ -203,23 +223,30 @@ class RayProcess:
         self._task.cancel()
         self._placement.places.pop(self._name, None)
         if started and not over:
-            with contextlib.suppress(RayError, TimeoutError):
-                await asyncio.wait_for(self._actor.stop.remote(seconds), seconds + STOPPED_S)
+            await asyncio.wait({self._beside(self._ask_to_stop(seconds))})
         await asyncio.wait({self._beside(self._kill())}, timeout=STOPPED_S)  # it goes on where the head is silent
 
     def lose(self) -> None:
         """Gives it up with the cluster on which it ran, of which nothing can be asked any more."""
         self._lost = True
-        self._task.cancel()
-        self._making.cancel()  # where it waits for a thread, it would be made on the cluster that is joined next
+        self._making.cancel()  # where it waits to begin, it would be made on the cluster that is joined next
         self._give_up("the Ray node of the service's machine is lost", lost=True)
+
+    async def let_go(self) -> Any:
+        """Asks the actor nothing more; returns what is left of Ray's."""
+        self._lost = True
+        asked = {self._making, *self._tasks}
+        for each in asked:
+            each.cancel()
+        await asyncio.wait(asked)
+        return self._making, self._answers
 
     async def _run(self, entry: Entry, spec: Any) -> None:
         role = self._needs.role
         try:
             await self._begin(entry, spec)
             while not self._over:
-                for message in await self._actor.take.remote():
+                for message in await self._answer(self._actor.take.remote()):
                     if isinstance(message, Gone):
                         self._end(Ended(message.exit_code, starved=message.starved))
                     elif not self._over:
@@ -240,7 +267,7 @@ class RayProcess:
     async def _begin(self, entry: Entry, spec: Any) -> None:
         """Starts the process, and says what it waits for as long as no node has room."""
         self._actor = await asyncio.shield(self._making)
-        starting = asyncio.ensure_future(self._actor.start.remote(entry, spec))
+        starting = asyncio.ensure_future(self._answer(self._actor.start.remote(entry, spec)))
         starting.add_done_callback(lambda done: done.cancelled() or done.exception())  # who stops it does not ask
         early, self._early = self._early or [], None
         for message in early:
@@ -270,9 +297,21 @@ class RayProcess:
         except Exception:  # a fault of the service's own: the next message is none of it
             log.exception("a message of actor %s", self._name)
 
+    async def _ask_to_stop(self, seconds: float) -> None:
+        with contextlib.suppress(RayError, TimeoutError):
+            await asyncio.wait_for(self._answer(self._actor.stop.remote(seconds)), seconds + STOPPED_S)
+
+    async def _answer(self, asked: Any) -> Any:
+        self._answers.add(asked)
+        try:
+            return await asked
+        finally:
+            if not self._lost:
+                self._answers.discard(asked)
+
     async def _post(self, sending: Any) -> None:
         try:
-            await sending
+            await self._answer(sending)
         except RayActorError:
             pass  # `_run` learns of it, too, and says what became of it
         except RayError as error:  # it did not get the message, so it must not go on

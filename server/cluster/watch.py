@@ -1,11 +1,10 @@
-"""Watches the nodes of the cluster: asks Ray in a thread, seldom, and never keeps a request waiting for its head."""
+"""Watches the nodes of the cluster: asks Ray seldom, and never keeps a request waiting for its head."""
 
 from __future__ import annotations
 
 import asyncio
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor
 from typing import Any
 
 AllNodes = Sequence[Mapping[str, Any]]
@@ -25,22 +24,17 @@ class NodeWatch:
     """Nodes as the head of the cluster told them last, and those that were lost lately. On the event loop.
 
     Args:
-        ask: asks the head for all nodes that there have been, as Ray describes them. Blocking.
-        now: seconds of a clock that never goes back. threads: for the question; None: those of the event loop.
+        ask: asks the head for all nodes that there have been, as Ray describes them.
+        now: seconds of a clock that never goes back.
 
     Attributes:
         nodes: of the newest answer. answers: whether the head gave it within `PATIENCE_S`.
     """
 
-    def __init__(
-        self,
-        ask: Callable[[], AllNodes],
-        now: Callable[[], float] = time.monotonic,
-        threads: Executor | None = None,
-    ) -> None:
+    def __init__(self, ask: Callable[[], asyncio.Future[Any]], now: Callable[[], float] = time.monotonic) -> None:
         self.nodes: AllNodes = ()
         self.answers = True
-        self._ask, self._now, self._threads = ask, now, threads
+        self._ask, self._now = ask, now
         self._asked = -FRESH_S
         self._answer: asyncio.Future[AllNodes] | None = None
         self._alive: set[str] = set()
@@ -57,7 +51,7 @@ class NodeWatch:
         now = self._now()
         if self._answer is None and now - self._asked >= FRESH_S:
             self._asked = now
-            self._answer = asyncio.get_running_loop().run_in_executor(self._threads, self._ask)
+            self._answer = self._ask()
             self._answer.add_done_callback(self._take)
         if self._answer is not None:
             left = self._asked + PATIENCE_S - now

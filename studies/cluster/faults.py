@@ -27,6 +27,8 @@ GOES_ON_S = 30.0
 """A scene works again so soon after its node is gone."""
 HEAD_GONE_S = 10.0
 """The head is away for so long."""
+NOT_PLACED = "not placed on a node yet"
+"""What the status of a scene says whose worker waits for room."""
 SWEPT_S = 180.0
 """Folders of workers before are gone after so long."""
 
@@ -102,6 +104,39 @@ def stopped_node(
         return ScenarioResult("a node stopped, and continued after its scene has moved", target, found, faults)
 
 
+def full_nodes(study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo) -> ScenarioResult:
+    """The scene's node is killed while other scenes fill those that are left; later they leave."""
+    with _running(study, "full") as (service, scene, sender):
+        left = _second_half(study, service, scene, sender)
+        others = _fill(study, service)
+        node, _ = _node_of(service, nodes, scene)
+        committed = service.status(scene).committed
+        nodes.kill(node)
+        wait_until(lambda: NOT_PLACED in (service.status(scene).error or ""), "the scene does not say that it waits")
+        said = str(service.status(scene).error)
+        _send(sender, left)
+        time.sleep(5 * update_s)
+        faults = []
+        if service.status(scene).committed > committed:
+            faults.append("the scene went on though nothing had room, so nothing was tried")
+        echo(f"{len(others)} scenes fill the nodes; waiting: {said}")
+        for other in others:
+            service.http.delete(f"/v1/scenes/{other}").raise_for_status()
+        began = time.monotonic()
+        wait_until(lambda: service.status(scene).committed > committed, "the scene did not go on when there was room")
+        pause = time.monotonic() - began
+        nodes.add()
+        status = service.finish(scene, len(study.frames))
+        faults += sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
+        if blamed := service.deaths(scene):
+            faults.append(f"a frame was held to blame for {blamed} of the nodes")
+        if status.degraded:
+            faults.append(f"the scene is degraded still: {status.error}")
+        found = f"{len(left)} frames acknowledged while it waited and said why; the next committed {pause:.1f} s after"
+        target = "frames are acknowledged, the scene says why it waits, goes on once there is room; bit-identical"
+        return ScenarioResult("a node killed while other scenes fill the rest", target, found, faults)
+
+
 def restarted_head(
     study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo
 ) -> ScenarioResult:
@@ -174,6 +209,22 @@ def _changed(folder: Path) -> dict[str, int]:
     return found
 
 
+def _fill(study: Study, service: Service) -> list[str]:
+    """Creates scenes until the worker of one has no room, which is deleted again; returns the others."""
+    others: list[str] = []
+    while True:
+        scene = study.create(service)
+        wait_until(partial(_is_placed_or_waits, service, scene), "a scene is neither placed nor does it wait")
+        if service.status(scene).error:
+            service.http.delete(f"/v1/scenes/{scene}").raise_for_status()
+            return others
+        others.append(scene)
+
+
+def _is_placed_or_waits(service: Service, scene: str) -> bool:
+    return service.worker_pid(scene) is not None or NOT_PLACED in (service.status(scene).error or "")
+
+
 def _send(sender: FrameSender, indices: range) -> None:
     for index in indices:
         sender.send(index)
@@ -187,7 +238,7 @@ def _works(service: Service, scene: str, before: int | None) -> bool:
     return status.state == "updating" or status.queued == 0
 
 
-ON_NODES = ("nodes", "stopped")
+ON_NODES = ("nodes", "stopped", "full")
 """Scenarios of nodes by name."""
 OF_THE_HEAD = "head"
 """That of a head which has Redis, in a cluster of its own."""
@@ -221,6 +272,8 @@ def run(study: Study, *, count: int, seed: int, parts: Sequence[str], local: Run
             outcomes.append(killed_nodes(there, nodes, expected, update_s, count, seed, echo))
         if "stopped" in parts:
             outcomes.append(stopped_node(there, nodes, expected, update_s, echo))
+        if "full" in parts:
+            outcomes.append(full_nodes(there, nodes, expected, update_s, echo))
         if others := [part for part in parts if part in AS_LOCALLY]:
             outcomes += local(there, others)
     return outcomes

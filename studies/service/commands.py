@@ -32,7 +32,7 @@ def faults(
     part: Annotated[
         list[str] | None,
         typer.Option(
-            help="Only this: kills, beginnings, log, disk, bits or strangers; on a cluster nodes, stopped, "
+            help="Only this: kills, beginnings, log, disk, bits or strangers; on a cluster nodes, stopped, full, "
             "head (needs redis-server), kills, beginnings, log or bits. May be repeated."
         ),
     ] = None,

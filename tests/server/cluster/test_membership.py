@@ -49,6 +49,10 @@ def test_what_ran_is_given_up_first_and_the_service_is_announced_last(cluster: C
     member.join()
     fails = [True]
 
+    async def give_up() -> None:
+        await asyncio.sleep(0.01)
+        cluster.events.append("given up")
+
     async def announce() -> None:
         if fails:
             fails.pop()
@@ -56,7 +60,7 @@ def test_what_ran_is_given_up_first_and_the_service_is_announced_last(cluster: C
         cluster.events.append("announced")
 
     async def test() -> None:
-        keeping = asyncio.ensure_future(member.keep(lambda: cluster.events.append("given up"), announce))
+        keeping = asyncio.ensure_future(member.keep(give_up, announce))
         await asyncio.sleep(0.1)
         assert cluster.events == ["joined"]  # nothing is lost
         cluster.refuses = 2
@@ -86,7 +90,7 @@ def test_a_silent_head_is_told_of_once_and_is_no_lost_node(
         pass
 
     async def test() -> None:
-        keeping = asyncio.ensure_future(member.keep(lambda: cluster.events.append("given up"), nothing))
+        keeping = asyncio.ensure_future(member.keep(nothing, nothing))
         await wait_for_soon(lambda: len(asked) == 2)
         await asyncio.sleep(0.1)
         assert len(asked) == 2  # one question at a time
@@ -120,7 +124,7 @@ def test_a_service_that_ray_does_not_let_join_again_ends(cluster: Cluster, monke
 
     async def test() -> None:
         cluster.lost = True
-        keeping = asyncio.ensure_future(member.keep(lambda: None, nothing))
+        keeping = asyncio.ensure_future(member.keep(nothing, nothing))
         await wait_for_soon(lambda: ended)
         keeping.cancel()
 
@@ -136,12 +140,15 @@ def test_a_service_that_ray_does_not_let_join_again_ends(cluster: Cluster, monke
 def test_a_node_that_is_lost_before_the_service_is_announced_is_noticed(cluster: Cluster) -> None:
     lost: list[bool] = []
 
+    async def lose() -> None:
+        lost.append(True)
+
     async def fails() -> None:
         raise ValueError("the name is taken")
 
     async def test() -> None:
         cluster.lost = True
-        keeping = asyncio.ensure_future(member.keep(lambda: lost.append(True), fails))
+        keeping = asyncio.ensure_future(member.keep(lose, fails))
         await wait_for_soon(lambda: cluster.events.count("joined") == 2)
         cluster.lost = True
         await wait_for_soon(lambda: cluster.events.count("joined") == 3)
@@ -162,36 +169,3 @@ def test_a_service_that_ray_does_not_let_leave_ends(cluster: Cluster, monkeypatc
     membership.Membership(None).leave()
     stands_still.set()
     assert ended == [1]
-
-
-def test_what_is_started_meanwhile_waits(cluster: Cluster) -> None:
-    member = membership.Membership(None)
-    member.join()
-    waited = threading.Event()
-
-    def start() -> None:
-        member.wait()
-        waited.set()
-
-    async def nothing() -> None:
-        pass
-
-    async def test() -> None:
-        cluster.refuses = 10**6
-        cluster.lost = True
-        keeping = asyncio.ensure_future(member.keep(lambda: None, nothing))
-        await wait_for_soon(lambda: cluster.inits > 2)
-        threading.Thread(target=start, daemon=True).start()
-        assert not waited.wait(0.1)
-        cluster.refuses = 0
-        await wait_for_soon(waited.is_set)
-        keeping.cancel()
-
-    asyncio.run(test())
-
-
-def test_who_waits_when_the_service_ends_does_not_wait_for_ever(cluster: Cluster) -> None:
-    member = membership.Membership(None)
-    member.leave()
-    member.wait()
-    assert cluster.events == ["left"]

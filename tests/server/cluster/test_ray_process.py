@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import socket
 import threading
+import weakref
 from collections.abc import Awaitable, Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -198,6 +200,56 @@ def test_one_that_waits_for_a_thread_when_it_is_lost_is_not_made(killed: list[An
         thread.shutdown(wait=True)
         assert made == []
         assert running.ends[0].lost
+
+    run(test)
+
+
+def test_what_is_left_of_ray_when_the_cluster_is_lost_is_kept_until_the_service_has_left(killed: list[Any]) -> None:
+    """Ray ends the process where one of its answers goes while the service leaves."""
+
+    class Pending:
+        """An answer that does not come."""
+
+        def __await__(self) -> Any:
+            return asyncio.Event().wait().__await__()
+
+    async def test(placement: FakePlacement) -> None:
+        pending = Pending()
+        here = weakref.ref(pending)
+        placement.actor.take = Remote([pending].pop)
+        del pending
+
+        async def lost() -> Any:
+            running = Running(placement)
+            await wait_for_soon(lambda: running.process.pid)
+            running.process.lose()
+            return await running.process.let_go()
+
+        kept = [await lost()]
+        gc.collect()
+        assert here() is not None
+        kept.clear()
+        gc.collect()
+        assert here() is None
+
+    run(test)
+
+
+def test_one_that_is_stopped_when_the_cluster_is_lost_is_not_waited_for(killed: list[Any]) -> None:
+    async def test(placement: FakePlacement) -> None:
+        async def stands_still(seconds: float) -> None:
+            await asyncio.Event().wait()
+
+        placement.actor.stop = Remote(stands_still)
+        running = Running(placement)
+        await wait_for_soon(lambda: running.process.pid)
+        stopping = asyncio.ensure_future(running.process.stop(100))
+        await asyncio.sleep(0.05)
+        running.process.lose()
+        await running.process.let_go()
+        await asyncio.wait_for(stopping, 10)
+        assert running.ends == []
+        assert killed == []
 
     run(test)
 

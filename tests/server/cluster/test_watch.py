@@ -26,7 +26,10 @@ class Head:
         self.fault: Exception | None = None
         self.speaks = threading.Event()
         self.speaks.set()
-        self.watch = NodeWatch(self._all, lambda: self.seconds)
+        self.watch = NodeWatch(self._ask, lambda: self.seconds)
+
+    def _ask(self) -> asyncio.Future[Any]:
+        return asyncio.get_running_loop().run_in_executor(None, self._all)
 
     def _all(self) -> tuple[Mapping[str, Any], ...]:
         self.asked += 1

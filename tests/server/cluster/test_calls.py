@@ -1,0 +1,84 @@
+"""Calls of Ray: none begins while the service has left its cluster, and it leaves once those before are over."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Awaitable, Callable
+
+import pytest
+
+from server.cluster.calls import THREADS, Calls
+
+
+def run(test: Callable[[Calls], Awaitable[None]]) -> None:
+    async def all_of() -> None:
+        calls = Calls()
+        try:
+            await test(calls)
+        finally:
+            calls.close()
+
+    asyncio.run(all_of())
+
+
+def test_what_is_asked_while_calls_are_held_begins_later_and_takes_no_thread() -> None:
+    async def test(calls: Calls) -> None:
+        calls.hold()
+        waiting = [calls.asked(lambda: 1) for _ in range(10 * THREADS)]
+        await asyncio.sleep(0.05)
+        assert await calls.over(0)
+        assert not any(call.done() for call in waiting)
+        calls.go_on()
+        assert await asyncio.gather(*waiting) == [1] * len(waiting)
+
+    run(test)
+
+
+def test_one_that_is_cancelled_before_it_begins_is_never_called() -> None:
+    called: list[int] = []
+
+    async def test(calls: Calls) -> None:
+        calls.hold()
+        held = calls.asked(called.append, 1)
+        await asyncio.sleep(0)
+        held.cancel()
+        calls.go_on()
+        await calls.asked(called.append, 2)
+        busy = threading.Event()
+        on = [calls.asked(busy.wait, 10) for _ in range(THREADS)]
+        queued = calls.asked(called.append, 3)
+        await asyncio.sleep(0.05)
+        queued.cancel()
+        await asyncio.sleep(0)
+        busy.set()
+        await asyncio.gather(*on)
+
+    run(test)
+    assert called == [2]
+
+
+@pytest.mark.parametrize("cancelled", [False, True])
+def test_those_that_have_begun_are_waited_for_also_where_nobody_else_does(*, cancelled: bool) -> None:
+    async def test(calls: Calls) -> None:
+        ends = threading.Event()
+        call = calls.asked(ends.wait, 10)
+        await asyncio.sleep(0.05)
+        if cancelled:
+            call.cancel()
+            await asyncio.sleep(0)
+        calls.hold()
+        assert not await calls.over(0.05)
+        ends.set()
+        assert await calls.over(10)
+        assert await calls.over(0)
+
+    run(test)
+
+
+def test_a_fault_reaches_who_has_asked() -> None:
+    async def test(calls: Calls) -> None:
+        with pytest.raises(ZeroDivisionError):
+            await calls.asked(lambda: 1 // 0)
+
+    run(test)
