@@ -75,16 +75,16 @@ class Membership:
         """Looks after the node of this machine, for ever.
 
         Args:
-            on_loss: called once the node, and so every actor of this service, is lost; when it ends, nothing of Ray's
-                may be left in this process. on_return: called once the service is a member again; tried again where it
-                fails.
+            on_loss: called once the node, and so every actor of this service, is lost. When it has ended, nothing in
+                this process may ask Ray, or drop a handle or an answer of Ray's, until `on_return` is called.
+            on_return: called once the service is a member again; tried again where it fails.
         """
         announced = True
         while True:
             await asyncio.sleep(EVERY_S)
             if await self._is_lost():
                 log.error("the Ray node of this machine is lost, and all processes of scenes with it; joining again")
-                await on_loss()
+                await _or_end(on_loss())
                 while not await self._is_done(self._join_or_end):
                     await asyncio.sleep(EVERY_S)
                 log.info("the service has joined the cluster again")
@@ -149,6 +149,15 @@ class Membership:
             return False
         self._said = ""
         return True
+
+
+async def _or_end(losing: Awaitable[None]) -> None:
+    """A service that cannot give up what it has lost would stand still: its supervisor starts another."""
+    try:
+        await losing
+    except Exception:
+        log.critical("what ran on the cluster cannot be given up; the service ends, start it again", exc_info=True)
+        os._exit(1)
 
 
 def _no_cluster(where: str, error: Exception) -> RuntimeError:

@@ -34,8 +34,8 @@ WAIT_S = 3.0
 """A worker that is not placed after so long says what it waits for."""
 LOST_S = 10.0
 """The head says within so long whether a node is lost."""
-LEFT_S = 20.0
-"""What this process has asked of Ray is over within so long before it leaves the cluster."""
+LOSE_S, CLOSE_S = 20.0, 3.0
+"""The service waits so long for what it has asked of Ray before it leaves: a lost cluster, and when it ends."""
 STOPPED_S = 5.0
 """An actor has so much longer than its process to say that this has ended."""
 
@@ -71,8 +71,9 @@ class RayPlacement(Placement):
         self._started = 0
         self._listens: tuple[str, int] | None = None
         self._announced: Any = None
-        self._kept: Any = None
-        """Handles and answers of Ray's: it ends this process, or stands still, where one goes while it leaves."""
+        self._kept: list[Any] = []
+        """What has handles and answers of Ray's. Ray ends this process, or stands still, where one is dropped while the
+        service leaves."""
         self._keeping: asyncio.Task[None] | None = None
         self._siblings: Mapping[str, str] | None = None
 
@@ -95,23 +96,26 @@ class RayPlacement(Placement):
         )
 
     async def _lose_all(self) -> None:
-        self._calls.hold()
-        for process in tuple(self._processes):
+        processes = tuple(self._processes)
+        for process in processes:
             try:
                 process.lose()
             except Exception:  # a fault of one scene's keeps none of the others, nor the service, from going on
                 log.exception("a process that is lost with its cluster")
-        await self._let_go()
+        await self._let_go(processes, LOSE_S)
 
-    async def _let_go(self) -> None:
-        """Asks Ray nothing more, and keeps what of its is in this process until the service has left."""
-        self._kept = [self._announced, [await process.let_go() for process in tuple(self._processes)]]
-        if not await self._calls.over(LEFT_S):
-            log.warning("Ray has not answered within %g s; the service leaves the cluster nevertheless", LEFT_S)
-        gc.collect()
+    async def _let_go(self, processes: Sequence[RayProcess], seconds: float) -> None:
+        """Asks Ray nothing more, and keeps all handles and answers of Ray's."""
+        self._calls.hold()
+        self._kept += [self._announced, *processes, *self._calls.begun]
+        for process in processes:
+            await process.let_go()
+        if not await self._calls.over(seconds):
+            log.warning("Ray has not answered within %g s; the service leaves the cluster nevertheless", seconds)
+        gc.collect()  # by itself it may come while the service leaves, and drop what only cycles hold
 
     async def _return(self) -> None:
-        self._kept = None
+        self._kept.clear()
         self._calls.go_on()
         await self._announce()
 
@@ -141,10 +145,9 @@ class RayPlacement(Placement):
 
     async def close(self) -> None:
         """Leaves the cluster; actors that are left end."""
-        self._calls.hold()
         if self._keeping is not None:
             self._keeping.cancel()
-        await self._let_go()
+        await self._let_go(tuple(self._processes), CLOSE_S)
         self._calls.close()
         await asyncio.to_thread(self._membership.leave)
 
@@ -198,8 +201,8 @@ class RayProcess:
         self._actor: Any = None
         self._making: asyncio.Future[Any] = placement.asked(placement.host, name, needs)
         self._answers: set[Any] = set()
-        """That are waited for, or were when the cluster was lost."""
-        self._tasks: set[asyncio.Task[None]] = set()
+        """Answers that are waited for, or were when the cluster was lost."""
+        self._tasks: set[asyncio.Task[Any]] = set()
         self._task = self._beside(self._run(*runs))
 
     @property
@@ -227,19 +230,17 @@ class RayProcess:
         await asyncio.wait({self._beside(self._kill())}, timeout=STOPPED_S)  # it goes on where the head is silent
 
     def lose(self) -> None:
-        """Gives it up with the cluster on which it ran, of which nothing can be asked any more."""
+        """Gives it up with the cluster on which it ran."""
         self._lost = True
-        self._making.cancel()  # where it waits to begin, it would be made on the cluster that is joined next
         self._give_up("the Ray node of the service's machine is lost", lost=True)
 
-    async def let_go(self) -> Any:
-        """Asks the actor nothing more; returns what is left of Ray's."""
-        self._lost = True
+    async def let_go(self) -> None:
+        """Asks the actor nothing more, and makes none; its answers are kept."""
+        self._lost = self._over = True
         asked = {self._making, *self._tasks}
         for each in asked:
             each.cancel()
         await asyncio.wait(asked)
-        return self._making, self._answers
 
     async def _run(self, entry: Entry, spec: Any) -> None:
         role = self._needs.role
@@ -267,7 +268,7 @@ class RayProcess:
     async def _begin(self, entry: Entry, spec: Any) -> None:
         """Starts the process, and says what it waits for as long as no node has room."""
         self._actor = await asyncio.shield(self._making)
-        starting = asyncio.ensure_future(self._answer(self._actor.start.remote(entry, spec)))
+        starting = self._beside(self._answer(self._actor.start.remote(entry, spec)))
         starting.add_done_callback(lambda done: done.cancelled() or done.exception())  # who stops it does not ask
         early, self._early = self._early or [], None
         for message in early:
@@ -333,7 +334,7 @@ class RayProcess:
         with contextlib.suppress(RayError, ValueError, OSError, RuntimeError):
             await self._placement.asked(ray.kill, await asyncio.shield(self._making))
 
-    def _beside(self, coroutine: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+    def _beside(self, coroutine: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
         task = asyncio.get_running_loop().create_task(coroutine)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)

@@ -24,7 +24,7 @@ class NodeWatch:
     """Nodes as the head of the cluster told them last, and those that were lost lately. On the event loop.
 
     Args:
-        ask: asks the head for all nodes that there have been, as Ray describes them.
+        ask: asks the head for all nodes that there have been, as Ray describes them; returns a future of the answer.
         now: seconds of a clock that never goes back.
 
     Attributes:

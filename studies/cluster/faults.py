@@ -105,7 +105,7 @@ def stopped_node(
 
 
 def full_nodes(study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo) -> ScenarioResult:
-    """The scene's node is killed while other scenes fill those that are left; later they leave."""
+    """The scene's node is killed while other scenes fill those that are left; then those scenes are deleted."""
     with _running(study, "full") as (service, scene, sender):
         left = _second_half(study, service, scene, sender)
         others = _fill(study, service)
@@ -120,9 +120,9 @@ def full_nodes(study: Study, nodes: Nodes, expected: Mapping[int, str], update_s
         if service.status(scene).committed > committed:
             faults.append("the scene went on though nothing had room, so nothing was tried")
         echo(f"{len(others)} scenes fill the nodes; waiting: {said}")
+        began = time.monotonic()
         for other in others:
             service.http.delete(f"/v1/scenes/{other}").raise_for_status()
-        began = time.monotonic()
         wait_until(lambda: service.status(scene).committed > committed, "the scene did not go on when there was room")
         pause = time.monotonic() - began
         nodes.add()
@@ -130,6 +130,8 @@ def full_nodes(study: Study, nodes: Nodes, expected: Mapping[int, str], update_s
         faults += sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
         if blamed := service.deaths(scene):
             faults.append(f"a frame was held to blame for {blamed} of the nodes")
+        if pause > GOES_ON_S:
+            faults.append(f"the scene went on after {pause:.0f} s")
         if status.degraded:
             faults.append(f"the scene is degraded still: {status.error}")
         found = f"{len(left)} frames acknowledged while it waited and said why; the next committed {pause:.1f} s after"
@@ -210,15 +212,12 @@ def _changed(folder: Path) -> dict[str, int]:
 
 
 def _fill(study: Study, service: Service) -> list[str]:
-    """Creates scenes until the worker of one has no room, which is deleted again; returns the others."""
-    others: list[str] = []
-    while True:
-        scene = study.create(service)
-        wait_until(partial(_is_placed_or_waits, service, scene), "a scene is neither placed nor does it wait")
-        if service.status(scene).error:
-            service.http.delete(f"/v1/scenes/{scene}").raise_for_status()
-            return others
-        others.append(scene)
+    """Creates scenes until the worker of one has no room; returns them."""
+    scenes: list[str] = []
+    while not scenes or NOT_PLACED not in (service.status(scenes[-1]).error or ""):
+        scenes.append(study.create(service))
+        wait_until(partial(_is_placed_or_waits, service, scenes[-1]), "a scene is neither placed nor does it wait")
+    return scenes
 
 
 def _is_placed_or_waits(service: Service, scene: str) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import threading
 from collections.abc import Awaitable, Callable
 
@@ -33,6 +34,48 @@ def test_what_is_asked_while_calls_are_held_begins_later_and_takes_no_thread() -
         assert await asyncio.gather(*waiting) == [1] * len(waiting)
 
     run(test)
+
+
+def test_what_waits_for_a_thread_when_calls_are_held_begins_later() -> None:
+    async def test(calls: Calls) -> None:
+        busy, called = threading.Event(), threading.Event()
+        on = [calls.asked(busy.wait, 10) for _ in range(THREADS)]
+        queued = calls.asked(called.set)
+        await asyncio.sleep(0.05)
+        calls.hold()
+        assert not await calls.over(0)
+        busy.set()
+        await asyncio.gather(*on)
+        assert await calls.over(10)
+        await asyncio.sleep(0.05)
+        assert not called.is_set()
+        calls.go_on()
+        await queued
+        assert called.is_set()
+
+    run(test)
+
+
+def test_a_fault_while_they_are_waited_for_is_told_to_who_has_asked_alone(caplog: pytest.LogCaptureFixture) -> None:
+    async def test(calls: Calls) -> None:
+        fails = threading.Event()
+
+        def fail() -> None:
+            fails.wait(10)
+            raise ConnectionError("no head")
+
+        call = calls.asked(fail)
+        await asyncio.sleep(0.05)
+        waiting = asyncio.ensure_future(calls.over(10))
+        await asyncio.sleep(0.05)
+        fails.set()
+        assert await waiting
+        with pytest.raises(ConnectionError):
+            await call
+
+    run(test)
+    gc.collect()
+    assert caplog.records == []
 
 
 def test_one_that_is_cancelled_before_it_begins_is_never_called() -> None:

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import gc
 import socket
 import threading
-import weakref
 from collections.abc import Awaitable, Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +18,7 @@ ray_placement = pytest.importorskip(
 
 from ray.exceptions import RayActorError, RayError  # noqa: E402
 
+from server.cluster.calls import Calls  # noqa: E402
 from server.cluster.host import Gone, Started  # noqa: E402
 from server.cluster.needs import Needs  # noqa: E402
 from server.cluster.nodes import is_lost, own_node_is_lost  # noqa: E402
@@ -181,56 +179,36 @@ def test_one_that_is_lost_with_its_cluster_is_told_and_not_asked_again(killed: l
     run(test)
 
 
-def test_one_that_waits_for_a_thread_when_it_is_lost_is_not_made(killed: list[Any]) -> None:
+def test_one_that_waits_to_begin_when_it_is_lost_is_not_made(killed: list[Any]) -> None:
     """It would be made on the cluster that the service joins next, and nobody would end it."""
     made: list[str] = []
 
     async def test(placement: FakePlacement) -> None:
-        thread, busy = ThreadPoolExecutor(1), threading.Event()
-        placement.asked = lambda function, *arguments: asyncio.get_running_loop().run_in_executor(  # type: ignore[method-assign]
-            thread, function, *arguments
-        )
+        calls = Calls()
+        placement.asked = calls.asked  # type: ignore[method-assign]
         placement.host = lambda name, needs: made.append(name)  # type: ignore[method-assign,assignment,return-value]
-        thread.submit(busy.wait, 10)
+        calls.hold()
         running = Running(placement)
         await asyncio.sleep(0.05)
         running.process.lose()
-        await asyncio.sleep(0.05)  # the thread hears of it by the loop
-        busy.set()
-        thread.shutdown(wait=True)
+        await running.process.let_go()
+        calls.go_on()
+        await asyncio.sleep(0.05)
         assert made == []
         assert running.ends[0].lost
 
     run(test)
 
 
-def test_what_is_left_of_ray_when_the_cluster_is_lost_is_kept_until_the_service_has_left(killed: list[Any]) -> None:
-    """Ray ends the process where one of its answers goes while the service leaves."""
-
-    class Pending:
-        """An answer that does not come."""
-
-        def __await__(self) -> Any:
-            return asyncio.Event().wait().__await__()
-
+def test_one_that_is_let_go_asks_nothing_more(killed: list[Any]) -> None:
     async def test(placement: FakePlacement) -> None:
-        pending = Pending()
-        here = weakref.ref(pending)
-        placement.actor.take = Remote([pending].pop)
-        del pending
-
-        async def lost() -> Any:
-            running = Running(placement)
-            await wait_for_soon(lambda: running.process.pid)
-            running.process.lose()
-            return await running.process.let_go()
-
-        kept = [await lost()]
-        gc.collect()
-        assert here() is not None
-        kept.clear()
-        gc.collect()
-        assert here() is None
+        running = Running(placement)
+        await wait_for_soon(lambda: running.process.pid)
+        await running.process.let_go()
+        running.process.send("a")
+        placement.actor.said.put_nowait("b")
+        await running.process.stop(0.05)
+        assert (placement.actor.posted, running.messages, running.ends, killed) == ([], [], [], [])
 
     run(test)
 

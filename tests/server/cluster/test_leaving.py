@@ -1,0 +1,234 @@
+"""A service that leaves its cluster asks Ray nothing meanwhile, and drops nothing of Ray's; Ray is a fake here."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import threading
+import weakref
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sending import wait_for_soon
+
+ray_placement = pytest.importorskip(
+    "server.cluster.ray_placement", reason="Ray is not installed: pip install 'scas4d[ray]'"
+)
+
+from server.cluster import membership  # noqa: E402
+from server.cluster.host import Started  # noqa: E402
+from server.cluster.needs import Needs  # noqa: E402
+from server.processes.placement import Ended  # noqa: E402
+from server.settings import ServerSettings  # noqa: E402
+
+
+class Answer:
+    """An answer of Ray's; it comes at once, or never."""
+
+    def __init__(self, *result: Any) -> None:
+        self.result = result
+
+    def __await__(self) -> Any:
+        if not self.result:
+            yield from asyncio.Event().wait().__await__()
+        return self.result[0]
+
+
+class Method:
+    def __init__(self, answer: Callable[[], Answer]) -> None:
+        self.remote = lambda *arguments: answer()
+
+
+class Cluster:
+    """A Ray whose node of this machine can be lost, with a placement; `left` is called while the service leaves."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.joined, self.lost, self.joins = False, False, 0
+        self.left: Callable[[], None] = lambda: None
+        self.pending: list[weakref.ref[Answer]] = []
+        self.exits: list[int] = []
+        for name, value in {"init": self._init, "shutdown": self._shutdown, "kill": lambda actor: None}.items():
+            monkeypatch.setattr(ray_placement.ray, name, value)
+        monkeypatch.setattr(ray_placement.ray, "is_initialized", lambda: self.joined)
+        monkeypatch.setattr(membership, "EVERY_S", 0.01)
+        monkeypatch.setattr(membership.os, "_exit", self._ended)
+        monkeypatch.setattr(membership, "own_node_is_lost", lambda: self.lost)
+        for name in ("check_folder", "mark", "announced"):
+            monkeypatch.setattr(ray_placement, name, lambda *arguments: None)
+        monkeypatch.setattr(ray_placement, "all_nodes", list)
+        monkeypatch.setattr(ray_placement, "needs_of", lambda *arguments: Needs("worker", "scene", 1, 0, 1))
+        self.placement = ray_placement.RayPlacement(None, None, ServerSettings(data=Path("data")))
+        monkeypatch.setattr(self.placement, "host", self._host)
+        self.ends: list[Ended] = []
+
+    def _ended(self, code: int) -> None:
+        self.exits.append(code)
+
+    def _init(self, **options: Any) -> None:
+        self.joins += 1
+        self.joined, self.lost = True, False
+
+    def _shutdown(self) -> None:
+        self.left()
+        self.joined = False
+
+    def _host(self, name: str, needs: Needs) -> Any:
+        class Actor:
+            start = Method(lambda: Answer(Started("node", 4711)))
+            post = take = stop = Method(self._never)
+
+        return Actor()
+
+    def _never(self) -> Answer:
+        answer = Answer()
+        self.pending.append(weakref.ref(answer))
+        return answer
+
+    async def started(self, on_end: Callable[[Ended], None] | None = None) -> Any:
+        class Spec:
+            class folder:
+                epoch = 0
+
+        process = self.placement.start(lambda: None, Spec, lambda message: None, on_end or self.ends.append)
+        await wait_for_soon(lambda: process.pid and self.pending)
+        return process
+
+    def dropped(self) -> int:
+        return [answer() for answer in self.pending].count(None)
+
+
+@pytest.fixture
+def cluster(monkeypatch: pytest.MonkeyPatch) -> Cluster:
+    return Cluster(monkeypatch)
+
+
+def run(cluster: Cluster, test: Callable[[], Awaitable[None]]) -> None:
+    async def all_of() -> None:
+        await cluster.placement.open()
+        try:
+            await test()
+        finally:
+            await cluster.placement.close()
+
+    asyncio.run(all_of())
+
+
+def test_answers_are_kept_until_the_service_has_left_and_calls_are_made_afterwards(cluster: Cluster) -> None:
+    leaves, may_leave = threading.Event(), threading.Event()
+    called: list[int] = []
+
+    def left() -> None:
+        leaves.set()
+        may_leave.wait(5)
+
+    async def test() -> None:
+        process = await cluster.started()
+        process.send("message")
+        stopping = asyncio.ensure_future((await cluster.started()).stop(100))
+        await asyncio.sleep(0.05)
+        del process
+        there = len(cluster.pending) - cluster.dropped()
+        cluster.left, cluster.lost = left, True
+        assert await asyncio.to_thread(leaves.wait, 10)
+        asked = cluster.placement.asked(called.append, 1)
+        await asyncio.wait_for(stopping, 10)
+        await asyncio.sleep(0.05)
+        gc.collect()
+        assert len(cluster.pending) - cluster.dropped() == there == 4
+        assert called == []
+        assert [end.lost for end in cluster.ends] == [True]
+        may_leave.set()
+        await asked
+        assert cluster.joins == 2
+        await wait_for_soon(lambda: gc.collect() >= 0 and cluster.dropped() == len(cluster.pending))
+
+    run(cluster, test)
+
+
+def test_what_only_cycles_hold_is_dropped_before(cluster: Cluster) -> None:
+    """By itself the collector may come while the service leaves."""
+    there: list[bool] = []
+
+    async def test() -> None:
+        answer = Answer()
+        found, cycle = weakref.ref(answer), [answer]
+        cycle.append(cycle)  # type: ignore[arg-type]
+        del answer, cycle
+        cluster.left = lambda: there.append(found() is not None)
+        cluster.lost = True
+        await wait_for_soon(lambda: there)
+
+    gc.disable()
+    try:
+        run(cluster, test)
+    finally:
+        gc.enable()
+    assert there[0] is False
+
+
+def test_a_service_that_ends_while_it_joins_again_drops_nothing(cluster: Cluster) -> None:
+    leaves, may_leave = threading.Event(), threading.Event()
+
+    def left() -> None:
+        leaves.set()
+        may_leave.wait(5)
+
+    async def test() -> None:
+        process = await cluster.started()
+        del process
+        cluster.left, cluster.lost = left, True
+        assert await asyncio.to_thread(leaves.wait, 10)
+        closing = asyncio.ensure_future(cluster.placement.close())
+        await asyncio.sleep(0.05)
+        gc.collect()
+        assert cluster.pending
+        assert cluster.dropped() == 0
+        may_leave.set()
+        await closing
+
+    async def all_of() -> None:
+        await cluster.placement.open()
+        await test()
+
+    asyncio.run(all_of())
+
+
+def test_what_ray_has_begun_is_waited_for_and_a_fault_of_one_scene_keeps_nobody(cluster: Cluster) -> None:
+    over = threading.Event()
+    when: list[bool] = []
+    cluster.left = lambda: when.append(over.is_set())
+
+    def fails(end: Ended) -> None:
+        raise KeyError("a fault of the scene's")
+
+    async def test() -> None:
+        await cluster.started(fails)
+        await cluster.started()
+        call = cluster.placement.asked(over.wait, 10)
+        await asyncio.sleep(0.05)
+        cluster.lost = True
+        await asyncio.sleep(0.1)
+        assert when == []
+        over.set()
+        await call
+        await wait_for_soon(lambda: cluster.joins == 2)
+        assert when == [True]
+        assert [end.lost for end in cluster.ends] == [True]
+
+    run(cluster, test)
+
+
+def test_a_service_that_cannot_give_up_what_it_has_lost_ends(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def fails(processes: Any, seconds: float) -> None:
+        raise KeyError("a fault of the service's")
+
+    async def test() -> None:
+        with monkeypatch.context() as patch:
+            patch.setattr(cluster.placement, "_let_go", fails)
+            cluster.lost = True
+            await wait_for_soon(lambda: cluster.exits)
+
+    run(cluster, test)
+    assert cluster.exits == [1]
