@@ -55,10 +55,7 @@ def killed_nodes(
                 echo(f"killed the node at frame {index}: {len(pauses)} of {count}, on after {pauses[-1]:.1f} s")
             thread.join()
         service.finish(scene, len(study.frames))
-        faults = sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
-        if blamed := service.deaths(scene):
-            faults.append(f"a frame was held to blame for {blamed} of the nodes")
-        faults += [f"the scene went on after {pause:.0f} s" for pause in pauses if pause > GOES_ON_S]
+        faults = _faults_of_kills(service, scene, sender, expected, pauses)
         lost = len(study.frames) - len(sender.receipts)
         longest = max(pauses, default=0.0)
         found = f"{lost} acknowledged frames lost, {len(expected)} states compared, on after at most {longest:.1f} s"
@@ -112,7 +109,7 @@ def full_nodes(study: Study, nodes: Nodes, expected: Mapping[int, str], update_s
         node, _ = _node_of(service, nodes, scene)
         committed = service.status(scene).committed
         nodes.kill(node)
-        wait_until(lambda: NOT_PLACED in (service.status(scene).error or ""), "the scene does not say that it waits")
+        wait_until(lambda: _waits(service, scene), "the scene does not say that it waits")
         said = str(service.status(scene).error)
         _send(sender, left)
         time.sleep(5 * update_s)
@@ -127,11 +124,7 @@ def full_nodes(study: Study, nodes: Nodes, expected: Mapping[int, str], update_s
         pause = time.monotonic() - began
         nodes.add()
         status = service.finish(scene, len(study.frames))
-        faults += sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
-        if blamed := service.deaths(scene):
-            faults.append(f"a frame was held to blame for {blamed} of the nodes")
-        if pause > GOES_ON_S:
-            faults.append(f"the scene went on after {pause:.0f} s")
+        faults += _faults_of_kills(service, scene, sender, expected, [pause])
         if status.degraded:
             faults.append(f"the scene is degraded still: {status.error}")
         found = f"{len(left)} frames acknowledged while it waited and said why; the next committed {pause:.1f} s after"
@@ -214,14 +207,28 @@ def _changed(folder: Path) -> dict[str, int]:
 def _fill(study: Study, service: Service) -> list[str]:
     """Creates scenes until the worker of one has no room; returns them."""
     scenes: list[str] = []
-    while not scenes or NOT_PLACED not in (service.status(scenes[-1]).error or ""):
+    while not scenes or not _waits(service, scenes[-1]):
         scenes.append(study.create(service))
         wait_until(partial(_is_placed_or_waits, service, scenes[-1]), "a scene is neither placed nor does it wait")
     return scenes
 
 
 def _is_placed_or_waits(service: Service, scene: str) -> bool:
-    return service.worker_pid(scene) is not None or NOT_PLACED in (service.status(scene).error or "")
+    return service.worker_pid(scene) is not None or _waits(service, scene)
+
+
+def _waits(service: Service, scene: str) -> bool:
+    return NOT_PLACED in (service.status(scene).error or "")
+
+
+def _faults_of_kills(
+    service: Service, scene: str, sender: FrameSender, expected: Mapping[int, str], pauses: Sequence[float]
+) -> list[str]:
+    """Faults of a scene whose nodes were killed: frames, states, frames held to blame, and pauses."""
+    faults = sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
+    if blamed := service.deaths(scene):
+        faults.append(f"a frame was held to blame for {blamed} of the nodes")
+    return faults + [f"the scene went on after {pause:.0f} s" for pause in pauses if pause > GOES_ON_S]
 
 
 def _send(sender: FrameSender, indices: range) -> None:

@@ -105,9 +105,8 @@ def crossed(folder: Path, capture: Capture) -> dict[str, list[str]]:
                 state = folder / "data" / "scenes" / scene / "states" / f"frame_{index:06d}.npz"
                 with _phase(folder, f"frame {index}"):
                     put(index)
-                    wait_until(
-                        state.exists, "the frame was not committed", COMMITTED_S
-                    )  # asking the service would cross other files
+                    # Asking the service would cross other files.
+                    wait_until(state.exists, "the frame was not committed", COMMITTED_S)
                 assert client.frame(scene, index).state is FrameState.COMMITTED
                 with _phase(folder, f"render {index}"):
                     client.render(scene, camera, index)

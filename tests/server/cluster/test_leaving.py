@@ -22,6 +22,7 @@ from server.cluster.host import Started  # noqa: E402
 from server.cluster.needs import Needs  # noqa: E402
 from server.processes.placement import Ended  # noqa: E402
 from server.settings import ServerSettings  # noqa: E402
+from tests.server.cluster.losing import LosableCluster  # noqa: E402
 
 
 class Answer:
@@ -41,20 +42,18 @@ class Method:
         self.remote = lambda *arguments: answer()
 
 
-class Cluster:
-    """A Ray whose node of this machine can be lost, with a placement; `left` is called while the service leaves."""
+class Cluster(LosableCluster):
+    """With a placement; `looks` is called while the service leaves, which takes until `may_leave` is set."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.joined, self.lost, self.joins = False, False, 0
-        self.left: Callable[[], None] = lambda: None
+        super().__init__(monkeypatch)
+        self.looks: Callable[[], None] = lambda: None
+        self.leaves, self.may_leave = threading.Event(), threading.Event()
+        self.may_leave.set()
         self.pending: list[weakref.ref[Answer]] = []
         self.exits: list[int] = []
-        for name, value in {"init": self._init, "shutdown": self._shutdown, "kill": lambda actor: None}.items():
-            monkeypatch.setattr(ray_placement.ray, name, value)
-        monkeypatch.setattr(ray_placement.ray, "is_initialized", lambda: self.joined)
-        monkeypatch.setattr(membership, "EVERY_S", 0.01)
-        monkeypatch.setattr(membership.os, "_exit", self._ended)
-        monkeypatch.setattr(membership, "own_node_is_lost", lambda: self.lost)
+        monkeypatch.setattr(ray_placement.ray, "kill", lambda actor: None)
+        monkeypatch.setattr(membership.os, "_exit", self.exits.append)
         for name in ("check_folder", "mark", "announced"):
             monkeypatch.setattr(ray_placement, name, lambda *arguments: None)
         monkeypatch.setattr(ray_placement, "all_nodes", list)
@@ -63,16 +62,11 @@ class Cluster:
         monkeypatch.setattr(self.placement, "host", self._host)
         self.ends: list[Ended] = []
 
-    def _ended(self, code: int) -> None:
-        self.exits.append(code)
-
-    def _init(self, **options: Any) -> None:
-        self.joins += 1
-        self.joined, self.lost = True, False
-
     def _shutdown(self) -> None:
-        self.left()
-        self.joined = False
+        self.looks()
+        self.leaves.set()
+        self.may_leave.wait(5)
+        super()._shutdown()
 
     def _host(self, name: str, needs: Needs) -> Any:
         class Actor:
@@ -116,12 +110,7 @@ def run(cluster: Cluster, test: Callable[[], Awaitable[None]]) -> None:
 
 
 def test_answers_are_kept_until_the_service_has_left_and_calls_are_made_afterwards(cluster: Cluster) -> None:
-    leaves, may_leave = threading.Event(), threading.Event()
     called: list[int] = []
-
-    def left() -> None:
-        leaves.set()
-        may_leave.wait(5)
 
     async def test() -> None:
         process = await cluster.started()
@@ -130,8 +119,9 @@ def test_answers_are_kept_until_the_service_has_left_and_calls_are_made_afterwar
         await asyncio.sleep(0.05)
         del process
         there = len(cluster.pending) - cluster.dropped()
-        cluster.left, cluster.lost = left, True
-        assert await asyncio.to_thread(leaves.wait, 10)
+        cluster.may_leave.clear()
+        cluster.lost = True
+        assert await asyncio.to_thread(cluster.leaves.wait, 10)
         asked = cluster.placement.asked(called.append, 1)
         await asyncio.wait_for(stopping, 10)
         await asyncio.sleep(0.05)
@@ -139,9 +129,9 @@ def test_answers_are_kept_until_the_service_has_left_and_calls_are_made_afterwar
         assert len(cluster.pending) - cluster.dropped() == there == 4
         assert called == []
         assert [end.lost for end in cluster.ends] == [True]
-        may_leave.set()
+        cluster.may_leave.set()
         await asked
-        assert cluster.joins == 2
+        assert cluster.inits == 2
         await wait_for_soon(lambda: gc.collect() >= 0 and cluster.dropped() == len(cluster.pending))
 
     run(cluster, test)
@@ -156,7 +146,7 @@ def test_what_only_cycles_hold_is_dropped_before(cluster: Cluster) -> None:
         found, cycle = weakref.ref(answer), [answer]
         cycle.append(cycle)  # type: ignore[arg-type]
         del answer, cycle
-        cluster.left = lambda: there.append(found() is not None)
+        cluster.looks = lambda: there.append(found() is not None)
         cluster.lost = True
         await wait_for_soon(lambda: there)
 
@@ -169,23 +159,18 @@ def test_what_only_cycles_hold_is_dropped_before(cluster: Cluster) -> None:
 
 
 def test_a_service_that_ends_while_it_joins_again_drops_nothing(cluster: Cluster) -> None:
-    leaves, may_leave = threading.Event(), threading.Event()
-
-    def left() -> None:
-        leaves.set()
-        may_leave.wait(5)
-
     async def test() -> None:
         process = await cluster.started()
         del process
-        cluster.left, cluster.lost = left, True
-        assert await asyncio.to_thread(leaves.wait, 10)
+        cluster.may_leave.clear()
+        cluster.lost = True
+        assert await asyncio.to_thread(cluster.leaves.wait, 10)
         closing = asyncio.ensure_future(cluster.placement.close())
         await asyncio.sleep(0.05)
         gc.collect()
         assert cluster.pending
         assert cluster.dropped() == 0
-        may_leave.set()
+        cluster.may_leave.set()
         await closing
 
     async def all_of() -> None:
@@ -198,7 +183,7 @@ def test_a_service_that_ends_while_it_joins_again_drops_nothing(cluster: Cluster
 def test_what_ray_has_begun_is_waited_for_and_a_fault_of_one_scene_keeps_nobody(cluster: Cluster) -> None:
     over = threading.Event()
     when: list[bool] = []
-    cluster.left = lambda: when.append(over.is_set())
+    cluster.looks = lambda: when.append(over.is_set())
 
     def fails(end: Ended) -> None:
         raise KeyError("a fault of the scene's")
@@ -209,11 +194,11 @@ def test_what_ray_has_begun_is_waited_for_and_a_fault_of_one_scene_keeps_nobody(
         call = cluster.placement.asked(over.wait, 10)
         await asyncio.sleep(0.05)
         cluster.lost = True
-        await asyncio.sleep(0.1)
+        assert not await asyncio.to_thread(cluster.leaves.wait, 1)
         assert when == []
         over.set()
         await call
-        await wait_for_soon(lambda: cluster.joins == 2)
+        await wait_for_soon(lambda: cluster.inits == 2)
         assert when == [True]
         assert [end.lost for end in cluster.ends] == [True]
 

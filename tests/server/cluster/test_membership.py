@@ -10,41 +10,15 @@ from sending import wait_for_soon
 
 membership = pytest.importorskip("server.cluster.membership", reason="Ray is not installed: pip install 'scas4d[ray]'")
 
-
-class Cluster:
-    """A cluster that a service can lose."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.events: list[str] = []
-        self.lost = False
-        self.refuses = 0
-        self.inits = 0
-        self.joined = False
-        monkeypatch.setattr(membership, "EVERY_S", 0.01)
-        monkeypatch.setattr(membership, "own_node_is_lost", lambda: self.lost)
-        monkeypatch.setattr(membership.ray, "is_initialized", lambda: self.joined)
-        monkeypatch.setattr(membership.ray, "init", self._init)
-        monkeypatch.setattr(membership.ray, "shutdown", self._shutdown)
-
-    def _init(self, **options: object) -> None:
-        self.inits += 1
-        if self.refuses:
-            self.refuses -= 1
-            raise ConnectionError("no node on this machine")
-        self.joined, self.lost = True, False
-        self.events.append("joined")
-
-    def _shutdown(self) -> None:
-        self.joined = False
-        self.events.append("left")
+from tests.server.cluster.losing import LosableCluster  # noqa: E402
 
 
 @pytest.fixture
-def cluster(monkeypatch: pytest.MonkeyPatch) -> Cluster:
-    return Cluster(monkeypatch)
+def cluster(monkeypatch: pytest.MonkeyPatch) -> LosableCluster:
+    return LosableCluster(monkeypatch)
 
 
-def test_what_ran_is_given_up_first_and_the_service_is_announced_last(cluster: Cluster) -> None:
+def test_what_ran_is_given_up_first_and_the_service_is_announced_last(cluster: LosableCluster) -> None:
     member = membership.Membership(None)
     member.join()
     fails = [True]
@@ -74,7 +48,7 @@ def test_what_ran_is_given_up_first_and_the_service_is_announced_last(cluster: C
 
 
 def test_a_silent_head_is_told_of_once_and_is_no_lost_node(
-    cluster: Cluster, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    cluster: LosableCluster, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     answers = threading.Event()
     asked: list[bool] = []
@@ -110,7 +84,9 @@ def test_a_silent_head_is_told_of_once_and_is_no_lost_node(
     assert cluster.events == ["joined"]
 
 
-def test_a_service_that_ray_does_not_let_join_again_ends(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_service_that_ray_does_not_let_join_again_ends(
+    cluster: LosableCluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It would stay without workers: its supervisor starts another, which finds all scenes in the data folder."""
     ended: list[int] = []
     stands_still = threading.Event()
@@ -137,7 +113,7 @@ def test_a_service_that_ray_does_not_let_join_again_ends(cluster: Cluster, monke
     assert set(ended) == {1}
 
 
-def test_a_node_that_is_lost_before_the_service_is_announced_is_noticed(cluster: Cluster) -> None:
+def test_a_node_that_is_lost_before_the_service_is_announced_is_noticed(cluster: LosableCluster) -> None:
     lost: list[bool] = []
 
     async def lose() -> None:
@@ -160,7 +136,7 @@ def test_a_node_that_is_lost_before_the_service_is_announced_is_noticed(cluster:
     assert len(lost) == 2
 
 
-def test_a_service_that_ray_does_not_let_leave_ends(cluster: Cluster, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_service_that_ray_does_not_let_leave_ends(cluster: LosableCluster, monkeypatch: pytest.MonkeyPatch) -> None:
     ended: list[int] = []
     stands_still = threading.Event()
     monkeypatch.setattr(membership, "LEAVE_S", 0.05)
