@@ -1,20 +1,51 @@
-"""Training views hold the pictures of a frame in CPU buffers, prepared once."""
+"""Training views and their cameras: host-side records, which every engine takes from here to its device."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.kernels import image_loss
-from scas4d_core.rasterize.cpu import CameraArrays
+from scas4d_core.cameras import Camera
 
 Array = NDArray[np.float32]
 
 SIDE = 8
 """Pixels of the side of squares whose mean colours are compared from frame to frame: their noise is small."""
+TILE = 32
+"""Pixels of the side of a tile, the unit in which pictures are drawn."""
+LABEL = 3
+"""The label's channel, after red, green and blue."""
+
+
+class CameraArrays(NamedTuple):
+    """A camera as kernels read it: ``pose`` [3, 4] and ``lens`` [6] (fx, fy, cx, cy, width, height), float32."""
+
+    pose: Array
+    lens: Array
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, camera: Camera) -> CameraArrays:
+        """From a ``Camera`` of the inside world."""
+        pose = np.ascontiguousarray(camera.world_to_camera[:3], dtype=np.float32)
+        lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], dtype=np.float32)
+        return cls(pose, lens, camera.width, camera.height)
+
+    @property
+    def tiles(self) -> tuple[int, int]:
+        """Columns and rows of tiles."""
+        return -(-self.width // TILE), -(-self.height // TILE)
+
+    @property
+    def centre(self) -> Array:
+        """[3] metres, the camera's centre in the inside world."""
+        centre: Array = -(self.pose[:, :3].T @ self.pose[:, 3])
+        return centre
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,21 +56,12 @@ class TrainingView:
         name: the camera's. camera: as kernels read it.
         target: [C, H, W] float32, RGB in 0…1 and, where the frame has a mask, the mask; C is 3 or 4.
         exposure: [C, 2] gain and offset of the camera; the label's are 1 and 0.
-        scratch: of the image loss, for pictures of this size.
     """
 
     name: str
     camera: CameraArrays
     target: Array
     exposure: Array
-    scratch: Array
-
-    @cached_property
-    def moments(self) -> tuple[Array, Array]:
-        """[C, H, W] twice: SSIM's windowed means of the target and of its square; made when first asked for."""
-        means, squares = np.empty_like(self.target), np.empty_like(self.target)
-        image_loss.target_moments(self.target, self.scratch, means, squares)
-        return means, squares
 
     @cached_property
     def mean(self) -> NDArray[np.float64]:

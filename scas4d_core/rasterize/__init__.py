@@ -1,1 +1,0 @@
-"""Differentiable rasterization of Gaussians: ``cpu`` (Numba), ``twin`` (torch, float64), ``cuda`` (gsplat)."""
