@@ -14,6 +14,7 @@ import numpy as np
 
 from scas4d_core.captures.frame import Frame
 from scas4d_core.captures.images import grey_among
+from scas4d_core.engines.engine import REPORT
 from scas4d_core.first_frame.calibration.record import Calibration
 from scas4d_core.first_frame.static_result import FirstCloud, StaticResult
 from scas4d_core.frame_outcome import (
@@ -28,7 +29,7 @@ from scas4d_core.frame_outcome import (
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust.alarms import left_out_alarms
 from scas4d_core.update.best_state import mean_error
-from scas4d_core.update.result import REPORT, CameraFit, Stopwatch, UpdateResult
+from scas4d_core.update.result import CameraFit, Stopwatch, UpdateResult
 
 REPORTED_ITERATIONS = 24
 """The report's training loss is a mean over this many last iterations: about one round of a rig's cameras."""

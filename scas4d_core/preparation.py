@@ -19,11 +19,8 @@ from scas4d_core.captures.frame import Frame
 from scas4d_core.effects.appearance.camera_gain import known_gains
 from scas4d_core.effects.cameras.pose_drift import posed
 from scas4d_core.effects.coherence.floor import floor_inside
-from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
 from scas4d_core.effects.effect import Effect, effect
 from scas4d_core.effects.evidence import Seen
-from scas4d_core.effects.parts import Arrays, PartsBuilder
-from scas4d_core.effects.registry import EFFECTS
 from scas4d_core.effects.switches import (
     Switch,
     Switches,
@@ -33,9 +30,11 @@ from scas4d_core.effects.switches import (
     joined,
     names_on,
     noted,
-    refusal,
     switched_by,
 )
+from scas4d_core.engines.choose import engine_of
+from scas4d_core.engines.renderer import Renderer
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_outcome import FrameOutcome
 from scas4d_core.gaussians import UNBORN, Gaussians
@@ -45,10 +44,10 @@ from scas4d_core.storage.checkpoint import CarryOver
 from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.structure.motion_mask import labelled, labels_learnt
 from scas4d_core.structure.neighbours import Neighbours, build_neighbours
-from scas4d_core.update.frame_update import FrameUpdate, Updater
-from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
+from scas4d_core.update.frame_update import FrameUpdate
+from scas4d_core.update.parts import Arrays, PlanBuilder
 from scas4d_core.update.result import UpdateResult, UpdateTrace
-from scas4d_core.update.training_view import TrainingView
+from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import motion_between
 
 SMALLEST_CLUSTER = 8
@@ -66,16 +65,16 @@ class Preparation:
     """Makes the updaters of a scene.
 
     Args:
-        factory: of its views. settings: of the scene. world: user's to inside. picture: renders.
+        factory: of its views. settings: of the scene. world: user's to inside. renderer: draws.
 
     Attributes:
-        parts: of the updater that was made last.
+        built: plan and parts of the updater that was made last.
     """
 
-    parts: PartsBuilder
+    built: PlanBuilder
 
-    def __init__(self, factory: ViewFactory, settings: Settings, world: WorldFrame, picture: PictureLoss) -> None:
-        self._factory, self._settings, self._picture = factory, settings, picture
+    def __init__(self, factory: ViewFactory, settings: Settings, world: WorldFrame, renderer: Renderer) -> None:
+        self._factory, self._settings, self._renderer = factory, settings, renderer
         self._scene = settings.scene
         self._made_of: tuple[NDArray[np.float32], NDArray[np.bool_]] | None = None
         self._hierarchy: Hierarchy
@@ -92,7 +91,7 @@ class Preparation:
         switches = first_switches(self._settings, frame.index, result.evidence or {}, len(frame.masks) > 0)
         views = self._factory.views(frame, result.exposures, use_masks=False)
         found = UpdateResult(result.gaussians, None, UpdateTrace())
-        seen = Seen(frame.index, result.gaussians, found, self._factory.rig, views, self._picture)
+        seen = Seen(frame.index, result.gaussians, found, self._factory.rig, views, self._renderer)
         arrays = began(switches, self._settings, seen)
         return switched_by(arrays, switches, seen), arrays
 
@@ -109,9 +108,9 @@ class Preparation:
         """
         self._factory.posed = posed(self._factory.rig, carried.effects)
         exposures = known_gains(fixed, carried.effects, self._factory.rig.names)
-        return self._factory.views(self._factory.scaled(frame), exposures, self.parts.mask > 0)
+        return self._factory.views(self._factory.scaled(frame), exposures, self.built.plan.mask > 0)
 
-    def updater(self, first: Gaussians, switches: Switches) -> tuple[Updater, int]:
+    def updater(self, first: Gaussians, switches: Switches) -> tuple[FrameUpdate, int]:
         """The updater of ``settings.device``, and the digest of its clusters and neighbours.
 
         Args:
@@ -119,21 +118,16 @@ class Preparation:
         """
         update = self._settings.update
         hierarchy = self._clusters(first)
-        parts = joined(PartsBuilder(self._scene, update, self._factory, hierarchy, first), names_on(switches))
-        self.parts = parts
-        if not parts.freedom.clusters:  # no cascade either
-            hierarchy = hierarchy.without_layers
-        tied = parts.find(NeighbourTerms) is not None
+        built = joined(PlanBuilder(self._scene, update, self._factory, hierarchy, first), names_on(switches))
+        self.built = built
+        if not built.plan.freedom.clusters:  # no cascade either
+            hierarchy = built.hierarchy = hierarchy.without_layers
+        tied = built.plan.neighbour_terms
         if tied and self._neighbours is None:
             self._neighbours = build_neighbours(first.means[hierarchy.rows], NEIGHBOURS, NEIGHBOUR_FALLOFF)
         neighbours = self._neighbours if tied else None
-        given = (self._factory, self._scene, update, hierarchy, neighbours, first, parts)
-        structure = digest(hierarchy, neighbours)
-        if self._settings.device == "cpu":
-            return FrameUpdate(*given), structure
-        from scas4d_core.torch_backend.device_update import DeviceUpdate  # torch is loaded only where it is used
-
-        return DeviceUpdate(*given, device=self._settings.device), structure
+        updater = FrameUpdate(engine_of(self._settings.device), built, neighbours)
+        return updater, digest(hierarchy, neighbours)
 
     def _clusters(self, first: Gaussians) -> Hierarchy:
         """The hierarchy of what moves; that of the updater before where the same Gaussians do, with its neighbours."""
@@ -144,29 +138,29 @@ class Preparation:
             self._hierarchy = build_hierarchy(*self._made_of, update.clusters, SMALLEST_CLUSTER, update.seed)
         return self._hierarchy
 
-    def again(self, first: Gaussians, carried: CarryOver) -> tuple[Updater, CarryOver]:
+    def again(self, first: Gaussians, carried: CarryOver) -> tuple[FrameUpdate, CarryOver]:
         """The updater for a carry-over; a motion that belongs to other clusters is dropped from that.
 
         Args:
             first: the roots.
         """
-        # An earlier version left no switches, or not those of effects that are new.
-        switches = {**first_switches(self._settings, 0), **carried.switches}
-        unknown = {name for name in EFFECTS if switches[name].on and refusal(name, self._settings) is not None}
-        switches |= {name: replace(switches[name], on=False) for name in unknown}  # to another device than before
-        carried = replace(carried, switches={name: switches[name] for name in EFFECTS})
-        updater, structure = self.updater(labelled(first, carried.labels), carried.switches)
+        switches = {
+            name: replace(switch, on=switch.on and effect(name).refused(self._settings) is None)
+            for name, switch in carried.switches.items()
+        }
+        carried = replace(carried, switches=switches)  # a replay may have other settings than the scene
+        updater, structure = self.updater(labelled(first, carried.labels), switches)
         same = carried.structure == structure
         return updater, carried if same else replace(carried, motion=None, structure=structure)
 
     def relabelled(
         self,
-        updater: Updater,
+        updater: FrameUpdate,
         carried: CarryOver,
         newest: Gaussians,
         first: Gaussians,
         believed: Sequence[TrainingView],
-    ) -> tuple[Updater, CarryOver]:
+    ) -> tuple[FrameUpdate, CarryOver]:
         """The updater and carry-over with the Gaussians that the pictures show to move, for scenes without masks.
 
         A Gaussian that has moved once stays in the hierarchy. The labels become part of the state with the commit of
@@ -176,12 +170,14 @@ class Preparation:
         Args:
             newest: Θ_{t−1}. first: the roots. believed: views of the frame.
         """
-        labels = labels_learnt(newest, carried.labels, carried.seen, believed, self._picture)
+        labels = labels_learnt(newest, carried.labels, carried.seen, believed, self._renderer)
         if labels is None:
             return updater, carried
         return self.again(first, replace(carried, labels=labels, motion=None))
 
-    def switched(self, updater: Updater, carried: CarryOver, seen: Seen, first: Gaussians) -> tuple[Updater, CarryOver]:
+    def switched(
+        self, updater: FrameUpdate, carried: CarryOver, seen: Seen, first: Gaussians
+    ) -> tuple[FrameUpdate, CarryOver]:
         """The updater and carry-over of the next frame, with the effects that a frame calls for.
 
         Args:
@@ -192,8 +188,8 @@ class Preparation:
         return (updater, carried) if names_on(switches) == before else self.again(first, carried)
 
     def followed(
-        self, updater: Updater, carried: CarryOver, seen: Seen, first: Gaussians, populates: bool
-    ) -> tuple[UpdateResult, Updater, CarryOver, Gaussians]:
+        self, updater: FrameUpdate, carried: CarryOver, seen: Seen, first: Gaussians, populates: bool
+    ) -> tuple[UpdateResult, FrameUpdate, CarryOver, Gaussians]:
         """What follows from a frame that was learnt: its result, and the updater, carry-over and roots of the next.
 
         Args:
@@ -228,8 +224,8 @@ class Preparation:
         return seen.result
 
     def regrown(
-        self, updater: Updater, carried: CarryOver, seen: Seen, result: UpdateResult, first: Gaussians
-    ) -> tuple[Updater, CarryOver, Gaussians]:
+        self, updater: FrameUpdate, carried: CarryOver, seen: Seen, result: UpdateResult, first: Gaussians
+    ) -> tuple[FrameUpdate, CarryOver, Gaussians]:
         """The updater, carry-over and roots after a frame in which Gaussians have come or gone.
 
         Args:

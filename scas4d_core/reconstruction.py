@@ -19,6 +19,10 @@ from scas4d_core.cameras import Rig, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.effects.evidence import FitTime, Seen
 from scas4d_core.effects.switches import kept_of, switches_record
+from scas4d_core.engines.choose import renderer_of
+from scas4d_core.engines.engine import REPORT
+from scas4d_core.engines.limits import rig_limits
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.errors import StepError
 from scas4d_core.first_frame.calibration.record import Calibration, in_use
 from scas4d_core.first_frame.calibration.refine import first_calibration
@@ -28,7 +32,6 @@ from scas4d_core.frame_report import FrameReport, Progress, report_of_first, rep
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import Preparation, room_for_births
 from scas4d_core.query.committed import CommittedScene
-from scas4d_core.rasterize.limits import rig_limits
 from scas4d_core.rig_checks import check_rig
 from scas4d_core.robust.alarms import first_watched, sharpness
 from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness, fingerprints, goes_on, lit, noted
@@ -39,12 +42,10 @@ from scas4d_core.settings import Settings, UpdateSettings
 from scas4d_core.storage.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, cold_start, find_commit
 from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.structure.motion_mask import first_labels, labelled
-from scas4d_core.torch_backend.device import require_device
-from scas4d_core.update.frame_update import Updater
-from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
-from scas4d_core.update.result import REPORT, Stopwatch
+from scas4d_core.update.frame_update import FrameUpdate
+from scas4d_core.update.result import Stopwatch
 from scas4d_core.update.schedule import TimeBudget
-from scas4d_core.update.training_view import TrainingView
+from scas4d_core.update.view_factory import ViewFactory
 
 __all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "ResumePoint", "StepError"]
 
@@ -73,7 +74,6 @@ class Reconstruction(CommittedScene):
 
     def __init__(self, rig: Rig, settings: Settings, history: History, found: Calibration | None = None) -> None:
         """Without a frame yet; ``rig`` as given, of the frames' pictures. ``found``: None: as the history began."""
-        require_device(settings.device)
         world, scale = rig.world_frame(settings.scene.metres_per_unit), settings.scene.image_scale
         limits = rig_limits(settings.scene.near, world, rig.cameras)
         super().__init__(history, world, limits)
@@ -81,13 +81,13 @@ class Reconstruction(CommittedScene):
         self.rig = rig_inside(world, rig.scaled(scale).cameras)
         self.settings, self._update = settings, settings.update
         self._factory = ViewFactory(self.rig, None if scale == 1.0 else rig)
-        self._picture = PictureLoss(self._factory, settings.scene.behind, 1.0, 0.0, limits=limits)
-        self._preparation = Preparation(self._factory, self.settings, self.world, self._picture)
+        self._renderer = renderer_of(settings.device, settings.scene.behind, limits)
+        self._preparation = Preparation(self._factory, self.settings, self.world, self._renderer)
         self.static: StaticResult | None = None
         self.report: FrameReport | None = None
         self.resumed: ResumePoint | None = None
         self._fixed: FirstFrame
-        self._updater: Updater
+        self._updater: FrameUpdate
         self.populates, self._carried = True, CarryOver()
         self._checkpoints = None if history.directory is None else Checkpoints(history.directory)
         self._budget = TimeBudget(settings.update.budget_ms)
@@ -117,7 +117,7 @@ class Reconstruction(CommittedScene):
             dropped, notes, started: see ``step``; the stage "load" has the time before: decoding, loading the kernels.
 
         Raises:
-            DeviceError: the settings' device cannot be had here. RigError: the rig cannot work with these settings.
+            RigError: the rig cannot work with these settings.
             ValueError: a time that is not finite, or pictures of another size.
         """
         if not isfinite(frame.time):
@@ -262,7 +262,7 @@ class Reconstruction(CommittedScene):
             unusable=unusable, carried=carried.effects,
             rests=learns and carried.labels is None and len(self.history.indices) <= RESTING,
         )  # fmt: skip
-        solver = FrameSolver(updater, self._factory, self._picture, self._update)
+        solver = FrameSolver(updater, self._factory, self._renderer, self._update)
         result, past = solver.run(given)
         watch.lap("update")
         watch.move("update", "judge", solver.judging)
@@ -276,7 +276,7 @@ class Reconstruction(CommittedScene):
             learnt = [view for view in result.views or believed if view.name not in result.trace.left_out]
             aside = [view for view in views if view.name not in {view.name for view in learnt}]
             room = room_for_births(len(self.history.first), len(result.gaussians))
-            looked_at = (result, self._factory.posed, learnt, self._picture, room, fits, aside)
+            looked_at = (result, self._factory.posed, learnt, self._renderer, room, fits, aside)
             seen, populates = Seen(frame.index, given.state, *looked_at), self.populates and exposure == 1.0
             result, updater, carried, roots = self._preparation.followed(updater, carried, seen, roots, populates)
             tried = self._budget.births  # time that was kept and not enough is not kept again
@@ -295,7 +295,7 @@ class Reconstruction(CommittedScene):
 
     @property
     def _learns_labels(self) -> bool:  # motion tells what moves: no masks do, and the effects ask for it
-        return self._preparation.parts.learns_labels and not self._fixed.masked
+        return self._preparation.built.plan.learns_labels and not self._fixed.masked
 
     def _seconds_to(self, frame: Frame) -> float:
         """Seconds from the last committed frame to one that comes after it."""

@@ -49,8 +49,8 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "scas4d_core.query.tracks": ("tracks_of_ids", "tracks_of_pixels", "tracks_of_points"),
     "scas4d_core.query.view": ("View", "ViewRenderer"),
     "scas4d_core.rasterize.cpu": ("CpuRasterizer",),
-    "scas4d_core.rasterize.limits": ("scene_limits",),
-    "scas4d_core.rasterize.twin": ("render",),
+    "scas4d_core.engines.limits": ("scene_limits",),
+    "scas4d_core.engines.torch.rasterizer": ("render",),
     "scas4d_core.frame_outcome": ("FrameOutcome", "degraded_text", "outcome_of"),
     "scas4d_core.presets": ("preset",),
     "scas4d_core.reconstruction": ("Reconstruction",),
@@ -61,12 +61,12 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "scas4d_core.structure.hierarchy": ("build_hierarchy",),
     "scas4d_core.structure.motion_mask": ("changed_pixels", "with_reliable_labels"),
     "scas4d_core.structure.neighbours": ("build_neighbours",),
-    "scas4d_core.torch_backend.deformation": (
+    "scas4d_core.engines.torch.deformation": (
         "cascade", "cluster_map", "cluster_pivots", "deform", "material_rotations", "polar_rotation",
         "quaternion_matrices", "quaternion_product", "rotation_quaternions", "scaling_factor",
     ),
-    "scas4d_core.torch_backend.device": ("require_device",),
-    "scas4d_core.torch_backend.losses": (
+    "scas4d_core.engines.torch.device": ("require_device",),
+    "scas4d_core.engines.torch.losses": (
         "floor_loss", "image_loss", "isometry_loss", "psnr", "rigidity_loss", "rotation_loss", "scale_loss",
         "soft_colour_loss", "ssim_map",
     ),

@@ -72,9 +72,9 @@ def evaluate_states(
 
 def _measure(found: Source, truth: Capture, store: Store, frames: int | None, report: Report) -> Row:
     # These bring the kernels; the command does not.
+    from scas4d_core.engines.limits import rig_limits
     from scas4d_core.metrics.evaluation import measure_flicker, measure_parts, measure_pictures, measure_tracks
     from scas4d_core.query.committed import CommittedScene
-    from scas4d_core.rasterize.limits import rig_limits
     from scas4d_core.storage.history import History
 
     given, last = found.of, truth.frame_count - 1

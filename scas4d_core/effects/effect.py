@@ -16,8 +16,8 @@ from scas4d_core.effects.registry import EFFECTS
 
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Evidence, Seen
-    from scas4d_core.effects.parts import Arrays, PartsBuilder
     from scas4d_core.settings import Settings
+    from scas4d_core.update.parts import Arrays, PlanBuilder
     from scas4d_core.update.result import UpdateResult
 
 
@@ -56,10 +56,6 @@ class Effect:
     off_below: float = 0.0
     without_masks: bool = True
     kept: tuple[str, ...] = ()
-
-    def always(self, settings: Settings) -> bool:
-        """True where it is on in every scene with these settings, and waits for no evidence."""
-        return not self.auto
 
     def refused(self, settings: Settings) -> tuple[str, str] | None:
         """Fault and remedy where it cannot be on under these settings; None: it can."""
@@ -102,7 +98,7 @@ class Effect:
         """
         return seen.result
 
-    def join(self, builder: PartsBuilder) -> None:
+    def join(self, builder: PlanBuilder) -> None:
         """Puts its part into the updates of a scene; called only where it is on."""
         raise NotImplementedError
 
@@ -120,11 +116,6 @@ def refused_at_zero(settings: Settings, key: str) -> Refusal | None:
     if attrgetter(key)(settings.update) > 0:
         return None
     return f"update.{key} is 0", f"give it a {'weight' if key.startswith('weights.') else 'rate'} above 0"
-
-
-def refused_on_gpu(settings: Settings) -> Refusal | None:
-    """Fault and remedy where another device than the CPU renders."""
-    return None if settings.device == "cpu" else (f"device is {settings.device!r}", "set device to 'cpu'")
 
 
 @cache

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from scas4d_core.cameras import Rig
+    from scas4d_core.engines.renderer import Renderer
+    from scas4d_core.engines.views import TrainingView
     from scas4d_core.gaussians import Gaussians
-    from scas4d_core.update.picture_loss import PictureLoss
     from scas4d_core.update.result import UpdateResult
-    from scas4d_core.update.training_view import TrainingView
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Seen:
 
     Attributes:
         index: of the frame. before: Θ_{t−1}. result: Θ_t, the trace of its update, arrays of the effects.
-        rig: the cameras inside, as they were posed. views: that were learnt from. picture: renders them.
+        rig: the cameras inside, as they were posed. views: that were learnt from. renderer: draws states of the scene.
         room: Gaussians that may still be born in the scene. time: for fitting them.
         suspects: views that were not learnt from, of cameras that are set aside.
     """
@@ -58,7 +58,7 @@ class Seen:
     result: UpdateResult
     rig: Rig
     views: Sequence[TrainingView]
-    picture: PictureLoss
+    renderer: Renderer
     room: int = 1_000_000
     time: FitTime = field(default_factory=FitTime)
     suspects: Sequence[TrainingView] = ()

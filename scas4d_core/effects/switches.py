@@ -8,19 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from importlib import import_module
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from scas4d_core.effects.effect import Effect, effect
-from scas4d_core.effects.parts import Part, not_on_devices
 from scas4d_core.effects.registry import EFFECTS, Mode
 from scas4d_core.errors import InputError
 from scas4d_core.settings import Settings
 
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Evidence, Seen
-    from scas4d_core.effects.parts import Arrays, PartsBuilder
+    from scas4d_core.update.parts import Arrays, PlanBuilder
 
 IDLE = 8
 """Frames in a row with too little evidence, after which an effect is switched off."""
@@ -49,22 +47,10 @@ NONE_FOUND: Mapping[str, Evidence] = MappingProxyType({})
 """No evidence."""
 
 
-def refusal(name: str, settings: Settings) -> tuple[str, str] | None:
-    """Fault and remedy where an effect cannot be on under these settings, or on their device; None: it can."""
-    own = effect(name).refused(settings)
-    if own is not None or settings.device == "cpu":
-        return own
-    for kind in vars(import_module(EFFECTS[name])).values():  # its parts, shared ones too, are named in its module
-        if isinstance(kind, type) and issubclass(kind, Part) and (hooks := not_on_devices(kind)):
-            missing = f"no update there calls {' and '.join(hooks)} of {kind.__name__}"
-            return f"device is {settings.device!r}, and {missing}", "set device to 'cpu'"
-    return None
-
-
 def contradictions(settings: Settings) -> Iterator[tuple[str, Mode, str, str]]:
     """Name, mode, fault and remedy of each effect whose pin the settings contradict."""
     for name, mode in settings.effects.items():
-        if mode == "on" and (found := refusal(name, settings)) is not None:
+        if mode == "on" and (found := effect(name).refused(settings)) is not None:
             yield name, mode, f"effects.{name} cannot be 'on': {found[0]}", f"{found[1]}, or leave it 'auto'"
         if mode == "off" and (found := effect(name).needed(settings)) is not None:
             yield name, mode, f"effects.{name} cannot be 'off': {found[0]}", found[1]
@@ -88,18 +74,16 @@ def first_switches(
     """
     for _, _, fault, remedy in contradictions(settings):
         raise InputError(fault, remedy)
-    switches, on_cpu = {}, settings.model_copy(update={"device": "cpu"})
+    switches = {}
     for name in EFFECTS:
         mode, one = settings.effects.get(name, "auto"), effect(name)
-        refused = refusal(name, settings)
+        refused = one.refused(settings)
         allowed = mode == "auto" and refused is None
-        on = mode == "on" or (allowed and one.always(settings))
+        on = mode == "on" or (allowed and not one.auto)
         evidence = found.get(name)
-        if evidence is not None and allowed and not one.always(settings):
+        if evidence is not None and allowed and one.auto:
             on = evidence.share >= one.on_above
         share, text = (0.0, "") if evidence is None else (evidence.share, evidence.text)
-        if mode == "auto" and refused is not None and refusal(name, on_cpu) is None:
-            text = refused[0]  # it is the device
         if allowed and not masked and not one.without_masks:
             on, text = False, "the first frame has no masks"
         switches[name] = Switch(on, index, mode != "auto", share, text)
@@ -131,7 +115,7 @@ def decided(switches: Switches, settings: Settings, seen: Seen) -> dict[str, Swi
 
 def _decided(name: str, switch: Switch, settings: Settings, seen: Seen) -> Switch:
     one = effect(name)
-    if switch.pinned or one.always(settings) or refusal(name, settings) is not None:
+    if switch.pinned or not one.auto or one.refused(settings) is not None:
         return switch
     found = one.evidence(seen)
     if found is None:
@@ -148,7 +132,7 @@ def began(switches: Switches, settings: Settings, seen: Seen) -> dict[str, Array
     found = {}
     for name, switch in switches.items():
         one = effect(name)
-        if (switch.on or not switch.pinned) and refusal(name, settings) is None:
+        if (switch.on or not switch.pinned) and effect(name).refused(settings) is None:
             arrays = one.began(seen)
             if arrays is not None:
                 found[name] = arrays
@@ -165,7 +149,7 @@ def noted(switches: Switches, settings: Settings, seen: Seen) -> Seen:
     for name, switch in switches.items():
         one = effect(name)
         asked = type(one).noted is not Effect.noted and (switch.on or not switch.pinned)
-        if asked and refusal(name, settings) is None:
+        if asked and effect(name).refused(settings) is None:
             arrays = one.noted(seen, switch.on)
             if arrays is not None:
                 found[name] = arrays
@@ -198,7 +182,7 @@ def names_on(switches: Switches) -> tuple[str, ...]:
     return tuple(name for name in EFFECTS if name in switches and switches[name].on)
 
 
-def joined(builder: PartsBuilder, effects: Sequence[str] | None = None) -> PartsBuilder:
+def joined(builder: PlanBuilder, effects: Sequence[str] | None = None) -> PlanBuilder:
     """The builder once the effects have joined it.
 
     Args:

@@ -9,7 +9,8 @@ The loop (``update.frame_update``) decides; an engine computes. The calls of one
     engine.probe(...)                       # image losses of the candidates on a few views
     engine.begin(start)                     # fresh moments
     engine.iterate(views, step)             # deform, render, compare, backward, Adam: once an iteration
-    engine.log(), engine.probe(...)         # at the gate, where a stopping rule looks, and at the end
+    engine.log(), engine.leave_out(views)   # at the gate, once each camera was rendered
+    engine.probe(...)                       # where a stopping rule looks, and at the end
     engine.state(learnt=True)               # Θ_t
 
 Only ``probe``, ``log``, ``tables``, ``state``, ``exposures`` and ``gains`` make the host wait for the device: about ten
@@ -26,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.engines.plan import Structure, UpdatePlan
+from scas4d_core.engines.renderer import Renderer
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.structure.hierarchy import Hierarchy
@@ -122,7 +124,6 @@ class StepScalars:
         smooth_gloss: whether the changes of the gloss are averaged over neighbours after this step.
         rigidity: weight of rigidity in this iteration.
         sample: index of the attempt's sample whose neighbours are compared.
-        cameras: number of cameras that still take part.
         keep_pictures: whether the log keeps the rendering of this iteration.
     """
 
@@ -134,7 +135,6 @@ class StepScalars:
     smooth_gloss: bool
     rigidity: float
     sample: int
-    cameras: int
     keep_pictures: bool
 
 
@@ -200,6 +200,10 @@ class UpdateEngine(Protocol):
 
     name: str
 
+    @property
+    def renderer(self) -> Renderer:
+        """Draws states with the background and limits of the plan."""
+
     def bind(self, plan: UpdatePlan, structure: Structure) -> None:
         """Prepare for the updates of a plan: allocate, compile.
 
@@ -230,6 +234,9 @@ class UpdateEngine(Protocol):
         Args:
             views: of the iteration, by index; the image and mask losses are the mean over them.
         """
+
+    def leave_out(self, views: Sequence[int]) -> None:
+        """Views, by index, that have no turn any more in this attempt: their cameras' gains stay."""
 
     def wait(self, iteration: int) -> None:
         """Wait until the device is near an iteration, so that the host's clock measures its work."""

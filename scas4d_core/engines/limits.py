@@ -65,5 +65,3 @@ def rig_limits(near: float | str, world: WorldFrame, cameras: Sequence[Camera]) 
 
 
 DEFAULT = Limits()
-GSPLAT = Limits(alpha_cap=0.999)
-"""gsplat 1.5.3, for comparisons with it."""

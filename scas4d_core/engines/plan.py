@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.engines.freedom import Freedom
 from scas4d_core.engines.limits import DEFAULT, Limits
-from scas4d_core.structure.hierarchy import Hierarchy
-from scas4d_core.structure.neighbours import Neighbours
+
+if TYPE_CHECKING:
+    from scas4d_core.structure.hierarchy import Hierarchy
+    from scas4d_core.structure.neighbours import Neighbours
 
 Array = NDArray[np.float32]
 Plane = tuple[float, float, float, float]
@@ -83,6 +85,12 @@ class UpdatePlan:
     whole_pictures: bool = False
     always_updates: bool = False
     learns_labels: bool = False
+
+    def learns_colours(self) -> ColourPlan:
+        """The plan of the colours; made with the first effect that asks for it."""
+        if self.colours is None:
+            self.colours = ColourPlan()
+        return self.colours
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,10 @@ from scas4d_core.gaussians import Gaussians
 Array = NDArray[np.float32]
 
 
+BLOCK = 4
+"""Pixels of the side of a block, see ``Renderer.reached``."""
+
+
 class Picture(NamedTuple):
     """A rendered picture; it may lie in a buffer of the renderer, valid until its next call.
 
@@ -92,4 +96,4 @@ class Renderer(Protocol):
         """
 
     def reached(self, state: Gaussians, rows: NDArray[np.int64], camera: CameraArrays) -> NDArray[np.bool_]:
-        """[h, w] bool, blocks of 4×4 pixels that the supports of some Gaussians meet; whole tiles, padded."""
+        """[h, w] bool, blocks of ``BLOCK`` pixels a side that the supports of some Gaussians meet; padded."""

@@ -15,8 +15,6 @@ Array = NDArray[np.float32]
 
 SIDE = 8
 """Pixels of the side of squares whose mean colours are compared from frame to frame: their noise is small."""
-TILE = 32
-"""Pixels of the side of a tile, the unit in which pictures are drawn."""
 LABEL = 3
 """The label's channel, after red, green and blue."""
 
@@ -35,11 +33,6 @@ class CameraArrays(NamedTuple):
         pose = np.ascontiguousarray(camera.world_to_camera[:3], dtype=np.float32)
         lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], dtype=np.float32)
         return cls(pose, lens, camera.width, camera.height)
-
-    @property
-    def tiles(self) -> tuple[int, int]:
-        """Columns and rows of tiles."""
-        return -(-self.width // TILE), -(-self.height // TILE)
 
     @property
     def centre(self) -> Array:

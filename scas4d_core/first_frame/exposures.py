@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.kernels.adam import EVERY_ROW, adam
-from scas4d_core.update.training_view import TrainingView
 
 Array = NDArray[np.float32]
 

@@ -17,13 +17,13 @@ from scipy.spatial import cKDTree
 from scas4d_core.effects.effect import effect
 from scas4d_core.effects.evidence import Evidence
 from scas4d_core.effects.registry import Mode
+from scas4d_core.engines.cpu.gloss import GLOSS, Shading, without_turn
 from scas4d_core.first_frame.fit_schedule import FitProgress, FitStep
 from scas4d_core.first_frame.normals import surface_normals
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.first_frame.static_scene import StaticTrainer
 from scas4d_core.first_frame.strengths import strengths_seen
 from scas4d_core.kernels.adam import EVERY_ROW, adam
-from scas4d_core.rasterize.shading import GLOSS, Shading, without_turn
 
 Array = NDArray[np.float32]
 

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.kernels import activation
 from scas4d_core.settings import SceneSettings, StaticSettings
-from scas4d_core.update.training_view import TrainingView
 
 Array = NDArray[np.float32]
 

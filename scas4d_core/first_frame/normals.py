@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion, gaussian_filter
 from scipy.spatial import cKDTree
 
-from scas4d_core.rasterize.cpu import CpuRasterizer
-from scas4d_core.rasterize.shading import camera_centre
-from scas4d_core.update.training_view import TrainingView
+from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
+from scas4d_core.engines.views import TrainingView
 
 Array = NDArray[np.float32]
 
@@ -64,7 +63,7 @@ def surface_normals(
         seen = rasterizer.backward(g_image, g_alpha, 3).features
         g_image[:] = 0
         total += seen
-        outwards += seen[:, 3:] * _unit(camera_centre(camera) - means)
+        outwards += seen[:, 3:] * _unit(camera.centre - means)
     found = np.where(total[:, 3:] > 1e-3, total[:, :3], outwards)
     found = _unit(np.where(np.linalg.norm(found, axis=1, keepdims=True) > TINY, found, _unit(means - means.mean(0))))
     weight = np.minimum(total[:, 3], 5) + 1e-3

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.captures.frame import Frame, InitialPoints
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.first_frame.fit_schedule import FEWER, FitProgress
 from scas4d_core.first_frame.glossy import fit_by_direction
 from scas4d_core.first_frame.initial_points import initial_points
@@ -24,8 +25,7 @@ from scas4d_core.frame_report import Progress
 from scas4d_core.robust.checks import axis_lengths
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings
 from scas4d_core.storage.history import History, HistoryError
-from scas4d_core.update.picture_loss import ViewFactory
-from scas4d_core.update.training_view import TrainingView
+from scas4d_core.update.view_factory import ViewFactory
 
 Colour = tuple[float, float, float]
 

@@ -7,6 +7,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.engines.cpu.gloss import Shading, without_turn
+from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.limits import scene_limits
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.first_frame.exposures import TRIAL, Exposures
 from scas4d_core.first_frame.fit_schedule import FitProgress, FitSchedule, FitStep
 from scas4d_core.first_frame.initial_gaussians import (
@@ -25,12 +29,10 @@ from scas4d_core.first_frame.time_limit import TimeLimit
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels import activation
 from scas4d_core.kernels.adam import EVERY_ROW, adam
-from scas4d_core.rasterize.limits import scene_limits
-from scas4d_core.rasterize.shading import Shading, without_turn
 from scas4d_core.settings import SceneSettings, StaticSettings
-from scas4d_core.update.picture_loss import PictureLoss, ViewFactory, view_order
 from scas4d_core.update.result import CameraFit, camera_fit
-from scas4d_core.update.training_view import TrainingView
+from scas4d_core.update.schedule import view_order
+from scas4d_core.update.view_factory import ViewFactory
 
 Array = NDArray[np.float32]
 
@@ -86,7 +88,7 @@ class StaticTrainer:
         self.stage = stage
         self.radius = factory.rig.radius
         limits = scene_limits(scene.near, self.radius)
-        self.loss = PictureLoss(factory, scene.behind, 1.0, WEIGHT_MASK, False, limits)
+        self.loss = CpuRenderer(scene.behind, 1.0, WEIGHT_MASK, False, limits)
         self._masked = any(len(view.target) > 3 for view in views)
         self.random = np.random.default_rng(settings.seed)
         self._reset_moments()
@@ -238,11 +240,11 @@ class StaticTrainer:
         A Gaussian that no camera sees is free to be anything and shows once the scene moves; one that a single camera
         sees is a floater that explains this camera's picture and spoils all others.
         """
-        activation.activate(self.parameters, self._means, self._factors, self._opacities, self._features)
         counts = np.zeros(len(self.parameters), np.int64)
+        state = self.gaussians()
         for view in self.views:
-            (seen,) = self.loss.coverage(self._means, self._factors, self._opacities, self._features, view)
-            counts += seen > SEEN_PIXELS
+            everywhere = np.ones((1, view.camera.height, view.camera.width), np.float32)
+            counts += self.loss.gather(state, view.camera, everywhere)[:, 0] > SEEN_PIXELS
         needed = np.full(len(counts), min(MIN_VIEWS, len(self.views)))
         if self.stage is not None:  # surroundings hide nothing from others
             needed[~self.stage.holds(self._means)] = 1

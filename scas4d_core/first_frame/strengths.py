@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scas4d_core.rasterize.cpu import CpuRasterizer
-from scas4d_core.rasterize.shading import SAME_SIDE, camera_centre, without_turn
-from scas4d_core.update.training_view import TrainingView
+from scas4d_core.engines.cpu.gloss import SAME_SIDE, without_turn
+from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
+from scas4d_core.engines.views import TrainingView
 
 Array = NDArray[np.float32]
 Float = NDArray[np.float64]
@@ -74,7 +74,7 @@ def strengths_seen(
         found = rasterizer.backward(g_image, g_alpha, 3).features
         g_image[:] = 0
         colours = found[:, :3] / np.maximum(found[:, 3:], 1e-6)
-        centre = camera_centre(view.camera)
+        centre = view.camera.centre
         ahead = centre - means
         facing = np.einsum("nc,nc->n", ahead, normals) / np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)
         counts = (found[:, 3] > ENOUGH) & (facing > FLATTEST)

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.cameras import Camera, WorldFrame
+from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query import parts as parts_of_history
 from scas4d_core.query import ply
 from scas4d_core.query import tracks as tracks_of_history
 from scas4d_core.query.tracks import Tracks
 from scas4d_core.query.view import View, ViewRenderer
-from scas4d_core.rasterize.limits import DEFAULT, Limits
 from scas4d_core.storage.history import History
 
 

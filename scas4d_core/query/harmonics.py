@@ -32,8 +32,8 @@ def harmonics(gaussians: Gaussians) -> Float:
     """
     assert gaussians.gloss is not None
     assert gaussians.environment is not None
+    from scas4d_core.engines.cpu.gloss import without_turn
     from scas4d_core.kernels.appearance.direction import shade  # only what is glossy needs the kernels
-    from scas4d_core.rasterize.shading import without_turn
 
     place = np.arange(DIRECTIONS) + 0.5
     z, turn = 1 - 2 * place / DIRECTIONS, np.pi * (1 + 5**0.5) * place

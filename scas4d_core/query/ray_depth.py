@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from scas4d_core.cameras import Camera
+from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.rasterize.limits import DEFAULT, Limits
 
 Float = NDArray[np.float64]
 

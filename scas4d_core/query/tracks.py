@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, maximum_filter
 
 from scas4d_core.cameras import Camera, WorldFrame
+from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.errors import InputError
 from scas4d_core.gaussians import moving_extent, quaternions_to_matrices
 from scas4d_core.query.carriers import carriers, geometric_median, of_those_there
 from scas4d_core.query.ray_depth import ray_depths
-from scas4d_core.rasterize.limits import DEFAULT, Limits
 from scas4d_core.storage.history import History
 
 Float = NDArray[np.float64]

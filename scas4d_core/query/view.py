@@ -9,12 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.cameras import Camera, WorldFrame
+from scas4d_core.engines.cpu.gloss import colours_seen
+from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
+from scas4d_core.engines.limits import DEFAULT, Limits
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels.blend import GROUP
 from scas4d_core.query.tracks import ALPHA_OF_A_SURFACE
-from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
-from scas4d_core.rasterize.limits import DEFAULT, Limits
-from scas4d_core.rasterize.shading import colours_seen
 
 Array = NDArray[np.float32]
 

@@ -24,12 +24,12 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.engines.renderer import Renderer
+from scas4d_core.engines.views import LABEL, TrainingView
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.rasterize.shading import features_seen
 from scas4d_core.robust.outliers import Past, few
-from scas4d_core.update.picture_loss import LABEL, PictureLoss, ViewFactory
 from scas4d_core.update.result import UpdateResult
-from scas4d_core.update.training_view import TrainingView
+from scas4d_core.update.view_factory import ViewFactory
 
 Array = NDArray[np.float32]
 
@@ -134,7 +134,7 @@ def lit(past: Past, light: float) -> Past:
 
 def evened(
     factory: ViewFactory,
-    picture: PictureLoss,
+    renderer: Renderer,
     state: Gaussians,
     views: Sequence[TrainingView],
     others: Sequence[TrainingView] = (),
@@ -147,19 +147,19 @@ def evened(
     Returns:
         1 and the views as they are, where they turn out not to differ.
     """
-    shown = [_shown(picture, state, view) for view in views]
+    shown = [_shown(renderer, state, view) for view in views]
     gain = _gain(views, shown)
     if gain is None or 1 / EXPOSURE <= gain <= EXPOSURE:
         return 1.0, list(views), list(others)
     every = [*views, *others]
-    shown += [_shown(picture, state, view) for view in others]
+    shown += [_shown(renderer, state, view) for view in others]
     without = [factory.retouched(view, _without(view, gain, now)) for view, now in zip(every, shown, strict=True)]
     return gain, without[: len(views)], without[len(views) :]
 
 
-def gain_of(picture: PictureLoss, state: Gaussians, views: Sequence[TrainingView]) -> float | None:
+def gain_of(renderer: Renderer, state: Gaussians, views: Sequence[TrainingView]) -> float | None:
     """Times that a frame is brighter than Θ_{t−1} shows it; None where no camera can say."""
-    return _gain(views, [_shown(picture, state, view) for view in views])
+    return _gain(views, [_shown(renderer, state, view) for view in views])
 
 
 def relit(state: Gaussians, gain: float) -> Gaussians:
@@ -168,11 +168,9 @@ def relit(state: Gaussians, gain: float) -> Gaussians:
     return state.replace(colours=np.minimum(np.float32(gain) * colours, np.maximum(colours, np.float32(1))))
 
 
-def _shown(picture: PictureLoss, state: Gaussians, view: TrainingView) -> Array:
+def _shown(renderer: Renderer, state: Gaussians, view: TrainingView) -> Array:
     """[3, H, W] the state as the view's camera would show it."""
-    features = features_seen(state, view.camera)
-    picture.measure(state.means, state.factors, state.opacities, features, view)
-    planes = picture.rasterizer.planes[:LABEL, : view.camera.height, : view.camera.width]
+    planes = renderer.render(state, view.camera).features[:LABEL]
     shown: Array = view.exposure[:LABEL, 0, None, None] * planes + view.exposure[:LABEL, 1, None, None]
     return shown
 

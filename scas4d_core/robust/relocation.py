@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.cameras import Camera, Rig
+from scas4d_core.engines.renderer import Renderer
+from scas4d_core.engines.views import LABEL, TrainingView
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.rasterize.shading import features_seen
-from scas4d_core.update.picture_loss import LABEL, PictureLoss
-from scas4d_core.update.training_view import TrainingView
 
 Float = NDArray[np.float64]
 
@@ -30,25 +29,21 @@ AGREE = 0.25
 """Of the distance found that the rays may miss each other by, root mean square: else they saw different things."""
 
 
-def find_jump(gaussians: Gaussians, views: Sequence[TrainingView], picture: PictureLoss, rig: Rig) -> Float | None:
+def find_jump(gaussians: Gaussians, views: Sequence[TrainingView], renderer: Renderer, rig: Rig) -> Float | None:
     """[3] metres, how far the moving Gaussians have jumped; None where the cameras do not agree on it.
 
     Args:
-        gaussians: Θ_{t−1}. views: of frame t. picture: renders. rig: the cameras inside.
+        gaussians: Θ_{t−1}. views: of frame t. renderer: draws. rig: the cameras inside.
     """
     rows = gaussians.moving
     if not rows.any():
         return None
-    alone = np.where(rows, np.float32(0), gaussians.opacities)
+    still = gaussians.replace(opacities=np.where(rows, np.float32(0), gaussians.opacities))
     rays_before: list[tuple[Float, Float]] = []
     rays_now: list[tuple[Float, Float]] = []
     for view in views:
-        height, width = view.camera.height, view.camera.width
-        features = features_seen(gaussians, view.camera)
-        picture.measure(gaussians.means, gaussians.factors, gaussians.opacities, features, view)
-        before = picture.rasterizer.planes[LABEL, :height, :width] > 0.5
-        picture.measure(gaussians.means, gaussians.factors, alone, features, view)
-        behind = picture.rasterizer.planes[:3, :height, :width]
+        before = renderer.render(gaussians, view.camera).features[LABEL] > 0.5
+        behind = renderer.render(still, view.camera).features[:3]
         shown = view.exposure[:3, 0, None, None] * behind + view.exposure[:3, 1, None, None]
         now = np.abs(view.target[:3] - shown).max(axis=0) > DIFFERENT
         if not before.any() or not SMALLEST_AREA <= now.sum() / before.sum() <= 1 / SMALLEST_AREA:

@@ -14,9 +14,10 @@ from time import perf_counter
 
 import numpy as np
 
+from scas4d_core.engines.renderer import Renderer
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.rasterize.shading import features_seen
 from scas4d_core.robust import outliers, timing
 from scas4d_core.robust.alarms import alarms_of, colours_by_camera
 from scas4d_core.robust.checks import EXPOSURE, evened, gain_of, relit, validated
@@ -26,12 +27,11 @@ from scas4d_core.robust.relocation import find_jump, shifted
 from scas4d_core.robust.update_input import UpdateInput
 from scas4d_core.settings import UpdateSettings
 from scas4d_core.update.best_state import by_size, committed_errors, slow, within
-from scas4d_core.update.frame_update import Updater
-from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
+from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.rates import all_begun
 from scas4d_core.update.result import AS_SET, AttemptOptions, UpdateResult, UpdateTrace
 from scas4d_core.update.schedule import MOST_TIMED, PROBE, Stopping
-from scas4d_core.update.training_view import TrainingView
+from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import Motion
 
 LADDER = (
@@ -55,15 +55,17 @@ class FrameSolver:
     """Solves the frames of a scene.
 
     Args:
-        updater: of the scene. factory: of its views. picture: renders, with the settings' background and limits.
+        updater: of the scene. factory: of its views. renderer: draws, with the settings' background and limits.
 
     Attributes:
         judging: seconds that checks took beside the updates.
     """
 
-    def __init__(self, updater: Updater, factory: ViewFactory, picture: PictureLoss, settings: UpdateSettings) -> None:
+    def __init__(
+        self, updater: FrameUpdate, factory: ViewFactory, renderer: Renderer, settings: UpdateSettings
+    ) -> None:
         self._updater = updater
-        self._picture = picture
+        self._renderer = renderer
         self._factory, self._rig = factory, factory.posed
         self._settings = settings
         self.judging = 0.0
@@ -77,7 +79,7 @@ class FrameSolver:
     def _alarmed(self, given: UpdateInput, result: UpdateResult, past: Past) -> Solved:
         """With the health of the cameras, the alarms, and when the pictures were taken."""
         if self._settings.judge:
-            past = timing.noted(past, given.state, result, self._picture, given.seconds, given.step, given.seed)
+            past = timing.noted(past, given.state, result, self._renderer, given.seconds, given.step, given.seed)
         means = {view.name: view.mean for view in result.views or given.views}
         alarms, past = alarms_of(
             given.past, past, outcome=result.outcome, reason=result.reason, exposure=result.exposure, sharp=given.sharp,
@@ -101,7 +103,7 @@ class FrameSolver:
         settings, attempts = self._settings, list[str]()
         exposure = 1.0
         if given.exposure != 1.0:
-            exposure, views, suspects = evened(self._factory, self._picture, given.state, given.views, given.suspects)
+            exposure, views, suspects = evened(self._factory, self._renderer, given.state, given.views, given.suspects)
             given = replace(given, views=views, suspects=suspects)
         result, fault = self._attempt(given, AS_SET, attempts)
         for options in LADDER:
@@ -154,7 +156,7 @@ class FrameSolver:
 
         Where the scene is shown as bright as it was, something new makes the pictures brighter: no reason to hold them.
         """
-        gain = gain_of(self._picture, given.state, given.views)
+        gain = gain_of(self._renderer, given.state, given.views)
         same = gain is not None and not given.light_moves and 1 / EXPOSURE <= gain <= EXPOSURE
         if gain is None or (same and given.unusable is None):
             return None
@@ -259,7 +261,7 @@ class FrameSolver:
             return None
         ended = _as_coloured(tried.gaussians, given.state)
         starts = [("sought from where the update ended", ended)]
-        jump = find_jump(given.state, given.views, self._picture, self._rig)
+        jump = find_jump(given.state, given.views, self._renderer, self._rig)
         if jump is not None:
             length = float(np.linalg.norm(jump))
             starts.insert(0, (f"sought {length:.2f} m away", shifted(given.state, jump)))
@@ -323,16 +325,11 @@ class FrameSolver:
 
     def _in_whole(self, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
         with self._timed():
-            return committed_errors(self._factory.rig, self._picture, views, state)
+            return committed_errors(self._factory.rig, self._renderer, views, state)
 
     def _measured(self, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
         """DB of cameras as a state shows them; those that are left out come back so, once they fit."""
-        found = {}
-        for view in views:
-            features = features_seen(state, view.camera)
-            self._picture.measure(state.means, state.factors, state.opacities, features, view)
-            found[view.name] = self._picture.psnr
-        return found
+        return {view.name: self._renderer.compare(state, view).psnr for view in views}
 
 
 def _as_coloured(state: Gaussians, before: Gaussians) -> Gaussians:

@@ -17,13 +17,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.engines.renderer import Renderer
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import CameraTiming, Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.rasterize.shading import features_seen
 from scas4d_core.robust.outliers import Past
-from scas4d_core.update.picture_loss import PictureLoss
 from scas4d_core.update.result import UpdateResult
-from scas4d_core.update.training_view import TrainingView
 
 LOOKS, ITERATIONS = 4, 25
 """Cameras that are looked at in a frame at most, one for so many iterations of its update: two renderings each."""
@@ -118,7 +117,7 @@ class Looks:
 
 
 def noted(
-    past: Past, before: Gaussians, result: UpdateResult, picture: PictureLoss, way: float, frame: float, index: int
+    past: Past, before: Gaussians, result: UpdateResult, renderer: Renderer, way: float, frame: float, index: int
 ) -> Past:
     """The past with the looks at some cameras of a frame; the same where it says nothing.
 
@@ -126,7 +125,7 @@ def noted(
     and any on a GPU, where no rendering is kept. A camera that is left out says nothing either.
 
     Args:
-        past: after the frame. before: Θ_{t−1}. result: Θ_t, before anything is born. picture: renders.
+        past: after the frame. before: Θ_{t−1}. result: Θ_t, before anything is born. renderer: draws.
         way: seconds between the two. frame: seconds since the frame before. index: of the frame.
     """
     trace, after = result.trace, result.gaussians
@@ -141,7 +140,7 @@ def noted(
     for view in views[:most]:
         every, planes = trace.shown[view.name]
         states = (ahead, back) if trace.kept is Candidate.END else (ahead, back, after)  # the end was shown
-        here, there, *now = (_rendered(picture, state, view)[:, ::every, ::every].copy() for state in states)
+        here, there, *now = (_rendered(renderer, state, view)[:, ::every, ::every].copy() for state in states)
         shown = now[0] if now else planes[:3]
         found = told(view.target[:3, ::every, ::every], *(_exposed(view, one) for one in (shown, here, there)))
         known = replace(looks.get(view.name, Looks()), last=float(index))
@@ -167,8 +166,8 @@ def moments(before: Gaussians, after: Gaussians) -> tuple[Gaussians, Gaussians]:
     return found[0], found[1]
 
 
-def _rendered(picture: PictureLoss, state: Gaussians, view: TrainingView) -> Array:
-    return picture.render(state, features_seen(state, view.camera), view).features[:3]
+def _rendered(renderer: Renderer, state: Gaussians, view: TrainingView) -> Array:
+    return renderer.render(state, view.camera).features[:3]
 
 
 def _exposed(view: TrainingView, shown: Array) -> Array:

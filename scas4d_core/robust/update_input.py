@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.effects.parts import Arrays
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust.outliers import Past
-from scas4d_core.update.training_view import TrainingView
+from scas4d_core.update.parts import Arrays
 from scas4d_core.update.warm_start import Motion
 
 RESTING = 10

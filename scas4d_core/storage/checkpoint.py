@@ -21,17 +21,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.captures.frame import Frame
-from scas4d_core.effects.parts import Arrays
 from scas4d_core.effects.switches import Switches, switches_of, switches_record
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.errors import message_of
 from scas4d_core.frame_outcome import FrameOutcome
 from scas4d_core.robust.outliers import Past
 from scas4d_core.storage.frame_files import checkpoint_file, checkpoint_of
 from scas4d_core.storage.history import NEWEST_KEPT, History, HistoryError
 from scas4d_core.storage.npz import read_npz, write_npz
-from scas4d_core.update.picture_loss import ViewFactory
+from scas4d_core.update.parts import Arrays
 from scas4d_core.update.result import UpdateResult
-from scas4d_core.update.training_view import TrainingView
+from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import Motion
 
 FORMAT = 2

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from scas4d_core.cameras import Rig
+from scas4d_core.engines.renderer import Renderer
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.first_frame.points.posed_pictures import pixels_inside
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.update.picture_loss import PictureLoss
-from scas4d_core.update.training_view import TrainingView
 
 Array = NDArray[np.float32]
 
@@ -123,24 +123,23 @@ def changed_pixels(before: Array, now: Array) -> Array:
 
 
 def moving_between(
-    gaussians: Gaussians, before: Sequence[TrainingView], now: Sequence[TrainingView], picture: PictureLoss
+    gaussians: Gaussians, before: Sequence[TrainingView], now: Sequence[TrainingView], renderer: Renderer
 ) -> NDArray[np.bool_]:
     """[N] bool: Gaussians that the pictures of two frames show to move.
 
     Args:
         gaussians: Θ_{t−1}. before, now: the views of both frames; cameras of only one are left out.
-        picture: renders.
+        renderer: draws.
     """
-    features = gaussians.features(gaussians.colours)
     earlier = {view.name: view for view in before}
     says = np.zeros(len(gaussians), np.int64)
     asked = np.zeros(len(gaussians), np.int64)
-    state = (gaussians.means, gaussians.factors, gaussians.opacities, features)
     for view in now:
         if view.name not in earlier:
             continue
         changed = changed_pixels(earlier[view.name].target[:3], view.target[:3])
-        total, inside = picture.coverage(*state, view, changed)
+        planes = np.stack([np.ones_like(changed), changed])
+        total, inside = renderer.gather(gaussians, view.camera, planes).T
         sees = total > SEEN_PIXELS
         asked += sees
         says += sees & (inside > IN_CHANGE * total)
@@ -153,7 +152,7 @@ def labels_learnt(
     known: NDArray[np.bool_] | None,
     before: Sequence[TrainingView],
     now: Sequence[TrainingView],
-    picture: PictureLoss,
+    renderer: Renderer,
 ) -> NDArray[np.bool_] | None:
     """[N] bool: Gaussians that have been seen to move by now; None where hardly any are new, or too few moved ever.
 
@@ -161,7 +160,7 @@ def labels_learnt(
         gaussians: Θ_{t−1}. known: [N] those that had been seen to move before, or None.
         before, now: see ``moving_between``.
     """
-    found = moving_between(gaussians, before, now, picture)
+    found = moving_between(gaussians, before, now, renderer)
     if known is None:
         return found if found.sum() >= FIRST_LABELS else None
     enough = min(NEW_LABELS * len(gaussians), max(FIRST_LABELS, MORE_LABELS * known.sum()))

@@ -10,18 +10,16 @@ from collections.abc import Callable, Mapping, Sequence
 from math import nan
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scas4d_core.cameras import Rig, farthest_first
+from scas4d_core.engines.engine import Tables, UpdateEngine
+from scas4d_core.engines.renderer import Renderer
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.rasterize.shading import features_seen, without_turn
-from scas4d_core.update.deformation import CpuDeformation
-from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
-from scas4d_core.update.training_view import TrainingView
+from scas4d_core.structure.hierarchy import Hierarchy
+from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import Motion, warm_start
-
-Array = NDArray[np.float32]
 
 VIEWS = 4
 """Probe views of a frame."""
@@ -75,44 +73,49 @@ def probe_views(rig: Rig, views: Sequence[TrainingView], count: int = VIEWS) -> 
 
 
 class ProbeViews:
-    """Fixed training views for comparing states.
+    """Fixed training views for comparing states: the engine gets ``views`` as the probes of a frame.
 
     Args:
-        factory: of the rig. picture: renders. views: of the frame; ``spread`` of them are taken; of none
+        factory: of the rig. engine: compares. views: of the frame; ``spread`` of them are taken; of none
             nothing is compared.
 
     Attributes:
-        whole: whether their whole pictures are compared; known once a state was.
+        views: the whole pictures, then the small ones, if these are compared.
+        whole: whether whole pictures are compared; known once a state was.
     """
 
-    def __init__(self, factory: ViewFactory, picture: PictureLoss, views: Sequence[TrainingView]) -> None:
-        self._whole = probe_views(factory.rig, views)
-        sides = [SCALE * min(view.camera.width, view.camera.height) for view in self._whole]
+    def __init__(self, factory: ViewFactory, engine: UpdateEngine, views: Sequence[TrainingView]) -> None:
+        whole = probe_views(factory.rig, views)
+        sides = [SCALE * min(view.camera.width, view.camera.height) for view in whole]
         self.whole = bool(sides) and min(sides) < FEWEST
-        self._views = self._whole if self.whole else [factory.coarser(view, SCALE) for view in self._whole]
-        self._picture, self._looked = picture, self.whole
+        small = [] if self.whole else [factory.coarser(view, SCALE) for view in whole]
+        self.views = [*whole, *small]
+        self._names = [view.name for view in whole]
+        self._whole = range(len(whole))
+        self._compared = self._whole if self.whole else range(len(whole), 2 * len(whole))
+        self._engine, self._looked = engine, self.whole
 
-    def errors(self, state: Gaussians, turns: Array | None = None) -> dict[str, float]:
+    def errors(self, *, moved: bool, learnt: bool) -> dict[str, float]:
         """The image loss (``losses.image_loss``) of a state in each view, by the camera's name.
 
         Args:
-            turns: since its gloss was known, see ``shading.colours_seen``.
+            moved, learnt: which state, see ``UpdateEngine.probe``.
         """
-        if not self._looked and self._views:  # the first state that is asked for is that of the frame before
+        if not self._looked and self._names:  # the first state that is asked for is that of the frame before
             self._looked = True
-            small, whole = (self._error(views[0], state, turns) for views in (self._views, self._whole))
+            small, whole = (
+                self._engine.probe([views[0]], moved=moved, learnt=learnt)[0] for views in (self._compared, self._whole)
+            )
             if small > ALIASED * whole:
-                self._views, self.whole = self._whole, True
-        return {view.name: self._error(view, state, turns) for view in self._views}
+                self._compared, self.whole = self._whole, True
+        return self._errors(self._compared, moved, learnt)
 
-    def whole_errors(self, state: Gaussians, turns: Array | None = None) -> dict[str, float]:
+    def whole_errors(self, *, moved: bool, learnt: bool) -> dict[str, float]:
         """As ``errors``, in whole pictures."""
-        return {view.name: self._error(view, state, turns) for view in self._whole}
+        return self._errors(self._whole, moved, learnt)
 
-    def _error(self, view: TrainingView, state: Gaussians, turns: Array | None) -> float:
-        features = features_seen(state, view.camera, turns)
-        self._picture.measure(state.means, state.factors, state.opacities, features, view)
-        return self._picture.image_part
+    def _errors(self, which: Sequence[int], moved: bool, learnt: bool) -> dict[str, float]:
+        return dict(zip(self._names, self._engine.probe(which, moved=moved, learnt=learnt), strict=True))
 
 
 def slow(errors: Mapping[Candidate, Mapping[str, float]], kept: Candidate) -> bool:
@@ -125,27 +128,22 @@ def slow(errors: Mapping[Candidate, Mapping[str, float]], kept: Candidate) -> bo
     return mean_error(still, list(ended)) <= (1 + SLOW) * mean_error(ended, list(ended))
 
 
-def committed_errors(
-    rig: Rig, picture: PictureLoss, views: Sequence[TrainingView], state: Gaussians
-) -> dict[str, float]:
+def committed_errors(rig: Rig, renderer: Renderer, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
     """The image loss of a committed state in a few whole pictures, by probe view, under names of their own.
 
     Args:
-        rig: as it is given, not as cameras drift. picture: renders whole pictures. views: of the frame.
+        rig: as it is given, not as cameras drift. renderer: compares whole pictures. views: of the frame.
     """
-    found = {}
-    for view in probe_views(rig, views, CONFIRMING):
-        picture.measure(state.means, state.factors, state.opacities, features_seen(state, view.camera), view)
-        found[view.name + COMMITTED] = picture.image_part
-    return found
+    chosen = probe_views(rig, views, CONFIRMING)
+    return {view.name + COMMITTED: renderer.compare(state, view).image_loss for view in chosen}
 
 
 class BestState:
-    """Finds the best start of an update and the best state at its end.
+    """Picks the best start of an update and the best state at its end.
 
     Args:
-        probes: of the frame. deformation: has taken Θ_{t−1}. previous: Θ_{t−1}.
-        motion: of the update before, or None. seconds: since it was found. momentum: see ``UpdateSettings``.
+        probes: of the frame. engine: has taken Θ_{t−1}. hierarchy: of the moving Gaussians.
+        motion: of the update before, or None. seconds: since it was measured. momentum: see ``UpdateSettings``.
 
     Attributes:
         errors: by candidate, then by probe view. seconds: that the motion is taken to have gone on for.
@@ -154,13 +152,13 @@ class BestState:
     def __init__(
         self,
         probes: ProbeViews,
-        deformation: CpuDeformation,
-        previous: Gaussians,
+        engine: UpdateEngine,
+        hierarchy: Hierarchy,
         motion: Motion | None,
         seconds: float,
         momentum: float,
     ) -> None:
-        self._probes, self._deformation, self._previous = probes, deformation, previous
+        self._probes, self._engine, self._hierarchy = probes, engine, hierarchy
         self._motion, self._momentum = motion, momentum
         self.seconds = seconds
         self.errors: dict[Candidate, dict[str, float]] = {}
@@ -170,34 +168,34 @@ class BestState:
         """True where whole pictures were compared."""
         return self._probes.whole
 
-    def start(self, step: float | None = None) -> None:
-        """Set the deformation to the motion before, or to none where that shows the frame better.
+    def start(self, step: float | None = None) -> Tables:
+        """The motion before as a start, or no motion where that shows the frame better; the engine has it.
 
         Args:
             step: seconds since the frame before, where that was not moved: the motion may have rested meanwhile. None:
-                as long as since the motion was found.
+                as long as since the motion was measured.
         """
-        previous, motion = self._previous, self._motion
-        self._note(Candidate.STILL, self._probes.errors(previous))
-        self._set(motion)
+        motion = self._motion
+        self._note(Candidate.STILL, self._probes.errors(moved=False, learnt=False))
+        tables = self._set(motion)
         if motion is not None and self.errors:
-            self._deformation.forward()
-            self._note(Candidate.WARM, self._moved(previous))
+            self._note(Candidate.WARM, self._probes.errors(moved=True, learnt=False))
             if step is not None:
-                self._try_after_rest(motion, step)
+                tables = self._try_after_rest(motion, step)
             if self._mean(Candidate.STILL) < self._mean(Candidate.WARM):
-                self._set(None)
+                tables = self._set(None)
+        return tables
 
-    def _try_after_rest(self, motion: Motion, step: float) -> None:
+    def _try_after_rest(self, motion: Motion, step: float) -> Tables:
         """The motion for the time since the frame before alone, kept where it shows the frame better."""
         whole, errors = self.seconds, self.errors[Candidate.WARM]
         self.seconds = step
-        self._set(motion)
-        self._deformation.forward()
-        self._note(Candidate.WARM, self._moved(self._previous))
+        tables = self._set(motion)
+        self._note(Candidate.WARM, self._probes.errors(moved=True, learnt=False))
         if mean_error(errors, list(errors)) <= self._mean(Candidate.WARM):
             self.seconds, self.errors[Candidate.WARM] = whole, errors
-            self._set(motion)
+            tables = self._set(motion)
+        return tables
 
     def stands(self, enough: Mapping[str, float] | None, confirm: Callable[[], bool] | None = None) -> bool:
         """True where Θ_{t−1} shows this frame as well as ``enough``, errors ``by_size``, and ``confirm`` agrees.
@@ -230,88 +228,60 @@ class BestState:
         met = mean_error(usual, names)
         return (led - met) / (unmoved - met) if unmoved > met else 1.0
 
-    def error(self, look: Gaussians) -> float:
-        """Mean error on the probe views of the deformation as it is set, with its cascade brought up to date.
+    def error(self) -> float:
+        """Mean error on the probe views of the state that the update has now."""
+        errors = self._probes.errors(moved=True, learnt=True)
+        return mean_error(errors, list(errors))
+
+    def end(self, iterations: int, left_out: Mapping[str, str]) -> Candidate:
+        """The best candidate; the engine's tables are set to it.
 
         Args:
-            look: Θ_{t−1} with the colours, gloss and environment as the update has them now.
-        """
-        self._deformation.forward()
-        found = self._moved(look)
-        return mean_error(found, list(found))
-
-    def error_of(self, state: Gaussians) -> float:
-        """Mean error on the probe views of a state."""
-        found = self._probes.errors(state)
-        return mean_error(found, list(found))
-
-    def end(self, look: Gaussians, iterations: int, left_out: Mapping[str, str]) -> Candidate:
-        """The best candidate; the deformation is set to it.
-
-        Args:
-            look: a state with the colours, gloss and environment that the update leaves.
-            iterations: that it had. left_out: cameras that have no say.
+            iterations: of the update. left_out: cameras that have no say.
         """
         if not self.errors:
             return Candidate.END
         if iterations:
-            self._note(Candidate.END, self._moved(look))
+            self._note(Candidate.END, self._probes.errors(moved=True, learnt=True))
         names = [name for name in self.errors[Candidate.STILL] if name not in left_out]
-        found = [candidate for candidate in Candidate if candidate in self.errors]  # of equal ones the first
-        best = min(found, key=lambda candidate: _or_last(mean_error(self.errors[candidate], names)))
+        compared = [candidate for candidate in Candidate if candidate in self.errors]  # of equal ones the first
+        best = min(compared, key=lambda candidate: _or_last(mean_error(self.errors[candidate], names)))
         if best is not Candidate.END and iterations and not self.whole:
-            best = self._best_in_whole(best, look, left_out)
+            best = self._best_in_whole(best, left_out)
         if best is not Candidate.END:
             self._put(best)
         return best
 
-    def _best_in_whole(self, best: Candidate, look: Gaussians, left_out: Mapping[str, str]) -> Candidate:
+    def _best_in_whole(self, best: Candidate, left_out: Mapping[str, str]) -> Candidate:
         """The best candidate in whole pictures: slow motion may show in them alone. Of equal ones ``best`` is taken.
 
-        The deformation is left as it ended.
+        The tables are left as they ended.
         """
-        tables = (*self._deformation.clusters, self._deformation.deltas)
-        errors, ended = {Candidate.END: self._in_whole(look, left_out)}, [values.copy() for values in tables]
+        ended = self._engine.tables()
+        errors = {Candidate.END: self._in_whole(True, left_out)}
         for candidate in self.errors.keys() - {Candidate.END}:
             self._put(candidate)
-            errors[candidate] = self._in_whole(self._previous, left_out)
-        for values, at_end in zip(tables, ended, strict=True):
-            values[:] = at_end
-        self._deformation.forward()
+            errors[candidate] = self._in_whole(False, left_out)
+        self._engine.set_tables(ended)
         return min(errors, key=lambda candidate: (errors[candidate], candidate is not best))
 
     def _put(self, candidate: Candidate) -> None:
-        """Sets the deformation to the start that a candidate is."""
+        """Sets the engine's tables to the start that a candidate is."""
         self._set(self._motion if candidate is Candidate.WARM else None)
-        self._deformation.forward()
 
-    def _set(self, motion: Motion | None) -> None:
-        self._deformation.rest(0)
-        warm_start(self._deformation, motion, self.seconds, self._momentum)
+    def _set(self, motion: Motion | None) -> Tables:
+        tables = warm_start(self._hierarchy, motion, self.seconds, self._momentum)
+        self._engine.set_tables(tables)
+        return tables
 
     def _note(self, candidate: Candidate, errors: dict[str, float]) -> None:
         if errors:
             self.errors[candidate] = errors
 
-    def _moved(self, look: Gaussians) -> dict[str, float]:
-        """Errors of Θ_{t−1} under the deformation, with the looks of a state."""
-        return self._probes.errors(*self._deformed(look))
-
-    def _in_whole(self, look: Gaussians, left_out: Mapping[str, str]) -> float:
-        """The same in whole pictures, the mean but for cameras that have no say; not a number counts as infinite."""
-        found = self._probes.whole_errors(*self._deformed(look))
-        return _or_last(mean_error(found, [name for name in found if name not in left_out]))
-
-    def _deformed(self, look: Gaussians) -> tuple[Gaussians, Array | None]:
-        found, turns = self._deformation, None
-        if look.gloss is not None:
-            turns = without_turn(len(look))
-            turns[found.hierarchy.rows] = found.turns
-        state = self._previous.replace(
-            means=found.means, factors=found.factors,
-            colours=look.colours, gloss=look.gloss, environment=look.environment,
-        )  # fmt: skip
-        return state, turns
+    def _in_whole(self, learnt: bool, left_out: Mapping[str, str]) -> float:
+        """Mean error in whole pictures, but for cameras that have no say; not a number counts as infinite."""
+        errors = self._probes.whole_errors(moved=True, learnt=learnt)
+        return _or_last(mean_error(errors, [name for name in errors if name not in left_out]))
 
     def _mean(self, candidate: Candidate, otherwise: float = np.inf) -> float:
         errors = self.errors.get(candidate)

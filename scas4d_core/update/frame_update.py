@@ -1,51 +1,67 @@
-"""Update of one frame on the CPU: from Θ_{t−1} and the pictures of frame t to Θ_t (paper, algorithm 1).
+"""Update of one frame: from Θ_{t−1} and the pictures of frame t to Θ_t (paper, algorithm 1).
 
-The loop is ``FrameUpdate.run``: deform, render and compare, tie neighbours, carry back, step.
+The loop is ``FrameUpdate.run``. An iteration is one call of the engine (``engines.engine.UpdateEngine.iterate``).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol
+from math import cos, pi
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.effects.parts import NOTHING, Arrays, Hooks, PartsBuilder, Work
-from scas4d_core.effects.switches import joined
+from scas4d_core.engines.engine import KEPT_PICTURES, REPORT, AttemptStart, StepScalars, UpdateEngine
+from scas4d_core.engines.plan import Structure
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import Candidate
-from scas4d_core.gaussians import Gaussians, quaternion_products
-from scas4d_core.guards import summed
-from scas4d_core.rasterize.cpu import Gradients
-from scas4d_core.rasterize.limits import scene_limits
-from scas4d_core.settings import SceneSettings, UpdateSettings
+from scas4d_core.gaussians import Gaussians
 from scas4d_core.structure.hierarchy import Hierarchy
 from scas4d_core.structure.neighbours import Neighbours
-from scas4d_core.update import schedule
 from scas4d_core.update.best_state import BestState, ProbeViews
-from scas4d_core.update.changed_pixels import MOST, ChangedPixels
-from scas4d_core.update.deformation import CpuDeformation, length_bounds
-from scas4d_core.update.free_tables import free_tables, freed
-from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
+from scas4d_core.update.parts import NOTHING, Arrays, Attempt, PlanBuilder
 from scas4d_core.update.rates import Rates
-from scas4d_core.update.result import AS_SET, REPORT, AttemptOptions, Stopwatch, UpdateResult, UpdateTrace
+from scas4d_core.update.result import AS_SET, AttemptOptions, Stopwatch, UpdateResult, UpdateTrace
 from scas4d_core.update.schedule import Stopping, ViewPlan, plan_samples
-from scas4d_core.update.training_view import TrainingView
 from scas4d_core.update.warm_start import Motion, predicted
 
 Array = NDArray[np.float32]
 
+SMOOTH_GLOSS_EVERY = 10
+"""Iterations between two averages of the gloss's changes over neighbours."""
+GLOSS_END = 0.1
+"""Share of the gloss's rates that is left at the end of an update."""
 
-class Updater(Protocol):
-    """Updates the frames of one scene for one hierarchy, on some device."""
 
-    hierarchy: Hierarchy
+class FrameUpdate:
+    """Updates the frames of one scene for one hierarchy, on one engine.
+
+    Args:
+        engine: computes; it is bound to the plan here. built: plan and parts of the effects that are on.
+        neighbours: of the moving Gaussians; None: no term needs them.
+
+    Attributes:
+        hierarchy: of the moving Gaussians.
+        curve: whether loss terms that the report alone needs are computed; state and evidence are the same without.
+
+    Raises:
+        EngineError: the engine cannot do what the plan asks for.
+    """
+
+    curve = True
+
+    def __init__(self, engine: UpdateEngine, built: PlanBuilder, neighbours: Neighbours | None) -> None:
+        self.settings, self.hierarchy = built.update, built.hierarchy
+        self._engine, self._plan, self._parts, self._factory = engine, built.plan, built.parts, built.factory
+        rates = Rates.of(self.settings, len(self.hierarchy.sizes), self._factory.rig.reach)
+        self._rates = rates.freed(self._plan.freedom)
+        engine.bind(self._plan, structure_of(self.hierarchy, neighbours, built.first))
 
     def run(
         self,
         previous: Gaussians,
-        views: list[TrainingView],
+        views: Sequence[TrainingView],
         motion: Motion | None,
         seconds: float,
         seed: int,
@@ -55,171 +71,124 @@ class Updater(Protocol):
         """Find D_t and apply it.
 
         Args:
-            previous: Θ_{t−1}. views: of frame t. motion: that the previous update found, or None.
+            previous: Θ_{t−1}. views: of frame t. motion: of the previous update, or None.
             seconds: between the frames. seed: of the order of views and the sampled neighbourhoods.
             options: of this attempt. carried: arrays that the effects left, by effect.
         """
-
-
-class FrameUpdate:
-    """The ``Updater`` of the CPU; buffers are kept from frame to frame.
-
-    Attributes:
-        tells: whether figures that the report alone needs are worked out; state and evidence are the same without.
-    """
-
-    tells = True
-
-    def __init__(
-        self,
-        factory: ViewFactory,
-        scene: SceneSettings,
-        settings: UpdateSettings,
-        hierarchy: Hierarchy,
-        neighbours: Neighbours | None,
-        first: Gaussians,
-        parts: PartsBuilder | None = None,
-    ) -> None:
-        self.settings = settings
-        self.hierarchy = hierarchy
-        self._factory = factory
-        parts = parts or joined(PartsBuilder(scene, settings, factory, hierarchy, first))
-        self._hooks, self._length, self._freedom = Hooks(parts.parts), parts.length, parts.freedom
-        self._exposes, self._follows = parts.exposes, parts.follows
-        self._rates = freed(Rates.of(settings, len(hierarchy.sizes), factory.rig.reach), parts.freedom)
-        limits = scene_limits(scene.near, factory.rig.radius)
-        given = (factory, scene.behind, schedule.IMAGE_WEIGHT, parts.mask)
-        self._picture = PictureLoss(*given, limits=limits)
-        if not parts.whole and len(hierarchy.rows) <= MOST * len(first):
-            self._picture = ChangedPixels(*given, hierarchy.rows, len(first), limits)
-        bounds = length_bounds(hierarchy, first)
-        self._deformation = CpuDeformation(hierarchy, neighbours, bounds, settings.cluster_map, settings.covariance)
-
-    def run(
-        self,
-        previous: Gaussians,
-        views: list[TrainingView],
-        motion: Motion | None,
-        seconds: float,
-        seed: int,
-        options: AttemptOptions = AS_SET,
-        carried: Mapping[str, Arrays] = NOTHING,
-    ) -> UpdateResult:
-        """Find D_t and apply it, see ``Updater.run``."""
-        settings, deformation = self.settings, self._deformation
-        motion = predicted(motion, self._freedom)
-        if self._exposes:  # another attempt at the frame starts from the exposures that it came with
-            views = [replace(view, exposure=view.exposure.copy()) for view in views]
+        settings, engine = self.settings, self._engine
+        motion = predicted(motion, self._plan.freedom)
         stopping = options.stopping or Stopping(settings.iterations)
         rng = np.random.default_rng([settings.seed, seed])
         watch, trace = Stopwatch(), UpdateTrace()
-        plan = ViewPlan(views, settings.views, stopping.most, rng)
+        order = ViewPlan(len(views), settings.views, stopping.most, rng)
         samples = plan_samples(len(self.hierarchy.rows), rng)
-        deformation.guards.reset()
-        self._picture.rasterizer.guards.reset()
-        deformation.start(previous)
-        self._picture.begin(previous)
-        probes = ProbeViews(self._factory, self._picture, views if options.compare else [])
-        best = BestState(probes, deformation, previous, motion, seconds, settings.momentum)
-        best.start(options.step)
-        rates = self._rates.tried(options.rates, options.rigid, options.hold_colours)
-        if motion is None:
-            rates = rates.cold(options.faster * settings.cold_start, options.several)
-        else:
-            rates = rates.warm(best.unexplained(options.usual))
-        work = Work(previous, deformation, rates, views, self._picture, dict(carried))
-        work.tells = self.tells
-        for start in self._hooks.start:
-            start(work)
-        tables = free_tables(deformation, work.rates)  # a hook may have set where the layers start
-        if not self._follows and best.stands(options.enough, options.confirm):
+        probes = ProbeViews(self._factory, engine, views if options.compare else [])
+        engine.load_views(views, probes.views)
+        engine.load_state(previous)
+        best = BestState(probes, engine, self.hierarchy, motion, seconds, settings.momentum)
+        tables = best.start(options.step)
+        rates = self._rates_of(options, motion, best)
+        attempt = Attempt(engine, engine.renderer, previous, views, rates, tables, dict(carried))
+        for part in self._parts:
+            part.begin(attempt)
+        engine.set_tables(attempt.tables)
+        engine.begin(self._start(rates, samples, attempt.gains, watch))
+        if not self._plan.always_updates and best.stands(options.enough, options.confirm):
             stopping = Stopping(0)
         watch.lap("start")
-        while (iteration := trace.iterations) < (planned := stopping.planned(iteration)):
-            deformation.rest(work.rates.resting(iteration, planned))
-            deformation.forward()
-            work.features[:, :3] = work.colours
-            watch.lap("cascade")
-            met = len(trace.first)
-            loss = self._pictures(plan.take(), work, trace, watch, planned - iteration - 1)
-            work.sample = samples[iteration % len(samples)]
-            for term in self._hooks.loss:
-                loss += term(work)
-            watch.lap("effects")
-            loss += self._length * deformation.backward(work.gradients.means, work.gradients.factors, self._length)
-            watch.lap("cascade backward")
-            for table in tables:
-                table.step(iteration, planned)
-            for step in self._hooks.step:
-                step(work, iteration, planned)
-            watch.lap("adam")
-            trace.losses.append(loss)
+        rendered: set[int] = set()
+        iteration = fade = 0
+        while iteration < (planned := stopping.planned(iteration)):
+            if stopping.end is not None:
+                engine.wait(iteration)
+            chosen = order.take()
+            engine.iterate(chosen, self._step(rates, iteration, planned, fade or planned, len(samples)))
+            iteration, fade = iteration + 1, planned
             trace.moments.append(watch.total)
             watch.lap(REPORT)
-            if options.gate is not None and met < len(trace.first) == len(views):  # each camera was rendered once
+            all_seen = len(rendered) == len(views)
+            rendered.update(chosen)
+            if options.gate is not None and not all_seen and len(rendered) == len(views):
+                trace.take(engine.log(), views)
                 trace.left_out.update(options.gate(trace.first))
-                plan.leave_out(trace.left_out)
-                work.views = [view for view in views if view.name not in trace.left_out]
+                out = [index for index, view in enumerate(views) if view.name in trace.left_out]
+                order.leave_out(out)
+                engine.leave_out(out)
+                attempt.views = [view for view in views if view.name not in trace.left_out]
                 watch.lap("judge")
-            if stopping.looks(trace.iterations):
-                stopping.saw(trace.iterations, best.error(work.look))
+            if stopping.looks(iteration):
+                stopping.saw(iteration, best.error())
                 watch.lap("looks")
-        deformation.forward()
-        trace.planned, trace.errors, trace.whole = stopping.planned_so_far, best.errors, best.whole
-        trace.kept = work.kept = best.end(work.look, trace.iterations, trace.left_out)
+        trace.take(engine.log(), views)
+        trace.planned, trace.errors = stopping.planned_so_far, best.errors
+        trace.kept = attempt.kept = best.end(iteration, trace.left_out)
+        trace.whole = best.whole
         watch.lap("end")
-        state = previous if work.kept is Candidate.STILL else self._commit(previous)
-        for end in self._hooks.end:
-            state = end(work, state)
-        found = Motion.of(deformation, best.seconds)
-        counts = [deformation.guards, self._picture.rasterizer.guards, *self._hooks.guards]
-        acted = summed([*counts, *(table.guards for table in tables)])
-        trace.guards = {name: count for name, count in acted.items() if count}
+        state = previous if trace.kept is Candidate.STILL else engine.state(learnt=trace.kept is Candidate.END)
+        views, attempt.views = self._exposed(views), self._exposed(attempt.views)
+        for part in self._parts:
+            state = part.end(attempt, state)
+        after = Motion.of(engine.tables(), self.hierarchy, best.seconds)
+        trace.guards = engine.log().guards
         watch.lap("commit")
         trace.seconds = watch.seconds
-        return UpdateResult(state, found, trace, carried=work.carried, views=views)
+        return UpdateResult(state, after, trace, carried=attempt.carried, views=self._exposed(views))
 
-    def _pictures(
-        self, views: list[TrainingView], work: Work, trace: UpdateTrace, watch: Stopwatch, left: int
-    ) -> float:
-        """Image and mask loss, the mean over the views; ``work`` gets the gradients, of a single view the buffers.
+    def _rates_of(self, options: AttemptOptions, motion: Motion | None, best: BestState) -> Rates:
+        """The rates of an attempt: as set, and by how near the motion before leads."""
+        rates = self._rates.tried(options.rates, options.rigid, options.hold_colours)
+        if motion is None:
+            return rates.cold(options.faster * self.settings.cold_start, options.several)
+        return rates.warm(best.unexplained(options.usual))
+
+    def _start(
+        self, rates: Rates, samples: Sequence[NDArray[np.int64]], gains: Array | None, watch: Stopwatch
+    ) -> AttemptStart:
+        moving, standing = rates.of_colours(self._plan.colours)
+        return AttemptStart(
+            layers=rates.layers, position=rates.position, rotation=rates.rotation, scale=rates.scale,
+            colour=moving, colour_standing=standing, beta1=rates.beta1, beta2=rates.beta2,
+            samples=samples, gains=gains, curve=self.curve, lap=watch.lap,
+        )  # fmt: skip
+
+    def _step(self, rates: Rates, iteration: int, planned: int, fade: int, samples: int) -> StepScalars:
+        """The numbers of an iteration.
 
         Args:
-            left: iterations that are planned after this one.
+            planned: iterations in all. fade: the same as it was planned one iteration before.
+            samples: number of samples of neighbourhoods.
         """
-        deformation, picture = self._deformation, self._picture
-        loss, total = 0.0, None
-        for view in views:
-            for show in self._hooks.show:
-                show(work, view)
-            found = picture.evaluate(
-                deformation.means, deformation.factors, work.previous.opacities, work.features, view, watch.lap
-            )
-            for saw in self._hooks.saw:
-                saw(work, view, picture, found)
-            loss += picture.image_part + picture.mask_part
-            trace.see(view, picture, left)
-            watch.lap(REPORT)
-            if len(views) == 1:
-                work.gradients = found
-                return loss
-            if total is None:
-                total = Gradients(*(array.copy() for array in found))
-            else:
-                for array, more in zip(total, found, strict=True):
-                    array += more
-        assert total is not None  # an iteration has a view
-        for array in total:
-            array /= len(views)
-        work.gradients = total
-        watch.lap("render backward")
-        return loss / len(views)
+        rigidity = self._plan.rigidity
+        if self._plan.rigidity_fades:  # at the end of an update positions are better known than turns
+            rigidity *= 0.5 * (1 + cos(pi * min(1.0, iteration / fade)))
+        return StepScalars(
+            resting=rates.resting(iteration, planned),
+            layers=tuple(
+                rates.factor(iteration, planned, rates.start_of(layer), rates.rest_of(layer))
+                for layer in range(len(rates.layers))
+            ),
+            own=rates.factor(iteration, planned, rates.start, 1.0),
+            colour=rates.factor(iteration, planned),
+            gloss=1 - (1 - GLOSS_END) * iteration / planned,
+            smooth_gloss=(iteration + 1) % SMOOTH_GLOSS_EVERY == 0,
+            rigidity=rigidity,
+            sample=iteration % samples,
+            keep_pictures=planned - iteration - 1 < KEPT_PICTURES,
+        )
 
-    def _commit(self, previous: Gaussians) -> Gaussians:
-        """Θ_t; the material rotation is the turn after all turns before."""
-        rows = self.hierarchy.rows
-        rotations = previous.rotations.copy()
-        turned = quaternion_products(self._deformation.turns, previous.rotations[rows])
-        rotations[rows] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
-        means, factors = self._deformation.means.copy(), self._deformation.factors.copy()
-        return previous.replace(means=means, factors=factors, rotations=rotations)
+    def _exposed(self, views: Sequence[TrainingView]) -> Sequence[TrainingView]:
+        """The views with the exposures that their cameras have now."""
+        if not self._plan.camera_gains:
+            return views
+        exposures = self._engine.exposures()
+        return [replace(view, exposure=exposures[view.name]) for view in views]
+
+
+def structure_of(hierarchy: Hierarchy, neighbours: Neighbours | None, first: Gaussians) -> Structure:
+    """What an update deforms, with the axis lengths of frame 0.
+
+    Args:
+        first: the roots, Θ_0 with all born since.
+    """
+    lengths: Array = np.sqrt(np.square(first.factors[hierarchy.rows]).sum(axis=1))
+    return Structure(hierarchy, neighbours, first.means, lengths)

@@ -1,4 +1,4 @@
-"""Rates of an update, the same on every device: what each parameter learns by, and when; Adam's step.
+"""Rates of an update, the same on every engine: how fast each parameter learns, and when.
 
 The coarse motion is found first. A layer of clusters begins once those above it have begun. Where the motion before
 leads near what a frame shows, it rests before those below it do: what it still shakes by, from view to view, would be a
@@ -11,16 +11,11 @@ from dataclasses import dataclass, replace
 from math import cos, pi
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
-from scas4d_core.guards import GuardCounts
-from scas4d_core.kernels.adam import ACTED, EVERY_ROW, adam
+from scas4d_core.engines.freedom import Freedom
+from scas4d_core.engines.plan import ColourPlan
 
 if TYPE_CHECKING:
     from scas4d_core.settings import UpdateSettings
-
-Array = NDArray[np.float32]
 
 RATE_SCALING = 0.002
 """Of c (1/m) and s of a cluster, per iteration."""
@@ -48,6 +43,10 @@ LEAST_TIME = 0.3
 NEAR = 0.6
 """Share of what changed that the motion before may leave unexplained, where layers rest. With every second frame left
 out it left about 0.55 to 1.2, and layers that always rested cost 0.6 to 3.4 dB (docs/method.md)."""
+
+
+FASTER_IN_CHANGING_LIGHT = 2.0
+"""Times the rate of static Gaussians' colours, where the light changes: 0.1 to 0.2 dB on a lamp that crosses a room."""
 
 
 def first_iteration(start: float, iterations: int) -> int:
@@ -121,6 +120,32 @@ class Rates:
         ends = (learning(self.start_of(k), self.rest_of(k), iterations).stop for k in range(len(self.rests)))
         return next((k for k, end in enumerate(ends) if iteration < end), len(self.rests))
 
+    def freed(self, freedom: Freedom) -> Rates:
+        """The rates with those of the deformation's parameters that are not free at 0.
+
+        >>> rates = Rates(((0.1, 0.2, 0.3),), position=0.4, rotation=0.5, scale=0.6, colour=0.7)
+        >>> rates.freed(Freedom(cluster_translation=True, own_scale=True))
+        Rates(layers=((0.0, 0.2, 0.0),), position=0.0, rotation=0.0, scale=0.6, colour=0.7, ...)
+        """
+        free = (freedom.cluster_rotation, freedom.cluster_translation, freedom.cluster_scaling)
+        return replace(
+            self,
+            layers=tuple((r * free[0], t * free[1], scaling * free[2]) for r, t, scaling in self.layers),
+            position=self.position * freedom.own_position,
+            rotation=self.rotation * freedom.own_rotation,
+            scale=self.scale * freedom.own_scale,
+        )
+
+    def of_colours(self, plan: ColourPlan | None) -> tuple[float, float]:
+        """Rates of the colours of moving and of static Gaussians, as a plan frees them."""
+        if plan is None:
+            return 0.0, 0.0
+        moving, standing = self.colour, self.colour_standing
+        if plan.changing_light:
+            standing = FASTER_IN_CHANGING_LIGHT * standing
+            moving = max(moving, standing)
+        return moving if plan.moving else 0.0, standing if plan.standing else 0.0
+
     def cold(self, factor: float, several: bool = False) -> Rates:
         """Without a motion to start from: layers turn and shift faster, as there is further to go.
 
@@ -187,41 +212,3 @@ def _of_layers(rests: tuple[float, ...], starts: tuple[float, ...]) -> tuple[flo
 def all_begun(settings: UpdateSettings) -> float:
     """Share of the iterations after which every layer and the Gaussians' own deltas learn."""
     return max(settings.own_start, *LAYER_STARTS)
-
-
-class Adam:
-    """Adam over one table of parameters, with a rate per column, times one per row where given.
-
-    It steps from a share ``start`` of the iterations to a share ``rest`` and leaves the table alone before and after.
-    ``guards`` counts how often each guard of the step acted.
-    """
-
-    def __init__(
-        self,
-        parameters: Array,
-        columns: list[float],
-        rates: Rates,
-        start: float = 0.0,
-        rest: float = 1.0,
-        by_row: Array = EVERY_ROW,
-    ) -> None:
-        self._parameters = parameters
-        self._by_row = by_row
-        self._first, self._second = np.zeros_like(parameters), np.zeros_like(parameters)
-        self._plan, self._start, self._rest = rates, start, rest
-        self._rates = np.array(columns, np.float32)
-        self._beta1, self._beta2 = np.float32(rates.beta1), np.float32(rates.beta2)
-        self._steps = 0
-        self.guards = GuardCounts(*ACTED)
-
-    def step(self, gradients: Array, iteration: int, iterations: int) -> None:
-        """Take the step of an iteration, counted from 0."""
-        factor = self._plan.factor(iteration, iterations, self._start, self._rest)
-        if factor == 0:
-            return
-        self._steps += 1
-        acted = adam(
-            self._parameters, gradients, self._first, self._second, self._rates * np.float32(factor), self._by_row,
-            self._beta1, self._beta2, self._steps,
-        )  # fmt: skip
-        self.guards.add(ACTED, acted)

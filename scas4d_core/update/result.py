@@ -5,22 +5,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
-from typing import NamedTuple, TypedDict
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.effects.parts import Array, Arrays
+from scas4d_core.engines.engine import REPORT, IterationLog, Thinned
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import Alarm, CameraTiming, Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.update.picture_loss import PictureLoss
+from scas4d_core.update.parts import Arrays
 from scas4d_core.update.schedule import Stopping
-from scas4d_core.update.training_view import TrainingView
 from scas4d_core.update.warm_start import Motion
-
-REPORT = "report"
-"""The stage of what an update spends on its own report: these timers, losses that nothing but the curve asks for,
-colour shifts, and assembling, writing and publishing the record."""
 
 
 class Stopwatch:
@@ -53,29 +49,6 @@ class Stopwatch:
         """Book a part of a stage to another."""
         self.seconds[stage] -= seconds
         self.seconds[other] = self.seconds.get(other, 0.0) + seconds
-
-
-SHOWN = 8
-"""Views of the last iterations whose renderings the trace keeps: what is new in a frame is seen by many cameras."""
-ROWS = 128
-"""Of such a rendering, about: of larger pictures every so many rows and columns are kept."""
-
-
-class Thinned(NamedTuple):
-    """A rendering, thinned out.
-
-    Attributes:
-        every: so many rows and columns. planes: [5, h, w] float32, RGB before the camera's exposure, label,
-            transmittance left.
-    """
-
-    every: int
-    planes: Array
-
-
-def _thinned(features: Array, rest: Array) -> Thinned:
-    every = max(1, min(rest.shape) // ROWS)
-    return Thinned(every, np.concatenate([features[:, ::every, ::every], rest[None, ::every, ::every]]))
 
 
 @dataclass(frozen=True)
@@ -152,8 +125,8 @@ class UpdateTrace:
         errors: image loss by candidate, then by probe view; empty where nothing was compared. kept: the candidate that
             became Θ_t.
         whole: whether these errors are of whole pictures.
-        shown: by camera, the renderings of the last ``SHOWN`` iterations: evidence is taken from them without another
-            rendering. Empty on other devices, and where an update ended sooner than planned.
+        shown: by camera, the renderings of the last ``engine.KEPT_PICTURES`` iterations: evidence is taken from them
+            without another rendering. Empty where an update ended sooner than planned.
         guards: those that acted, how often.
     """
 
@@ -186,20 +159,16 @@ class UpdateTrace:
         """DB of the cameras that were learnt from to the end."""
         return {name: psnr for name, psnr in self.fits.items() if name not in self.left_out}
 
-    def see(self, view: TrainingView, picture: PictureLoss, left: int) -> None:
-        """Note a view that was rendered and compared; its colour shift is evidence for gains of cameras, too.
-
-        Args:
-            left: iterations that are planned after this one.
-        """
-        self.psnr.append(picture.psnr)
-        self.first.setdefault(view.name, picture.psnr)
-        self.cameras[view.name] = camera_fit(picture.psnr, picture.colour_shift(view))
-        if left < SHOWN:
-            self.shown.pop(view.name, None)
-            self.shown[view.name] = _thinned(*picture.shown(view))
-            for name in list(self.shown)[:-SHOWN]:  # what was planned for the last iterations has become longer
-                del self.shown[name]
+    def take(self, log: IterationLog, views: Sequence[TrainingView]) -> None:
+        """Take what an engine has logged so far; colour shifts are evidence for gains of cameras, too."""
+        self.losses, self.guards = log.losses, log.guards
+        self.psnr = [rendered.psnr for rendered in log.rendered]
+        self.first, self.cameras = {}, {}
+        for rendered in log.rendered:
+            name = views[rendered.view].name
+            self.first.setdefault(name, rendered.psnr)
+            self.cameras[name] = camera_fit(rendered.psnr, rendered.colour_shift)
+        self.shown = {views[view].name: picture for view, picture in log.pictures.items()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.settings import UpdateSettings
-from scas4d_core.update.picture_loss import view_order
-from scas4d_core.update.training_view import TrainingView
 
 NEIGHBOUR_SAMPLE = 4000
 """Gaussians whose neighbours are looked at an iteration: what the neighbour terms cost does not grow with the scene."""
@@ -26,35 +24,43 @@ SOFT_COLOUR_WEIGHT = 0.01
 """Weight of the mean absolute change of the colours (Dynamic3DGaussians; the paper does not give it)."""
 
 
+def view_order(count: int, iterations: int, rng: np.random.Generator) -> Sequence[int]:
+    """The view that each iteration trains: a new random order whenever all have been used."""
+    rounds = -(-iterations // count)
+    order = np.concatenate([rng.permutation(count) for _ in range(rounds)])[:iterations]
+    return [int(index) for index in order]
+
+
 class ViewPlan:
-    """The views that each iteration trains: random rounds over all.
+    """The views that each iteration trains, by index: random rounds over all.
 
     Args:
-        each: views of an iteration. most: iterations there can be at most; the order of more begins again.
+        count: number of views. each: views of an iteration.
+        most: iterations there can be at most; the order of more begins again.
     """
 
-    def __init__(self, views: Sequence[TrainingView], each: int, most: int, rng: np.random.Generator) -> None:
-        self._views = views
-        self._order = view_order(len(views), most * each, rng)
+    def __init__(self, count: int, each: int, most: int, rng: np.random.Generator) -> None:
+        self._count = count
+        self._order = view_order(count, most * each, rng)
         self._each = each
         self._next = 0
-        self._left_out: set[str] = set()
+        self._left_out: set[int] = set()
 
-    def leave_out(self, names: Iterable[str]) -> None:
-        """These cameras have no turn any more; all of them cannot be left out."""
-        self._left_out |= set(names)
-        if all(view.name in self._left_out for view in self._views):
-            raise ValueError(f"all {len(self._views)} views are left out; an update needs one")
+    def leave_out(self, views: Iterable[int]) -> None:
+        """These views have no turn any more; all of them cannot be left out."""
+        self._left_out |= set(views)
+        if len(self._left_out) == self._count:
+            raise ValueError(f"all {self._count} views are left out; an update needs one")
 
-    def take(self) -> list[TrainingView]:
+    def take(self) -> list[int]:
         """The views of the next iteration."""
         return [self._next_view() for _ in range(self._each)]
 
-    def _next_view(self) -> TrainingView:
+    def _next_view(self) -> int:
         while True:
-            view = self._views[self._order[self._next % len(self._order)]]
+            view = self._order[self._next % len(self._order)]
             self._next += 1
-            if view.name not in self._left_out:
+            if view not in self._left_out:
                 return view
 
 

@@ -7,12 +7,12 @@ a point on a circle goes on along the circle, and so do the clusters of finer la
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.effects.freedom import Freedom
+from scas4d_core.engines.engine import Tables
+from scas4d_core.engines.freedom import Freedom
 from scas4d_core.gaussians import Gaussians, quaternion_products
 from scas4d_core.structure.hierarchy import Hierarchy
 
@@ -35,18 +35,6 @@ def rotate(r: NDArray[np.floating], vectors: NDArray[np.floating]) -> Float:
     cross = np.cross(r, vectors)
     turned: Float = vectors + 2 * (cross + np.cross(r, cross)) / (1 + np.square(r).sum(axis=1, keepdims=True))
     return turned
-
-
-class Parameters(Protocol):
-    """The parameters of a deformation, on any device.
-
-    Attributes:
-        clusters: per layer [K, 10], columns r, t, c, s. deltas: [M, 9], columns Δp, Δr, Δs.
-    """
-
-    hierarchy: Hierarchy
-    clusters: list[Array]
-    deltas: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,12 +69,11 @@ class Motion:
         )
 
     @classmethod
-    def of(cls, deformation: Parameters, seconds: float) -> Motion:
-        """Read what a deformation found. What the Gaussians of a finest cluster add in common becomes its own shift."""
-        hierarchy = deformation.hierarchy
-        turns = [values[:, :3].astype(np.float64) for values in deformation.clusters]
-        shifts = [values[:, 3:6].astype(np.float64) for values in deformation.clusters]
-        rest = deformation.deltas[:, :3].astype(np.float64)
+    def of(cls, tables: Tables, hierarchy: Hierarchy, seconds: float) -> Motion:
+        """The motion of a deformation. What the Gaussians of a finest cluster add in common becomes its own shift."""
+        turns = [values[:, :3].astype(np.float64) for values in tables.clusters]
+        shifts = [values[:, 3:6].astype(np.float64) for values in tables.clusters]
+        rest = tables.deltas[:, :3].astype(np.float64)
         if turns:
             starts = hierarchy.starts[-1]
             common = np.add.reduceat(rest, starts[:-1]) / np.diff(starts)[:, None]
@@ -101,7 +88,7 @@ class Motion:
                 turns[below] = rotate(turns[k][parents], turns[below])
                 shifts[below] = rotate(turns[k][parents], shifts[below])
             shifts[k] = rotate(turns[k], shifts[k])
-        return cls(turns, shifts, rest, deformation.deltas[:, 3:6].astype(np.float64), seconds)
+        return cls(turns, shifts, rest, tables.deltas[:, 3:6].astype(np.float64), seconds)
 
 
 def motion_between(
@@ -170,20 +157,20 @@ def predicted(motion: Motion | None, freedom: Freedom) -> Motion | None:
     )
 
 
-def warm_start(deformation: Parameters, motion: Motion | None, seconds: float, momentum: float) -> None:
-    """Set the parameters to the motion before, per unit of time; scaling (c, s) and Δs start at the identity.
+def warm_start(hierarchy: Hierarchy, motion: Motion | None, seconds: float, momentum: float) -> Tables:
+    """The motion before, per unit of time, as a start; scaling (c, s) and Δs start at the identity.
 
     Args:
-        deformation: set in place. motion: of the update before; None: no motion. seconds: since it was found.
+        motion: of the update before; None: no motion. seconds: since it was measured.
         momentum: share of what the layers leave of it that Δp and ΔR start from.
     """
-    for values in [*deformation.clusters, deformation.deltas]:
-        values[:] = 0
+    tables = Tables.still(hierarchy)
     if motion is None:
-        return
+        return tables
     share = WARM_START * min(seconds / motion.seconds, LONGEST_PREDICTION)
-    for values, turns, shifts in zip(deformation.clusters, motion.turns, motion.shifts, strict=True):
+    for values, turns, shifts in zip(tables.clusters, motion.turns, motion.shifts, strict=True):
         values[:, :3] = share * turns
         values[:, 3:6] = share * shifts
-    deformation.deltas[:, :3] = share * momentum * motion.rest
-    deformation.deltas[:, 3:6] = share * momentum * motion.own_turns
+    tables.deltas[:, :3] = share * momentum * motion.rest
+    tables.deltas[:, 3:6] = share * momentum * motion.own_turns
+    return tables

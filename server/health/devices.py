@@ -10,7 +10,7 @@ from server.problems import Problem
 
 ASK = """
 import json, sys
-from scas4d_core.torch_backend.device import DeviceError, require_device
+from scas4d_core.engines.torch.device import DeviceError, require_device
 try:
     require_device(sys.argv[1])
 except DeviceError as error:

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from client.wire import GaussianModel, GaussiansModel, part_colour, parts_model
+from scas4d_core.engines.limits import rig_limits
 from scas4d_core.errors import InputError, message_of, without_paths
-from scas4d_core.rasterize.limits import rig_limits
 from scas4d_core.storage.frame_files import frame_file
 from scas4d_core.storage.history import DamagedFrameError, History, UnreadableFrameError
 from server.processes import track_answers

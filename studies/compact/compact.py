@@ -18,10 +18,10 @@ from scas4d_core.captures import Capture
 from scas4d_core.compact import Bounds, CompactReader, CompactWriter, Head
 from scas4d_core.compact.records import Kind, scan
 from scas4d_core.compact.writer import KEY_EVERY
+from scas4d_core.engines.limits import DEFAULT, Limits, rig_limits
 from scas4d_core.errors import InputError
 from scas4d_core.gaussians import UNBORN, Gaussians, moving_extent
 from scas4d_core.query.committed import CommittedScene
-from scas4d_core.rasterize.limits import DEFAULT, Limits, rig_limits
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 

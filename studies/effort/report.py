@@ -2,7 +2,7 @@
 
 The stage ``report`` has the stage timers themselves, losses that nothing but the curve asks for, the cameras' colour
 shifts, and assembling and writing the record; publishing it, as a worker does, is timed here and belongs to it. What is
-interleaved with the iterations can be left out (``FrameUpdate.tells``): the same frames with and without it, in turns,
+interleaved with the iterations can be left out (``FrameUpdate.curve``): the same frames with and without it, in turns,
 say what it takes in all, whatever the timers say.
 """
 
@@ -20,7 +20,7 @@ import numpy as np
 from client.cli.evaluate import Report
 from client.cli.scores import Row
 from client.importers.open_source import open_source
-from scas4d_core.update.result import REPORT
+from scas4d_core.engines.engine import REPORT
 from studies.effort.effort import COUNTED_FROM, changed, leave
 from studies.frontier.timing import started
 from studies.quality.settings import settings_of
@@ -51,11 +51,11 @@ def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report
             dict(frame.images), dict(frame.masks)  # decoded before, so that both find them so
             for tells in (True, False) if index % 2 else (False, True):
                 began = time.process_time()
-                FrameUpdate.tells = tells
+                FrameUpdate.curve = tells
                 try:
                     done = scenes[tells].step(frame)
                 finally:
-                    FrameUpdate.tells = True
+                    FrameUpdate.curve = True
                 taken = time.process_time() - began
                 if index < COUNTED_FROM:
                     continue

@@ -17,13 +17,13 @@ from client.cli import pictures
 from client.importers.open_source import open_source
 from scas4d_core import metrics
 from scas4d_core.cameras import WorldFrame
+from scas4d_core.engines.limits import rig_limits
 from scas4d_core.exports.formats import FORMATS
 from scas4d_core.exports.sequence import export_sequence
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.committed import CommittedScene
 from scas4d_core.query.parts import parts
 from scas4d_core.query.ply import SH_DEGREE_0
-from scas4d_core.rasterize.limits import rig_limits
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 

@@ -35,14 +35,14 @@ Look = Callable[[int, Any, Any, Any, Any], None]
 
 
 class WatchedPictures:
-    """Stands before an update's ``PictureLoss`` and shows what it is about to render, iteration by iteration."""
+    """Stands before an update's ``CpuRenderer`` and shows what it is about to render, iteration by iteration."""
 
     def __init__(self, inner: Any, look: Look) -> None:
         self._inner, self._look = inner, look
         self._done = 0
 
     def evaluate(self, means: Any, factors: Any, opacities: Any, features: Any, *others: Any, **more: Any) -> Any:
-        """See ``PictureLoss.evaluate``."""
+        """See ``CpuRenderer.evaluate``."""
         self._look(self._done, means, factors, opacities, features)
         self._done += 1
         return self._inner.evaluate(means, factors, opacities, features, *others, **more)

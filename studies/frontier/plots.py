@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from client.cli.scores import Row
-from scas4d_core.update.result import REPORT
+from scas4d_core.engines.engine import REPORT
 from studies.frontier.frontier import DEFAULT, METHODS
 from studies.frontier.tradeoff import Point, curve, of_axis, spread, undominated
 

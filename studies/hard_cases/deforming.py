@@ -9,10 +9,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.engines.cpu.deformation import CpuDeformation
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.structure.hierarchy import Hierarchy
 from scas4d_core.structure.neighbours import Neighbours, build_neighbours
-from scas4d_core.update.deformation import CpuDeformation
 from studies.hard_cases.case import (
     CPU,
     CUDA,
@@ -104,7 +104,7 @@ class Deforming:
     def _torch(self, backend: str) -> BackendResult:
         import torch
 
-        from scas4d_core.torch_backend import deformation, losses
+        from scas4d_core.engines.torch import deformation, losses
 
         dtype = torch.float64 if backend == REFERENCE else torch.float32
         device = "cuda" if backend == CUDA else "cpu"

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 
 from scas4d_core.cameras import Camera
+from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.kernels.blend import blend
 from scas4d_core.kernels.projection import DEPTH, TILE
-from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
 from studies.hard_cases.case import CPU, BackendResult, HardCase
 from studies.hard_cases.rendering import Rendering
 

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.cameras import Camera
-from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
-from scas4d_core.rasterize.limits import DEFAULT, GSPLAT, Limits
+from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
+from scas4d_core.engines.limits import DEFAULT, GSPLAT, Limits
+from scas4d_core.engines.views import CameraArrays
 from studies.hard_cases.case import CPU, CUDA, REFERENCE, BackendResult, apart, beyond, not_finite, unexpected_counts
 
 Array = NDArray[np.float32]
@@ -85,7 +86,6 @@ class Rendering:
 
     def _torch(self, backend: str) -> BackendResult:
         import torch
-
         from scas4d_core.rasterize import cuda, twin
 
         dtype, device = (torch.float64, "cpu") if backend == REFERENCE else (torch.float32, "cuda")

@@ -163,7 +163,7 @@ def _activation(
     def in_torch() -> BackendResult:
         import torch
 
-        from scas4d_core.torch_backend.deformation import quaternion_matrices
+        from scas4d_core.engines.torch.deformation import quaternion_matrices
 
         leaf = torch.tensor(table, dtype=torch.float64, requires_grad=True)
         squares = leaf[:, 3:7].square().sum(dim=1, keepdim=True)
@@ -236,7 +236,7 @@ def _pictures(rendered: Any, target: Any, size: tuple[int, int] = (40, 37), agre
     def in_torch() -> BackendResult:
         import torch
 
-        from scas4d_core.torch_backend import losses
+        from scas4d_core.engines.torch import losses
 
         leaf = torch.tensor(image, dtype=torch.float64, requires_grad=True)
         other = torch.tensor(truth, dtype=torch.float64)

@@ -16,23 +16,25 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scas4d_core.engines.torch.device import require_device
+from scas4d_core.engines.torch.device_update import DeviceUpdate
+from scas4d_core.rasterize import cuda, twin
 from torch import Tensor
 
+from scas4d_core.engines.cpu.deformation import CpuDeformation, first_lengths
+from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
+from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.limits import GSPLAT
+from scas4d_core.engines.torch import losses
+from scas4d_core.engines.torch.deformation import ClusterParams, Deltas, Layer, deform
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.preparation import NEIGHBOURS
-from scas4d_core.rasterize import cuda, twin
-from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
-from scas4d_core.rasterize.limits import GSPLAT
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.structure.neighbours import build_neighbours
-from scas4d_core.torch_backend import losses
-from scas4d_core.torch_backend.deformation import ClusterParams, Deltas, Layer, deform
-from scas4d_core.torch_backend.device import require_device
-from scas4d_core.torch_backend.device_update import DeviceUpdate
-from scas4d_core.update.deformation import CpuDeformation, first_lengths
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
 from scas4d_core.update.result import UpdateResult
+from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import Motion
 from studies.kernels import synthetic
 from studies.machine import in_words, machine
@@ -108,7 +110,7 @@ class Bench:
             self.hierarchy, self.neighbours, first_lengths(self.hierarchy, self.before), "centred"
         )
         self._rasterizer = CpuRasterizer(GSPLAT)
-        self._picture = PictureLoss(self.factory, (0, 0, 0), 1.0, 1.0, limits=GSPLAT)
+        self._picture = CpuRenderer(self.factory, (0, 0, 0), 1.0, 1.0, limits=GSPLAT)
         self._motion = self._updated(FrameUpdate, None).motion
 
     def run(self, repeats: int = 5) -> list[Stage]:

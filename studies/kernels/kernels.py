@@ -26,10 +26,11 @@ from client.cli.evaluate import Report, peak_megabytes
 from client.cli.scores import Row
 from client.importers.open_source import open_source
 from scas4d_core.cameras import Camera, rig_inside
+from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
+from scas4d_core.engines.limits import DEFAULT, Limits, scene_limits
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels.jit import threads
-from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
-from scas4d_core.rasterize.limits import DEFAULT, Limits, scene_limits
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from scas4d_core.warm_up import warm_up_elsewhere

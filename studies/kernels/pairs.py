@@ -15,6 +15,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.kernels import lanes
 from scas4d_core.kernels.blend import BLOCK, HALF_LOG2_E
 from scas4d_core.kernels.jit import HALF, ONE, TWO, ZERO, exp, kernel, parallel_kernel
@@ -30,7 +31,6 @@ from scas4d_core.kernels.projection import (
     REACH,
     SPLAT_COLUMNS,
 )
-from scas4d_core.rasterize.limits import DEFAULT, Limits
 
 Array = NDArray[np.float32]
 

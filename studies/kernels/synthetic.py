@@ -6,8 +6,9 @@ import numpy as np
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures.frame import Frame
+from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
 
 SHIFT, TURN = np.array([0.015, 0.01, -0.01]), 0.05
 """Metres, and radians about the vertical, from the first frame to the second."""

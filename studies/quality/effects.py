@@ -108,7 +108,7 @@ def variants(names: Sequence[str], settings: Settings) -> list[Pins]:
         if name not in EFFECTS:
             raise ValueError(f"effect {name!r} is unknown; docs/effects.md lists all")
         one = effect(name)
-        modes = ("off",) if one.always(settings) else ("off", "removed", "on")
+        modes = ("off",) if not one.auto else ("off", "removed", "on")
         refused = one.refused(settings) is not None
         for mode in modes:
             contradicts = mode != "removed" and any(contradictions(pinned(settings, {name: mode})))

@@ -24,8 +24,8 @@ from scas4d_core.captures import Capture
 from scas4d_core.captures.frame import Frame
 from scas4d_core.effects.cameras.alignment import in_pixels, motion_of, offset_of
 from scas4d_core.effects.cameras.pose_drift import NAME
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.metrics.evaluation import measure_pictures
-from scas4d_core.rasterize.cpu import CameraArrays
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from studies.machine import core_version, machine

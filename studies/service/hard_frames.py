@@ -21,12 +21,12 @@ from PIL import Image
 
 from client.wire import FRAME_MEDIA_TYPE, FrameState, frame_chunks
 from scas4d_core.captures.frame import Frame
+from scas4d_core.engines.limits import rig_limits
 from scas4d_core.frame_outcome import Alarm, AlarmKind, FrameOutcome
 from scas4d_core.frame_report import FrameReport
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics import psnr
 from scas4d_core.query.committed import CommittedScene
-from scas4d_core.rasterize.limits import rig_limits
 from scas4d_core.storage.history import History
 from server.storage.layout import DataFolder
 from studies.hard_frames.footage import AnyFootage

@@ -14,8 +14,9 @@ from PIL import Image
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.compact import CompactReader
 from scas4d_core.compact.columns import Columns
-from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
-from scas4d_core.rasterize.limits import scene_limits
+from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
+from scas4d_core.engines.limits import scene_limits
+from scas4d_core.engines.views import CameraArrays
 
 ATTRIBUTES = ("means", "factors", "rotations", "colours", "foreground", "opacities", "retired", "ids")
 PRELUDE = """async ([data, order]) => {

@@ -9,8 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Camera, Rig, WorldFrame, rig_inside
 from scas4d_core.captures.frame import Frame
+from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
 
 SIDE = 0.4
 GRID = 8

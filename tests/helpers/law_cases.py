@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from scas4d_core.cameras import Camera
+from scas4d_core.engines.cpu.deformation import CpuDeformation
+from scas4d_core.engines.torch.deformation import ClusterMap, ClusterParams, Deltas, Layer
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.structure.hierarchy import Hierarchy
-from scas4d_core.torch_backend.deformation import ClusterMap, ClusterParams, Deltas, Layer
-from scas4d_core.update.deformation import CpuDeformation
 
 seeds = st.integers(0, 2**32 - 1)
 """Where numbers of a law are drawn from a generator: a failure names one integer."""

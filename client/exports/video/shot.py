@@ -79,8 +79,8 @@ class Shot:
 
     def pictures(self) -> Iterator[Picture]:
         """The pictures, [H, W, 3], one after the other; two states are in memory at once."""
+        from scas4d_core.engines.limits import DEFAULT, rig_limits
         from scas4d_core.query.view import ViewRenderer
-        from scas4d_core.rasterize.limits import DEFAULT, rig_limits
 
         head, options = self.given.head, self.options
         limits = DEFAULT if head.rig is None else rig_limits("auto", head.world, head.rig.cameras)

@@ -20,8 +20,8 @@ from scas4d_core.cameras import farthest_first
 from scas4d_core.gaussians import Gaussians
 
 if TYPE_CHECKING:
-    from scas4d_core.update.picture_loss import PictureLoss
-    from scas4d_core.update.training_view import TrainingView
+    from scas4d_core.engines.renderer import Renderer
+    from scas4d_core.engines.views import TrainingView
 
 SUBSETS = 6
 """Steps a frame, each from as many of the views as the others."""
@@ -33,22 +33,19 @@ FEW = 1.0
 
 
 def follow_pictures(
-    state: Gaussians, views: Sequence[TrainingView], picture: PictureLoss, learnt: NDArray[np.uint8]
+    state: Gaussians, views: Sequence[TrainingView], renderer: Renderer, learnt: NDArray[np.uint8]
 ) -> Gaussians:
     """The state with the colours of some Gaussians stepped to what the pictures show.
 
     Args:
-        state: as it is shown in the pictures. views: of the frame. picture: renders them.
+        state: as it is shown in the pictures. views: of the frame. renderer: draws them.
         learnt: [N] 1 for the Gaussians whose colours are stepped; the others keep theirs.
     """
-    from scas4d_core.rasterize.shading import features_seen  # it loads the kernels
-
     views = from_all_sides(views)
     for first in range(min(SUBSETS, len(views))):
         sums, weights = np.zeros((len(state), 3)), np.full(len(state), FEW)
         for view in views[first::SUBSETS]:
-            features = features_seen(state, view.camera)
-            more, seen = picture.residuals(state.means, state.factors, state.opacities, features, view, learnt, MOST)
+            more, seen = renderer.residuals(state, view, learnt, MOST)
             sums += more
             weights += seen
         step = (sums / weights[:, None]).astype(np.float32)

@@ -13,98 +13,73 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from scas4d_core.effects.effect import Effect, Group, refused_on_gpu
+from scas4d_core.effects.effect import Effect, Group
 from scas4d_core.effects.evidence import Evidence
-from scas4d_core.effects.parts import Array, Part, PartsBuilder, Work
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.update.parts import Array, Attempt, Part, PlanBuilder
 
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Seen
-    from scas4d_core.rasterize.cpu import Gradients
-    from scas4d_core.rasterize.shading import Shading
-    from scas4d_core.settings import Settings
-    from scas4d_core.update.picture_loss import PictureLoss
-    from scas4d_core.update.training_view import TrainingView
 
-RATE_GLOSS, RATE_ENVIRONMENT, RATE_NEARNESS = 2e-3, 1e-2, 1e-3
-"""Adam rates in an update, falling to a tenth; of the gloss see ``shading.gloss_rate``."""
-SMOOTH_EVERY = 10
-"""Iterations between two averages of the changes over neighbours."""
+TURNED_TOGETHER = 32
+"""Gaussians whose places tell the rotation of a normal."""
 FEW = 4
 """Views that the evidence is taken from."""
 
 
-class DirectionPart(Part):
-    """Gloss and environment as parameters of an update; does nothing in a scene whose frame 0 had neither."""
+def neighbourhood_turns(before: Array, after: Array, near: NDArray[np.int64]) -> NDArray[np.float64]:
+    """[M, 3, 3] the rotation of each Gaussian's neighbourhood between two states (Kabsch 1976).
 
-    def __init__(self, builder: PartsBuilder) -> None:
-        self._rows, self._roots = builder.hierarchy.rows, builder.first.means
-        self._shading: Shading | None = None
-        self._turns: Array
+    Normals are turned by it rather than by the rotations of single Gaussians: a normal belongs to a surface, and places
+    do not add up the errors of all frames before. On `gloss` both came out alike.
+
+    Args:
+        before, after: [N, 3] metres. near: [M, k] rows of the neighbourhood.
+    """
+    there, now = before[near].astype(np.float64), after[near].astype(np.float64)
+    there -= there.mean(axis=1, keepdims=True)
+    now -= now.mean(axis=1, keepdims=True)
+    spread = np.einsum("nki,nkj->nij", now, there)
+    spread[~np.isfinite(spread).all(axis=(1, 2))] = np.eye(3)  # such a place is held back; its neighbours keep theirs
+    left, _, right = np.linalg.svd(spread)
+    left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
+    turns: NDArray[np.float64] = left @ right
+    return turns
+
+
+def neighbourhoods(means: Array) -> NDArray[np.int64]:
+    """[N, k] the nearest of each, itself the first."""
+    count = len(means)
+    found: NDArray[np.int64] = np.asarray(cKDTree(means).query(means, min(TURNED_TOGETHER, count))[1])
+    return found.reshape(count, -1)
+
+
+class DirectionPart(Part):
+    """Turns the gloss with the deformation; does nothing in a scene whose frame 0 had none."""
+
+    def __init__(self, builder: PlanBuilder) -> None:
+        self._roots = builder.first.means
         self._near: NDArray[np.int64] | None = None
 
-    def start(self, work: Work) -> None:
-        """Takes both from Θ_{t−1}; the gloss is kept as it was turned there."""
-        from scas4d_core.rasterize.shading import Shading, gloss_rate, neighbourhoods, without_turn
-
-        state = work.previous
-        self._shading = None
-        if state.gloss is None or state.environment is None:
-            return
-        rates = (gloss_rate(RATE_GLOSS, state.gloss), RATE_ENVIRONMENT, RATE_NEARNESS)
-        self._shading = Shading(state.gloss.copy(), state.environment.copy(), rates)
-        work.gloss, work.environment = self._shading.gloss, self._shading.environment
+    def end(self, attempt: Attempt, state: Gaussians) -> Gaussians:
+        """Θ_t has the gloss turned with its neighbourhood, where it moved."""
+        if state.gloss is None or state.environment is None or attempt.kept is Candidate.STILL:
+            return state
         if self._near is None:
             self._near = neighbourhoods(self._roots[: len(state.gloss)])
-        self._turns = without_turn(len(state))
-
-    def show(self, work: Work, view: TrainingView) -> None:
-        """The colours as the view's camera sees them."""
-        if self._shading is not None:
-            self._turns[self._rows] = work.deformation.turns
-            self._shading.show(work.deformation.means, self._turns, work.colours, view.camera, work.features)
-
-    def saw(self, work: Work, view: TrainingView, picture: PictureLoss, gradients: Gradients) -> None:
-        """Turns the gradients of features into those of colours, gloss and environment."""
-        if self._shading is not None:
-            self._shading.saw(work.deformation.means, self._turns, work.colours, view.camera, gradients.features)
-
-    def step(self, work: Work, iteration: int, planned: int) -> None:
-        """Steps both; changes of the gloss are averaged over neighbours from time to time."""
-        if self._shading is not None:
-            self._shading.step(1 - 0.9 * iteration / planned)
-            if (iteration + 1) % SMOOTH_EVERY == 0:
-                self._shading.smooth(self._roots)
-
-    def end(self, work: Work, state: Gaussians) -> Gaussians:
-        """Θ_t has those of the end, where that is what is kept; the gloss is turned with its neighbourhood."""
-        if self._shading is None or self._near is None or work.kept is Candidate.STILL:
-            return state
-        from scas4d_core.rasterize.shading import neighbourhood_turns
-
-        learnt = work.kept is Candidate.END
-        gloss = self._shading.gloss if learnt else work.previous.gloss
-        assert gloss is not None
-        turns = neighbourhood_turns(work.previous.means, state.means, self._near)
-        return state.replace(
-            gloss=np.einsum("nij,nj->ni", turns, gloss).astype(np.float32),
-            environment=self._shading.environment if learnt else work.previous.environment,
-        )
+        turns = neighbourhood_turns(attempt.previous.means, state.means, self._near)
+        return state.replace(gloss=np.einsum("nij,nj->ni", turns, state.gloss).astype(np.float32))
 
 
 @dataclass(frozen=True)
 class Direction(Effect):
     """Waits for the evidence of frame 0."""
 
-    def refused(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused on a GPU, whose update does not know it."""
-        return refused_on_gpu(settings)
-
     def evidence(self, seen: Seen) -> Evidence | None:
         """The share of the squared error of a few pictures that the gloss takes away."""
-        from scas4d_core.rasterize.shading import features_seen
         from scas4d_core.update.best_state import spread
 
         if seen.before.gloss is None:
@@ -115,15 +90,14 @@ class Direction(Effect):
         for view in seen.views:
             if view.name not in chosen:
                 continue
-            for which, features in enumerate((state.features(state.colours), features_seen(state, view.camera))):
-                seen.picture.measure(state.means, state.factors, state.opacities, features, view)
-                left[which] += 10 ** (-seen.picture.psnr / 10)
+            for which, features in enumerate((state.features(state.colours), None)):
+                left[which] += 10 ** (-seen.renderer.compare(state, view, features).psnr / 10)
         share = float(max(0, 1 - left[1] / max(left[0], 1e-12)))
         return Evidence(share, f"explains {100 * share:.0f} % of the residual")
 
-    def join(self, builder: PartsBuilder) -> None:
+    def join(self, builder: PlanBuilder) -> None:
         """Adds the part; what a camera sees of what stands is another thing in each frame."""
-        builder.whole = True
+        builder.plan.whole_pictures = builder.plan.gloss = True
         builder.parts.append(DirectionPart(builder))
 
 

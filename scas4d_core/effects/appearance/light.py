@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.effects.appearance.colours import Colours
 from scas4d_core.effects.effect import Effect, Group, refused_at_zero
 from scas4d_core.effects.evidence import Evidence, Seen
-from scas4d_core.effects.parts import PartsBuilder
+from scas4d_core.update.parts import PlanBuilder
 
 if TYPE_CHECKING:
     from scas4d_core.gaussians import Gaussians
@@ -86,10 +85,10 @@ class Light(Effect):
         change = change_of_light(seen.before, seen.result.gaussians, centre)
         return Evidence(min(1.0, change), f"the light changes by {change:.1%} a frame")
 
-    def join(self, builder: PartsBuilder) -> None:
+    def join(self, builder: PlanBuilder) -> None:
         """Frees the colours that are learnt, also from a frame that is shown well enough in the light before."""
-        builder.shared(Colours).lit = True
-        builder.follows = True
+        builder.plan.learns_colours().changing_light = True
+        builder.plan.always_updates = True
 
 
 EFFECT = Light(

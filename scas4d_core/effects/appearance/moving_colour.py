@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from scas4d_core.effects.appearance.colours import Colours
 from scas4d_core.effects.effect import Effect, Group, refused_at_zero
-from scas4d_core.effects.parts import PartsBuilder
+from scas4d_core.update.parts import PlanBuilder
 
 if TYPE_CHECKING:
     from scas4d_core.settings import Settings
@@ -21,9 +20,9 @@ class MovingColour(Effect):
         """Refused with a rate of 0."""
         return refused_at_zero(settings, "rate_colour")
 
-    def join(self, builder: PartsBuilder) -> None:
+    def join(self, builder: PlanBuilder) -> None:
         """Frees their colours."""
-        builder.shared(Colours).moving = True
+        builder.plan.learns_colours().moving = True
 
 
 EFFECT = MovingColour(

@@ -13,9 +13,9 @@ import numpy as np
 
 from scas4d_core.effects.appearance.closed_form import follow_pictures
 from scas4d_core.effects.effect import Effect, Group, refused_at_zero
-from scas4d_core.effects.parts import Part, PartsBuilder, Work
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.update.parts import Attempt, Part, PlanBuilder
 
 if TYPE_CHECKING:
     from scas4d_core.settings import Settings
@@ -24,15 +24,15 @@ if TYPE_CHECKING:
 class ShadingPart(Part):
     """Steps the colours of what moves at the end of an update."""
 
-    def __init__(self, builder: PartsBuilder) -> None:
+    def __init__(self, builder: PlanBuilder) -> None:
         self._moves = np.zeros(len(builder.first), np.uint8)
         self._moves[builder.hierarchy.rows] = 1
 
-    def end(self, work: Work, state: Gaussians) -> Gaussians:
+    def end(self, attempt: Attempt, state: Gaussians) -> Gaussians:
         """Steps them, where a motion is what is kept and colours were not held."""
-        if work.kept is Candidate.STILL or work.rates.colour == 0 or not self._moves.any():
+        if attempt.kept is Candidate.STILL or attempt.rates.colour == 0 or not self._moves.any():
             return state
-        return follow_pictures(state, work.views, work.picture, self._moves)
+        return follow_pictures(state, attempt.views, attempt.renderer, self._moves)
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Shading(Effect):
         """Refused with a rate of 0."""
         return refused_at_zero(settings, "rate_colour")
 
-    def join(self, builder: PartsBuilder) -> None:
+    def join(self, builder: PlanBuilder) -> None:
         """Adds the part."""
         builder.parts.append(ShadingPart(builder))
 

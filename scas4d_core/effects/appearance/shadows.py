@@ -13,17 +13,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.effects.appearance.closed_form import follow_pictures
-from scas4d_core.effects.effect import Effect, Group, refused_at_zero, refused_on_gpu
+from scas4d_core.effects.effect import Effect, Group, refused_at_zero
 from scas4d_core.effects.evidence import Evidence
-from scas4d_core.effects.parts import Array, Arrays, Part, PartsBuilder, Work
+from scas4d_core.engines.renderer import BLOCK
+from scas4d_core.engines.views import SIDE
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.update.parts import Array, Arrays, Attempt, Part, PlanBuilder
 
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Seen
+    from scas4d_core.engines.renderer import Renderer
+    from scas4d_core.engines.views import TrainingView
     from scas4d_core.settings import Settings
-    from scas4d_core.update.picture_loss import PictureLoss
-    from scas4d_core.update.training_view import TrainingView
 
 NAME = "shadows"
 CHANGED = 0.02
@@ -40,22 +42,22 @@ STANDS = 0.05
 class ShadowsPart(Part):
     """Steps the colours of what stands at the end of an update."""
 
-    def __init__(self, builder: PartsBuilder) -> None:
+    def __init__(self, builder: PlanBuilder) -> None:
         self._stands = np.ones(len(builder.first), np.uint8)
         self._stands[builder.hierarchy.rows] = 0
 
-    def end(self, work: Work, state: Gaussians) -> Gaussians:
+    def end(self, attempt: Attempt, state: Gaussians) -> Gaussians:
         """Steps them, where the end of the update is what is kept."""
-        if work.kept is not Candidate.END or not self._stands.any() or work.rates.colour_standing == 0:
+        if attempt.kept is not Candidate.END or not self._stands.any() or attempt.rates.colour_standing == 0:
             return state
-        before: Arrays = work.carried.get(NAME, {})
-        known = [view for view in work.views if view.name in before]
+        before: Arrays = attempt.carried.get(NAME, {})
+        known = [view for view in attempt.views if view.name in before]
         if len(known) < ENOUGH * len(before):
             return state
-        compared = [_compared(before[view.name], view, state, work.picture) for view in known]
+        compared = [_compared(before[view.name], view, state, attempt.renderer) for view in known]
         if sum((squares & stands).sum() for squares, stands in compared) <= HARDLY * sum(s.sum() for _, s in compared):
             return state
-        return follow_pictures(state, known, work.picture, self._stands)
+        return follow_pictures(state, known, attempt.renderer, self._stands)
 
 
 @dataclass(frozen=True)
@@ -63,8 +65,8 @@ class Shadows(Effect):
     """A closed-form step of the colours of what stands."""
 
     def refused(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused with a rate of 0, and on a GPU, whose update does not know it: there colours follow in iterations."""
-        return refused_at_zero(settings, "rate_colour_standing") or refused_on_gpu(settings)
+        """Refused with a rate of 0."""
+        return refused_at_zero(settings, "rate_colour_standing")
 
     def began(self, seen: Seen) -> Arrays | None:
         """[h, w, 4] float16 of each view: mean colours of squares, and 1 where what moves reaches."""
@@ -76,7 +78,7 @@ class Shadows(Effect):
         for view in seen.views:
             means = _means(view)
             # Where all seems to move, as without masks, it is not known yet what stands.
-            hidden = _hidden(view, state, seen.picture) if stands else np.zeros(means.shape[:2])
+            hidden = _hidden(view, state, seen.renderer) if stands else np.zeros(means.shape[:2])
             found[view.name] = np.concatenate([means, hidden[..., None]], axis=-1).astype(np.float16)
         return found
 
@@ -92,7 +94,7 @@ class Shadows(Effect):
         changed = compared = 0
         for view in seen.views:
             if view.name in before:
-                squares, stands = _compared(before[view.name], view, seen.result.gaussians, seen.picture)
+                squares, stands = _compared(before[view.name], view, seen.result.gaussians, seen.renderer)
                 changed += int((squares & stands).sum())
                 compared += int(stands.sum())
         if not before:
@@ -102,7 +104,7 @@ class Shadows(Effect):
         share = changed / compared
         return Evidence(share, f"{100 * share:.0f} % of what stands looks other than in frame 0")
 
-    def join(self, builder: PartsBuilder) -> None:
+    def join(self, builder: PlanBuilder) -> None:
         """Adds the part."""
         builder.parts.append(ShadowsPart(builder))
 
@@ -114,23 +116,18 @@ def _means(view: TrainingView) -> Array:
 
 
 def _compared(
-    before: NDArray[Any], view: TrainingView, state: Gaussians, picture: PictureLoss
+    before: NDArray[Any], view: TrainingView, state: Gaussians, renderer: Renderer
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """[h, w] squares that look other than before, and those that what moves reaches neither then nor now."""
     changed: NDArray[np.bool_] = np.abs(_means(view) - before[..., :3].astype(np.float32)).max(axis=-1) >= CHANGED
-    return changed, (before[..., 3] == 0) & ~_hidden(view, state, picture)
+    return changed, (before[..., 3] == 0) & ~_hidden(view, state, renderer)
 
 
-def _hidden(view: TrainingView, state: Gaussians, picture: PictureLoss) -> NDArray[np.bool_]:
+def _hidden(view: TrainingView, state: Gaussians, renderer: Renderer) -> NDArray[np.bool_]:
     """[h, w] squares that what moves reaches."""
-    from scas4d_core.rasterize.blocks import BLOCK, as_grid  # these load the kernels
-    from scas4d_core.update.changed_pixels import reached
-    from scas4d_core.update.training_view import SIDE
-
-    given = (state.means, state.factors, state.opacities, np.zeros((len(state), 4), np.float32))
-    blocks = reached(picture.rasterizer, given, np.flatnonzero(state.moving), view.camera)
     height, width, each = view.target.shape[1] // SIDE, view.target.shape[2] // SIDE, SIDE // BLOCK
-    grid = as_grid(blocks, view.camera)[: height * each, : width * each]
+    blocks = renderer.reached(state, np.flatnonzero(state.moving), view.camera)
+    grid = blocks[: height * each, : width * each]
     return np.asarray(grid.reshape(height, each, width, each).any(axis=(1, 3)))
 
 

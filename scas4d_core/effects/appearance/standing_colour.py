@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from scas4d_core.effects.appearance.colours import Colours
 from scas4d_core.effects.effect import Effect, Group, refused_at_zero
-from scas4d_core.effects.parts import PartsBuilder
+from scas4d_core.update.parts import PlanBuilder
 
 if TYPE_CHECKING:
     from scas4d_core.settings import Settings
@@ -17,24 +16,20 @@ if TYPE_CHECKING:
 class StandingColour(Effect):
     """RGB of the Gaussians that stand, at the rate ``rate_colour_standing``."""
 
-    def always(self, settings: Settings) -> bool:
-        """On a GPU, whose update knows no shadows; elsewhere only where it is pinned."""
-        return settings.device != "cpu"
-
     def refused(self, settings: Settings) -> tuple[str, str] | None:
         """Refused with a rate of 0."""
         return refused_at_zero(settings, "rate_colour_standing")
 
-    def join(self, builder: PartsBuilder) -> None:
+    def join(self, builder: PlanBuilder) -> None:
         """Frees their colours."""
-        builder.shared(Colours).standing = True
-        builder.whole = True
+        builder.plan.learns_colours().standing = True
+        builder.plan.whole_pictures = True
 
 
 EFFECT = StandingColour(
     name="standing_colour",
     group=Group.APPEARANCE,
-    says="The colours of what stands follow the pictures in every iteration: on a GPU, and where it is pinned on.",
+    says="The colours of what stands follow the pictures in every iteration, where it is pinned on.",
     gauge="The mean absolute change of all colours is a term: what moves or a gain explains is not put into colours.",
     cost="whole pictures are rendered, and one step of Adam over RGB an iteration",
     auto=True,

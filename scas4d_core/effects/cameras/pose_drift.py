@@ -39,15 +39,15 @@ from scas4d_core.effects.cameras.alignment import (
     turn_equations,
     twist_equations,
 )
-from scas4d_core.effects.effect import Effect, Group, refused_on_gpu
+from scas4d_core.effects.effect import Effect, Group
 from scas4d_core.effects.evidence import Evidence
-from scas4d_core.effects.parts import Arrays, PartsBuilder
+from scas4d_core.engines.views import LABEL
 from scas4d_core.frame_outcome import Candidate
+from scas4d_core.update.parts import Arrays, PlanBuilder
 
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Seen
-    from scas4d_core.settings import Settings
-    from scas4d_core.update.training_view import TrainingView
+    from scas4d_core.engines.views import TrainingView
 
 NAME = "pose_drift"
 CAMERAS = 4
@@ -210,10 +210,6 @@ def centred(twists: Double, rig: Rig, believed: NDArray[np.bool_]) -> Double:
 class PoseDrift(Effect):
     """Poses that follow the pictures, once a frame."""
 
-    def refused(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused where another device renders: the evidence is taken from the CPU's renderings."""
-        return refused_on_gpu(settings)
-
     def noted(self, seen: Seen, on: bool) -> Arrays | None:
         """What each camera is off by; where it is on, the poses of the frames after."""
         if not _says(seen):
@@ -255,7 +251,7 @@ class PoseDrift(Effect):
         size = float(np.linalg.norm(poses.offsets[row]))
         return Evidence(float(shares[row]), f"camera {seen.rig.names[row]} is off by {size:.1f} pixels")
 
-    def join(self, builder: PartsBuilder) -> None:
+    def join(self, builder: PlanBuilder) -> None:
         """Adds nothing: updates know nothing of it, for the poses are those of their views."""
 
 
@@ -297,11 +293,8 @@ def _exposed(view: TrainingView, shown: Array) -> Array:
 
 def _rendered(seen: Seen, view: TrainingView) -> tuple[Array, Array]:
     """[3, H, W] as a view is rendered, without its exposure, and [H, W] metres along z; NaN where nothing is."""
-    from scas4d_core.rasterize.shading import features_seen  # it loads the kernels
-    from scas4d_core.update.picture_loss import LABEL
-
     state = seen.result.gaussians
-    planes, rest = seen.picture.render(state, features_seen(state, view.camera), view, LABEL)
+    planes, rest = seen.renderer.render(state, view.camera, depth_channel=LABEL)
     alpha = 1 - rest
     depth = np.where(alpha > COVERED, planes[LABEL] / np.maximum(alpha, np.float32(COVERED)), np.float32(np.nan))
     return planes[:3].copy(), depth

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from scas4d_core.effects.effect import Effect, Group, refused_at_zero
-from scas4d_core.effects.parts import PartsBuilder
+from scas4d_core.update.parts import PlanBuilder
 
 if TYPE_CHECKING:
     from scas4d_core.settings import Settings
@@ -20,9 +20,9 @@ class AxisLength(Effect):
         """Refused with a weight of 0."""
         return refused_at_zero(settings, "weights.scale")
 
-    def join(self, builder: PartsBuilder) -> None:
-        """The cascade's backward has the term in itself: it gets the weight."""
-        builder.length = builder.update.weights.scale
+    def join(self, builder: PlanBuilder) -> None:
+        """Adds the term, with its weight."""
+        builder.plan.axis_length = builder.update.weights.scale
 
 
 EFFECT = AxisLength(

@@ -12,17 +12,15 @@ its motion is no turn. Joints are few among the patches, and what is met badly m
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import cos, pi
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
 from scas4d_core.effects.effect import Effect, Group, refused_at_zero
 from scas4d_core.effects.evidence import Evidence, Seen
-from scas4d_core.effects.parts import Part, PartsBuilder, Work
+from scas4d_core.update.parts import PlanBuilder
 
 if TYPE_CHECKING:
     from scas4d_core.gaussians import Gaussians
@@ -89,23 +87,6 @@ def bend(before: Gaussians, after: Gaussians) -> float | None:
     return float(np.median(angles - rest))
 
 
-class Bends(Part):
-    """Lets rigidity fall along an update: at its end the positions know better than the turns."""
-
-    known_to_devices = True  # where no update calls it, rigidity keeps its weight
-
-    def __init__(self, terms: NeighbourTerms) -> None:
-        self._terms, self._rigidity = terms, terms.strengths[0]
-
-    def start(self, work: Work) -> None:
-        """Rigidity as it is set."""
-        self._terms.strengths[0] = self._rigidity
-
-    def step(self, work: Work, iteration: int, planned: int) -> None:
-        """Its share in the next iteration, half a cosine from 1 to 0."""
-        self._terms.strengths[0] = self._rigidity * 0.5 * (1 + cos(pi * min(1.0, (iteration + 1) / planned)))
-
-
 @dataclass(frozen=True)
 class Bending(Effect):
     """Turns that are free of one another."""
@@ -125,12 +106,10 @@ class Bending(Effect):
         angle = max(0.0, angle)
         return Evidence(min(1.0, angle), f"neighbourhoods turn {np.degrees(angle):.1f}° a frame unlike each other")
 
-    def join(self, builder: PartsBuilder) -> None:
-        """Leaves out the term of rotation; on a GPU rigidity keeps its weight."""
-        terms = builder.shared(NeighbourTerms)
-        terms.strengths[2] = 0.0
-        if terms.strengths[0]:
-            builder.parts.append(Bends(terms))
+    def join(self, builder: PlanBuilder) -> None:
+        """Leaves out the term of rotation, and lets rigidity fall along an update."""
+        builder.plan.neighbour_terms, builder.plan.rotation = True, 0.0
+        builder.plan.rigidity_fades = builder.plan.rigidity > 0
 
 
 EFFECT = Bending(

@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
 from scas4d_core.effects.effect import Effect, Group, refused_at_zero
-from scas4d_core.effects.parts import PartsBuilder
+from scas4d_core.update.parts import PlanBuilder
 
 if TYPE_CHECKING:
     from scas4d_core.settings import Settings
@@ -21,9 +20,10 @@ class Isometry(Effect):
         """Refused with a weight of 0."""
         return refused_at_zero(settings, "weights.isometry")
 
-    def join(self, builder: PartsBuilder) -> None:
-        """Adds its strength to the terms between neighbours."""
-        builder.shared(NeighbourTerms).strengths[1] = builder.update.weights.isometry
+    def join(self, builder: PlanBuilder) -> None:
+        """Adds the term, with its weight."""
+        builder.plan.neighbour_terms = True
+        builder.plan.isometry = builder.update.weights.isometry
 
 
 EFFECT = Isometry(

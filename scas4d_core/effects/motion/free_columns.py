@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from scas4d_core.effects.effect import Effect, effect
-from scas4d_core.effects.parts import PartsBuilder
+from scas4d_core.update.parts import PlanBuilder
 
 if TYPE_CHECKING:
     from scas4d_core.settings import Settings
@@ -29,7 +29,7 @@ def may_be_on(name: str, settings: Settings) -> bool:
 
 @dataclass(frozen=True)
 class FreeColumns(Effect):
-    """An effect that frees the parameters of its name (``freedom.Freedom``)."""
+    """An effect that frees the parameters of its name (``engines.freedom.Freedom``)."""
 
     def needed(self, settings: Settings) -> tuple[str, str] | None:
         """Refused where nothing at all could move."""
@@ -37,9 +37,9 @@ class FreeColumns(Effect):
             return None
         return "no motion of clusters and of Gaussians is left", f"leave one of {', '.join(MOVES)} 'auto'"
 
-    def join(self, builder: PartsBuilder) -> None:
+    def join(self, builder: PlanBuilder) -> None:
         """Frees them."""
-        builder.freedom = replace(builder.freedom, **{self.name: True})
+        builder.plan.freedom = replace(builder.plan.freedom, **{self.name: True})
 
 
 @dataclass(frozen=True)

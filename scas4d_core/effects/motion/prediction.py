@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from scas4d_core.effects.effect import Effect, Group
-from scas4d_core.effects.parts import PartsBuilder
+from scas4d_core.update.parts import PlanBuilder
 
 if TYPE_CHECKING:
     from scas4d_core.settings import Settings
@@ -30,9 +30,9 @@ class Prediction(Effect):
             return None
         return f"{' and '.join(carried)} are 'off'", "leave one of them 'auto'"
 
-    def join(self, builder: PartsBuilder) -> None:
+    def join(self, builder: PlanBuilder) -> None:
         """Lets the update start from the motion before."""
-        builder.freedom = replace(builder.freedom, prediction=True)
+        builder.plan.freedom = replace(builder.plan.freedom, prediction=True)
 
 
 EFFECT = Prediction(

@@ -11,14 +11,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.effects.parts import Part, PartsBuilder, Work
 from scas4d_core.effects.presence.carving import Hull, carve_new
 from scas4d_core.effects.presence.novelty import novelties
+from scas4d_core.update.parts import Attempt, Part, PlanBuilder
 
 if TYPE_CHECKING:
-    from scas4d_core.effects.parts import Arrays
     from scas4d_core.gaussians import Gaussians
-    from scas4d_core.update.picture_loss import PictureLoss
+    from scas4d_core.update.parts import Arrays
 
 Float = NDArray[np.float64]
 
@@ -37,40 +36,24 @@ class Catching(Part):
             ("places", [T, 3] metres).
     """
 
-    def __init__(self, builder: PartsBuilder, name: str) -> None:
-        self._hierarchy, self._factory, self._scene, self._name = (
-            builder.hierarchy,
-            builder.factory,
-            builder.scene,
-            name,
-        )
-        self._picture: PictureLoss | None = None
+    def __init__(self, builder: PlanBuilder, name: str) -> None:
+        self._hierarchy, self._factory, self._name = builder.hierarchy, builder.factory, name
 
-    def start(self, work: Work) -> None:
-        """Finds each young thing in the pictures of the frame."""
-        arrays = work.carried.get(self._name)
-        if arrays is None or not len(arrays["young"]) or not self._hierarchy.sizes:
+    def begin(self, attempt: Attempt) -> None:
+        """Locates each thing that was born in the frame before in the pictures of this frame."""
+        arrays = attempt.carried.get(self._name)
+        if arrays is None or not len(arrays["young"]) or not attempt.tables.clusters:
             return
-        rest = work.previous.retire(arrays["young"])
-        rig = self._factory.posed
-        hull = carve_new(novelties(rest, rest.colours, work.views, rig, self._renderer()))
-        thing = np.full(len(work.previous), -1)
+        rest = attempt.previous.retire(arrays["young"])
+        hull = carve_new(novelties(rest, rest.colours, attempt.views, self._factory.posed, attempt.renderer))
+        thing = np.full(len(attempt.previous), -1)
         thing[arrays["young"]] = arrays["thing"]
         of_entries, labels = thing[self._hierarchy.rows], self._hierarchy.labels[0]
         counts = np.bincount(labels)
         for number, way in _ways(hull, arrays).items():
-            way = way - _gone(work.previous, arrays, number)
+            way = way - _gone(attempt.previous, arrays, number)
             own = np.bincount(labels, weights=of_entries == number, minlength=len(counts)) > OWN * counts
-            work.deformation.clusters[0][own, 3:6] = way
-
-    def _renderer(self) -> PictureLoss:
-        if self._picture is None:
-            from scas4d_core.rasterize.limits import scene_limits
-            from scas4d_core.update.picture_loss import PictureLoss
-
-            limits = scene_limits(self._scene.near, self._factory.rig.radius)
-            self._picture = PictureLoss(self._factory, self._scene.behind, 1.0, 0.0, limits=limits)
-        return self._picture
+            attempt.tables.clusters[0][own, 3:6] = way
 
 
 def _gone(state: Gaussians, arrays: Arrays, number: int) -> Float:

@@ -12,17 +12,17 @@ from scipy.spatial import cKDTree
 
 from scas4d_core.effects.effect import Effect, Group
 from scas4d_core.effects.evidence import Evidence
-from scas4d_core.effects.parts import Arrays
 from scas4d_core.effects.presence.carving import Hull, carve_new, footprint
 from scas4d_core.effects.presence.catching import Catching
 from scas4d_core.effects.presence.novelty import Novelty, glance, said
 from scas4d_core.effects.presence.returning import returned, revived
 from scas4d_core.first_frame.points.posed_pictures import pixels_inside
+from scas4d_core.update.parts import Arrays
 
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Seen
-    from scas4d_core.effects.parts import PartsBuilder
     from scas4d_core.gaussians import Gaussians
+    from scas4d_core.update.parts import PlanBuilder
     from scas4d_core.update.result import UpdateResult
 
 Bool = NDArray[np.bool_]
@@ -176,7 +176,7 @@ class Entering(Effect):
         young = left["age"] < SETTLED
         settling = left["rows"][young & state.present[left["rows"]]]
         if len(settling):
-            state = settled(state, settling, seen.views, seen.rig, seen.picture, rng, seen.time)
+            state = settled(state, settling, seen.views, seen.rig, seen.renderer, rng, seen.time)
         arrays = {**left, **{name: NOBODY[name] for name in OF_THE_YOUNG}, "age": left["age"] + 1}
         joins = result.joins
         grown_up = left["rows"][(left["age"] == SETTLED) & state.present[left["rows"]]]
@@ -184,7 +184,7 @@ class Entering(Effect):
             denied = _denied(said(seen, seen.views), state.means[grown_up].astype(np.float64))
             state = state.retire(grown_up[denied]) if denied.any() else state
         if found is not None and state.retired.any():
-            back = returned(found.seen, found.hull, state, seen.picture)
+            back = returned(found.seen, found.hull, state, seen.renderer)
             if back:
                 state = revived(state, back)
                 arrays |= _remembered(found, state, np.concatenate([one.rows for one in back]), arrays)
@@ -195,7 +195,7 @@ class Entering(Effect):
             found = found if len(points) else None
         born = None
         if found is not None:
-            given = seen.views, seen.rig, seen.picture, rng
+            given = seen.views, seen.rig, seen.renderer, rng
             born = grown(state, points, colours, *given, moves=True, time=seen.time)
         if found is not None and born is not None:
             rows = np.arange(len(state), len(state) + len(born))
@@ -207,7 +207,7 @@ class Entering(Effect):
             return result
         return replace(result, gaussians=state, joins=joins, carried={**result.carried, NAME: arrays})
 
-    def join(self, builder: PartsBuilder) -> None:
+    def join(self, builder: PlanBuilder) -> None:
         """Adds the search for what was born in the frame before."""
         builder.parts.append(Catching(builder, NAME))
 

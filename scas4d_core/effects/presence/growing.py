@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from scas4d_core.cameras import Camera, Rig
     from scas4d_core.effects.evidence import FitTime
     from scas4d_core.effects.presence.novelty import Novelty
+    from scas4d_core.engines.cpu.renderer import CpuRenderer
+    from scas4d_core.engines.views import TrainingView
     from scas4d_core.gaussians import Gaussians
-    from scas4d_core.update.picture_loss import PictureLoss
-    from scas4d_core.update.training_view import TrainingView
 
 Array = NDArray[np.float32]
 Float = NDArray[np.float64]
@@ -70,7 +70,7 @@ def grown(
     colours: Array,
     views: Sequence[TrainingView],
     rig: Rig,
-    picture: PictureLoss,
+    picture: CpuRenderer,
     rng: np.random.Generator,
     *,
     moves: bool,
@@ -100,7 +100,7 @@ def settled(
     rows: Int,
     views: Sequence[TrainingView],
     rig: Rig,
-    picture: PictureLoss,
+    picture: CpuRenderer,
     rng: np.random.Generator,
     time: FitTime,
 ) -> Gaussians:
@@ -160,13 +160,13 @@ class _Fit:
     """Fits the rows of a table of parameters (``kernels.activation``) beside a state that stays as it is."""
 
     def __init__(
-        self, state: Gaussians, parameters: Array, views: Sequence[TrainingView], rig: Rig, picture: PictureLoss
+        self, state: Gaussians, parameters: Array, views: Sequence[TrainingView], rig: Rig, picture: CpuRenderer
     ) -> None:
-        from scas4d_core.update.picture_loss import ViewFactory
+        from scas4d_core.update.view_factory import ViewFactory
 
         self._parameters, self._radius = parameters, rig.radius
         factory = ViewFactory(rig)
-        self._picture = picture.apart(factory)
+        self._picture = picture.apart()
         self._crops = []
         for view in views:
             box = _box(rig[view.name], parameters[:, :3].astype(np.float64))
@@ -175,7 +175,7 @@ class _Fit:
                 self._crops.append(self._crop(state, rows, factory.cropped(view, *box)))
 
     def _crop(self, state: Gaussians, rows: Int, view: TrainingView) -> _Crop:
-        from scas4d_core.rasterize.shading import features_seen  # it loads the kernels
+        from scas4d_core.engines.cpu.gloss import features_seen  # it loads the kernels
 
         n = len(rows)
         count = n + len(self._parameters)
@@ -206,8 +206,7 @@ class _Fit:
         from scas4d_core.first_frame import initial_gaussians as columns
         from scas4d_core.kernels import activation
         from scas4d_core.kernels.adam import EVERY_ROW, adam
-        from scas4d_core.update.picture_loss import view_order
-        from scas4d_core.update.schedule import PROBE, Stopping
+        from scas4d_core.update.schedule import PROBE, Stopping, view_order
 
         if not self._crops or not len(self._parameters):
             return True

@@ -19,7 +19,7 @@ from scas4d_core.gaussians import Gaussians, moving_extent
 if TYPE_CHECKING:
     from scas4d_core.cameras import Rig
     from scas4d_core.effects.evidence import Seen
-    from scas4d_core.effects.parts import Arrays, PartsBuilder
+    from scas4d_core.update.parts import Arrays, PlanBuilder
     from scas4d_core.update.result import UpdateResult
 
 NAME = "leaving"
@@ -88,7 +88,7 @@ class Leaving(Effect):
         carried = {**seen.result.carried, NAME: arrays}
         return replace(seen.result, gaussians=state.retire(gone) if gone.any() else state, carried=carried)
 
-    def join(self, builder: PartsBuilder) -> None:
+    def join(self, builder: PlanBuilder) -> None:
         """Adds nothing: retirements come after the update of a frame."""
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from scas4d_core.effects.effect import Effect, Group
-from scas4d_core.effects.parts import PartsBuilder
+from scas4d_core.update.parts import PlanBuilder
 
 if TYPE_CHECKING:
     from scas4d_core.settings import Settings
@@ -25,11 +25,11 @@ class MaskTerm(Effect):
             return None
         return "update.weights.mask and update.weights.mask_alone are 0", "give one of them a weight above 0"
 
-    def join(self, builder: PartsBuilder) -> None:
-        """The comparison of pictures has the term in itself: it gets the weight."""
+    def join(self, builder: PlanBuilder) -> None:
+        """Adds the term, with its weight."""
         from scas4d_core.update.schedule import mask_weight  # it loads the kernels
 
-        builder.mask = mask_weight(builder.update, len(builder.hierarchy.rows), int(builder.first.present.sum()))
+        builder.plan.mask = mask_weight(builder.update, len(builder.hierarchy.rows), int(builder.first.present.sum()))
 
 
 EFFECT = MaskTerm(

@@ -8,16 +8,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from scas4d_core.effects.effect import Effect, Group
-from scas4d_core.effects.parts import PartsBuilder
+from scas4d_core.update.parts import PlanBuilder
 
 
 @dataclass(frozen=True)
 class MotionLabels(Effect):
     """Labels from motion, in scenes without masks."""
 
-    def join(self, builder: PartsBuilder) -> None:
+    def join(self, builder: PlanBuilder) -> None:
         """Asks for them."""
-        builder.learns_labels = True
+        builder.plan.learns_labels = True
 
 
 EFFECT = MotionLabels(

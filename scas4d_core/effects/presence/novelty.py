@@ -21,10 +21,10 @@ from scas4d_core.frame_outcome import Candidate
 if TYPE_CHECKING:
     from scas4d_core.cameras import Camera, Rig
     from scas4d_core.effects.evidence import Seen
+    from scas4d_core.engines.engine import Thinned
+    from scas4d_core.engines.renderer import Renderer
+    from scas4d_core.engines.views import TrainingView
     from scas4d_core.gaussians import Gaussians
-    from scas4d_core.update.picture_loss import PictureLoss
-    from scas4d_core.update.result import Thinned, UpdateTrace
-    from scas4d_core.update.training_view import TrainingView
 
 Bool = NDArray[np.bool_]
 Array = NDArray[np.float32]
@@ -152,7 +152,7 @@ def said(seen: Seen, views: Sequence[TrainingView]) -> list[Novelty]:
     missing = [view for view in views if view.name not in known or known[view.name].view is not view]
     colours = state.colours.copy()
     colours[: len(seen.before)] = seen.before.colours
-    found = novelties(state, colours, missing, seen.rig, seen.picture)
+    found = novelties(state, colours, missing, seen.rig, seen.renderer)
     known.update({view.name: one for view, one in zip(missing, found, strict=True)})
     return [known[view.name] for view in views]
 
@@ -162,7 +162,7 @@ def novelties(
     colours: Array,
     views: Sequence[TrainingView],
     rig: Rig | Mapping[str, Camera],
-    picture: PictureLoss,
+    renderer: Renderer,
 ) -> list[Novelty]:
     """What each view says against a state.
 
@@ -170,14 +170,12 @@ def novelties(
         state: Θ_t, updated to the frame. colours: [N, 3] RGB to render: of the frame before, so that what is new has
             not been painted on what stands. views: of the frame.
     """
-    from scas4d_core.rasterize.shading import features_seen  # it loads the kernels
-
     shown = state.replace(colours=colours)
-    return [_novelty(state, features_seen(shown, view.camera), view, rig[view.name], picture) for view in views]
+    return [_novelty(shown, view, rig[view.name], renderer) for view in views]
 
 
-def _novelty(state: Gaussians, features: Array, view: TrainingView, camera: Camera, picture: PictureLoss) -> Novelty:
-    planes, rest = picture.render(state, features, view)
+def _novelty(state: Gaussians, view: TrainingView, camera: Camera, renderer: Renderer) -> Novelty:
+    planes, rest = renderer.render(state, view.camera)
     gain, offset = view.exposure[:3, 0, None, None], view.exposure[:3, 1, None, None]
     difference: Array = view.target[:3] - (gain * planes[:3] + offset)
     label = planes[3]

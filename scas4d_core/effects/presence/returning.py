@@ -15,7 +15,7 @@ from scas4d_core.gaussians import Gaussians
 
 if TYPE_CHECKING:
     from scas4d_core.effects.presence.novelty import Novelty
-    from scas4d_core.update.picture_loss import PictureLoss
+    from scas4d_core.engines.renderer import Renderer
 
 Float = NDArray[np.float64]
 
@@ -41,11 +41,11 @@ class Returned(NamedTuple):
     shift: Float
 
 
-def returned(seen: Sequence[Novelty], hull: Hull, state: Gaussians, picture: PictureLoss) -> list[Returned]:
+def returned(seen: Sequence[Novelty], hull: Hull, state: Gaussians, renderer: Renderer) -> list[Returned]:
     """What of the retired explains things that are new; they are shown as they were, moved to the hull's middle.
 
     Args:
-        seen: what the cameras say. hull: of what is new. state: Θ_t. picture: renders.
+        seen: what the cameras say. hull: of what is new. state: Θ_t. renderer: draws.
     """
     retired = np.flatnonzero(state.retired & (state.foreground > 0.5))
     found: list[Returned] = []
@@ -59,7 +59,7 @@ def returned(seen: Sequence[Novelty], hull: Hull, state: Gaussians, picture: Pic
             if taken or not 1 / ALIKE <= _size(means) / _size(points) <= ALIKE:
                 continue
             shift = points.mean(axis=0) - means.mean(axis=0)
-            left = _left(seen, points, hull.voxel, revived(state, [Returned(int(thing), own, shift)]), picture)
+            left = _left(seen, points, hull.voxel, revived(state, [Returned(int(thing), own, shift)]), renderer)
             if left < 1 - EXPLAINS and (best is None or left < best[0]):
                 best = left, Returned(int(thing), own, shift)
         if best is not None:
@@ -98,13 +98,13 @@ def _groups(means: Float, apart: float) -> list[NDArray[np.int64]]:
     return [np.flatnonzero(numbers == number) for number in np.unique(numbers)]
 
 
-def _left(seen: Sequence[Novelty], points: Float, voxel: float, state: Gaussians, picture: PictureLoss) -> float:
+def _left(seen: Sequence[Novelty], points: Float, voxel: float, state: Gaussians, renderer: Renderer) -> float:
     """Share of the squared error at a thing that is left with a state."""
     before = after = 0.0
     for one in seen:
         where = one.new & footprint(one, points, voxel)
         if where.any():
-            now = novelties(state, state.colours, [one.view], {one.view.name: one.camera}, picture)[0]
+            now = novelties(state, state.colours, [one.view], {one.view.name: one.camera}, renderer)[0]
             before += float(one.error[where].sum())
             after += float(now.error[where].sum())
     return after / before if before > 0 else 1.0

@@ -16,8 +16,8 @@ from scas4d_core.effects.presence.uncovering import Uncovered, uncovered
 
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Seen
-    from scas4d_core.effects.parts import Arrays, PartsBuilder
     from scas4d_core.gaussians import Gaussians
+    from scas4d_core.update.parts import Arrays, PlanBuilder
     from scas4d_core.update.result import UpdateResult
 
 NAME = "uncovered"
@@ -51,7 +51,7 @@ def _looked_for(seen: Seen, glanced: int) -> Found | None:
     if sum(one.bare.sum() >= SMALLEST * one.bare.size for one in glance(seen, glanced, bare=SMALLEST)) < glanced:
         return None
     everyone = said(seen, seen.views)
-    found = uncovered(everyone, seen.result.gaussians, seen.picture)
+    found = uncovered(everyone, seen.result.gaussians, seen.renderer)
     if not len(found.points):
         return None
     total = sum(float(one.error.sum()) for one in everyone)
@@ -86,7 +86,7 @@ class UncoveredEffect(Effect):
             return result
         if len(some) > most:
             some = np.sort(rng.choice(some, most, replace=False))
-        given = seen.views, seen.rig, seen.picture, rng
+        given = seen.views, seen.rig, seen.renderer, rng
         born = grown(state, points.points[some], points.colours[some], *given, moves=False, time=seen.time)
         if born is None:
             return result
@@ -100,7 +100,7 @@ class UncoveredEffect(Effect):
             carried={**result.carried, NAME: arrays},
         )
 
-    def join(self, builder: PartsBuilder) -> None:
+    def join(self, builder: PlanBuilder) -> None:
         """Adds nothing: births come after the update of a frame."""
 
 

@@ -18,8 +18,8 @@ from scas4d_core.first_frame.points.posed_pictures import pixels_inside
 
 if TYPE_CHECKING:
     from scas4d_core.effects.presence.novelty import Novelty
+    from scas4d_core.engines.renderer import Renderer
     from scas4d_core.gaussians import Gaussians
-    from scas4d_core.update.picture_loss import PictureLoss
 
 Array = NDArray[np.float32]
 Float = NDArray[np.float64]
@@ -54,14 +54,14 @@ class Uncovered:
     spacing: float
 
 
-def uncovered(seen: Sequence[Novelty], state: Gaussians, picture: PictureLoss) -> Uncovered:
+def uncovered(seen: Sequence[Novelty], state: Gaussians, renderer: Renderer) -> Uncovered:
     """Points in the bare regions of all cameras.
 
     Args:
-        seen: what the cameras say. state: Θ_t. picture: renders.
+        seen: what the cameras say. state: Θ_t. renderer: draws.
     """
     standing = state.retire(state.moving)
-    found = [_points(one, standing, picture) for one in seen if one.bare.any()]
+    found = [_points(one, standing, renderer) for one in seen if one.bare.any()]
     points = np.concatenate(found) if found else np.zeros((0, 3))
     if not len(points):
         return Uncovered(points, np.zeros((0, 3), np.float32), 0.0)
@@ -76,10 +76,10 @@ def uncovered(seen: Sequence[Novelty], state: Gaussians, picture: PictureLoss) -
     return Uncovered(points[agreed], colours[agreed], cell)
 
 
-def _points(one: Novelty, standing: Gaussians, picture: PictureLoss) -> Float:
+def _points(one: Novelty, standing: Gaussians, renderer: Renderer) -> Float:
     """[P, 3] points of a camera's bare pixels."""
     features = np.zeros((len(standing), 4), np.float32)
-    planes, rest = picture.render(standing, features, one.view, depth_channel=0)
+    planes, rest = renderer.render(standing, one.view.camera, features, depth_channel=0)
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = (1 - rest) / planes[0]
     known = (rest < OPAQUE) & one.behind & np.isfinite(inverse)

@@ -1,84 +1,76 @@
-"""The free columns of a deformation's tables, and Adam's step over them.
-
-A column that is not free is in no optimizer: it has no moments, takes no step and stays as it is.
-"""
+"""Adam over the parameters of an update: one table of them, or the free columns of one."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.effects.freedom import Freedom
 from scas4d_core.guards import GuardCounts
-from scas4d_core.update.deformation import CpuDeformation
-from scas4d_core.update.rates import Adam, Rates
+from scas4d_core.kernels.adam import ACTED, EVERY_ROW, adam
 
 Array = NDArray[np.float32]
 
 
-def freed(rates: Rates, freedom: Freedom) -> Rates:
-    """The rates with those of the deformation's parameters that are not free at 0.
-
-    >>> rates = Rates(((0.1, 0.2, 0.3),), position=0.4, rotation=0.5, scale=0.6, colour=0.7)
-    >>> freed(rates, Freedom(cluster_translation=True, own_scale=True))
-    Rates(layers=((0.0, 0.2, 0.0),), position=0.0, rotation=0.0, scale=0.6, colour=0.7, ...)
-    """
-    free = (freedom.cluster_rotation, freedom.cluster_translation, freedom.cluster_scaling)
-    return replace(
-        rates,
-        layers=tuple((r * free[0], t * free[1], scaling * free[2]) for r, t, scaling in rates.layers),
-        position=rates.position * freedom.own_position,
-        rotation=rates.rotation * freedom.own_rotation,
-        scale=rates.scale * freedom.own_scale,
-    )
-
-
-class FreeTable:
-    """The columns of one table of parameters whose rate is above 0, with their moments, which start at zero.
+class Adam:
+    """Adam over one table of parameters, with a rate for each column, times one for each row where given.
 
     Args:
-        table, gradients: [n, columns]; the table is stepped in place, and by nobody else. columns: rate of each column.
-        plan: of the rates. start, rest: shares of the iterations after which it begins, and rests.
+        parameters: [n, columns] float32; stepped in place. columns: rate of each column.
+        betas: decays of the two moments, which start at zero. by_row: [n] factor on the rates of each row.
 
     Attributes:
-        guards: of its steps.
+        guards: how often each guard of a step acted.
     """
 
     def __init__(
-        self,
-        table: Array,
-        gradients: Array,
-        columns: Sequence[float],
-        plan: Rates,
-        start: float = 0.0,
-        rest: float = 1.0,
+        self, parameters: Array, columns: Sequence[float], betas: tuple[float, float], by_row: Array = EVERY_ROW
     ) -> None:
-        self._table, self._gradients = table, gradients
+        self._parameters = parameters
+        self._by_row = by_row
+        self._first, self._second = np.zeros_like(parameters), np.zeros_like(parameters)
+        self._rates = np.array(columns, np.float32)
+        self._beta1, self._beta2 = np.float32(betas[0]), np.float32(betas[1])
+        self._steps = 0
+        self.guards = GuardCounts(*ACTED)
+
+    def step(self, gradients: Array, factor: float) -> None:
+        """Take a step.
+
+        Args:
+            gradients: [n, columns]. factor: on all rates; 0 takes no step and leaves the moments.
+        """
+        if factor == 0:
+            return
+        self._steps += 1
+        acted = adam(
+            self._parameters, gradients, self._first, self._second, self._rates * np.float32(factor), self._by_row,
+            self._beta1, self._beta2, self._steps,
+        )  # fmt: skip
+        self.guards.add(ACTED, acted)
+
+
+class FreeColumns:
+    """Adam over the columns of a table whose rate is above 0; the others have no moments and stay as they are.
+
+    Args:
+        table: [n, columns]; the table is stepped in place, and by nobody else. columns: rate of each column, one of
+            them above 0. betas: see ``Adam``.
+    """
+
+    def __init__(self, table: Array, columns: Sequence[float], betas: tuple[float, float]) -> None:
+        self._table = table
         self._free = np.flatnonzero(columns)
-        whole = len(self._free) == len(columns)
-        # A copy in rows: the kernel is compiled for these.
-        self._values = table if whole else np.take(table, self._free, axis=1)
-        self._adam = Adam(self._values, [rate for rate in columns if rate], plan, start, rest)
+        # The kernel is compiled for contiguous rows, so some columns are stepped in a copy.
+        self._values = table if len(self._free) == len(columns) else np.take(table, self._free, axis=1)
+        self._adam = Adam(self._values, [rate for rate in columns if rate], betas)
         self.guards: GuardCounts = self._adam.guards
 
-    def step(self, iteration: int, planned: int) -> None:
-        """Take the step of an iteration, counted from 0."""
+    def step(self, gradients: Array, factor: float) -> None:
+        """Take a step; see ``Adam.step``."""
         if self._values is self._table:
-            self._adam.step(self._gradients, iteration, planned)
+            self._adam.step(gradients, factor)
             return
-        self._adam.step(np.take(self._gradients, self._free, axis=1), iteration, planned)
+        self._adam.step(np.take(gradients, self._free, axis=1), factor)
         self._table[:, self._free] = self._values
-
-
-def free_tables(deformation: CpuDeformation, rates: Rates) -> list[FreeTable]:
-    """One per table that has a free column: each layer of clusters, the Gaussians' own deltas."""
-    columns = [[r] * 3 + [t] * 3 + [scaling] * 4 for r, t, scaling in rates.layers]
-    columns.append([rates.position] * 3 + [rates.rotation] * 3 + [rates.scale] * 3)
-    times = [(rates.start_of(layer), rates.rest_of(layer)) for layer in range(len(rates.layers))] + [(rates.start, 1.0)]
-    tables = [*deformation.clusters, deformation.deltas]
-    gradients = [*deformation.cluster_gradients, deformation.delta_gradients]
-    given = zip(tables, gradients, columns, times, strict=True)
-    return [FreeTable(table, g, rate, rates, *time) for table, g, rate, time in given if any(rate)]

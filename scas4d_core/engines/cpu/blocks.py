@@ -5,16 +5,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.engines.renderer import BLOCK
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.kernels.projection import TILE
-from scas4d_core.rasterize.cpu import CameraArrays
 
-BLOCK = 4
-"""Pixels of a block's side."""
+
+def tile_grid(camera: CameraArrays) -> tuple[int, int]:
+    """Columns and rows of the tiles of a camera's picture."""
+    return -(-camera.width // TILE), -(-camera.height // TILE)
 
 
 def as_grid(blocks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.bool_]:
     """[rows, columns] of blocks, from bits 8 x + y of each tile."""
-    tiles_x, tiles_y = camera.tiles
+    tiles_x, tiles_y = tile_grid(camera)
     side = TILE // BLOCK
     bits = np.unpackbits(blocks.astype("<u8").view(np.uint8).reshape(-1, 8), axis=1, bitorder="little")
     grid = bits.reshape(tiles_y, tiles_x, side, side).transpose(0, 3, 1, 2)
@@ -29,7 +32,7 @@ def pixels_of(blocks: NDArray[np.uint64], camera: CameraArrays) -> NDArray[np.bo
 
 def as_blocks(grid: NDArray[np.bool_], camera: CameraArrays) -> NDArray[np.uint64]:
     """[tiles] bits, from a grid of blocks."""
-    tiles_x, tiles_y = camera.tiles
+    tiles_x, tiles_y = tile_grid(camera)
     side = TILE // BLOCK
     bits = grid.reshape(tiles_y, side, tiles_x, side).transpose(0, 2, 3, 1).reshape(-1, side * side)
     packed = np.packbits(bits, axis=1, bitorder="little")

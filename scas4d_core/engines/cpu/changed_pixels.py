@@ -17,14 +17,16 @@ from math import log10
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.engines.cpu.blocks import pixels_of, tile_grid, widened
+from scas4d_core.engines.cpu.gloss import features_seen
+from scas4d_core.engines.cpu.rasterizer import Drawing
+from scas4d_core.engines.cpu.renderer import CpuRenderer, blocks_of, forget_moments, no_lap
+from scas4d_core.engines.limits import DEFAULT, Limits
+from scas4d_core.engines.renderer import Gradients, Picture
+from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView, means
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import SMALLEST_SQUARE
 from scas4d_core.kernels import image_loss, lanes, tiles
-from scas4d_core.rasterize.blocks import pixels_of, widened
-from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Drawing, Gradients, Picture
-from scas4d_core.rasterize.limits import DEFAULT, Limits
-from scas4d_core.update.picture_loss import LABEL, PictureLoss, ViewFactory, no_lap
-from scas4d_core.update.training_view import TrainingView, means
 
 Array = NDArray[np.float32]
 State = tuple[Array, Array, Array, Array]
@@ -65,18 +67,17 @@ class Region:
     rest: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
 
-class ChangedPixels(PictureLoss):
-    """A ``PictureLoss`` for states in which nothing but the moving Gaussians changes while ``begin`` is not called.
+class ChangedPixels(CpuRenderer):
+    """A ``CpuRenderer`` for states of which nothing but the moving Gaussians changes between two ``load_state``.
 
     The gradients of standing Gaussians are 0.
 
     Args:
-        moving: [M] int64 rows that move. count: N. The others are those of ``PictureLoss``.
+        moving: [M] int64 rows that move. count: N. The others are those of ``CpuRenderer``.
     """
 
     def __init__(
         self,
-        factory: ViewFactory,
         background: tuple[float, float, float],
         image_weight: float,
         mask_weight: float,
@@ -84,7 +85,7 @@ class ChangedPixels(PictureLoss):
         count: int,
         limits: Limits = DEFAULT,
     ) -> None:
-        super().__init__(factory, background, image_weight, mask_weight, limits=limits)
+        super().__init__(background, image_weight, mask_weight, limits=limits)
         self._moving = np.sort(moving)
         self._moves = np.zeros(count, bool)
         self._moves[moving] = True
@@ -96,11 +97,11 @@ class ChangedPixels(PictureLoss):
         self._base_means: dict[tuple[str, int, int], NDArray[np.float64]] = {}
         self._regions: dict[tuple[str, int, int], Region] = {}
         self._gradients: Gradients | None = None
-        self._scratch, self._planes = np.empty(0, np.float32), np.empty(0, np.float32)
+        self._box_scratch, self._planes = np.empty(0, np.float32), np.empty(0, np.float32)
         self._shown_mean = np.zeros(3)
 
-    def begin(self, previous: Gaussians) -> None:
-        """Takes the state that a frame starts from; what stood otherwise before is rendered anew."""
+    def load_state(self, previous: Gaussians) -> None:
+        """Take the state that a frame starts from; static Gaussians that differ from those before are drawn anew."""
         features = previous.features(previous.colours)
         state = taken((previous.means, previous.factors, previous.opacities, features), self._standing)
         if self._stood is None or not all(map(np.array_equal, state, self._stood)):
@@ -117,7 +118,7 @@ class ChangedPixels(PictureLoss):
         view: TrainingView,
         lap: Callable[[str], None] = no_lap,
     ) -> Gradients:
-        """Renders what changed; sets the losses and ``psnr`` of the whole picture; see ``PictureLoss``."""
+        """Renders what changed; sets the losses and ``psnr`` of the whole picture; see ``CpuRenderer``."""
         region = self._drawn((means, factors, opacities, features), view)
         lap("render")
         self._compare_box(region, view)
@@ -137,26 +138,20 @@ class ChangedPixels(PictureLoss):
         self._compare_box(region, view)
 
     def residuals(
-        self,
-        means: Array,
-        factors: Array,
-        opacities: Array,
-        features: Array,
-        view: TrainingView,
-        learnt: NDArray[np.uint8],
-        most: float,
+        self, state: Gaussians, view: TrainingView, learnt: NDArray[np.uint8], most: float
     ) -> tuple[Array, Array]:
-        """See ``PictureLoss``; of what moves, from the pixels alone that it reaches."""
+        """See ``Renderer.residuals``; of moving Gaussians, from the pixels alone that they reach."""
         if not np.array_equal(learnt, self._moves):
-            return super().residuals(means, factors, opacities, features, view, learnt, most)
-        region = self._drawn((means, factors, opacities, features), view)
-        sums, weights = np.zeros((len(means), 3), np.float32), np.zeros(len(means), np.float32)
+            return super().residuals(state, view, learnt, most)
+        count, shown = len(state), features_seen(state, view.camera)
+        region = self._drawn((state.means, state.factors, state.opacities, shown), view)
+        sums, weights = np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
         found = self._lacking(view, most)
         sums[self._moving], weights[self._moving] = found[0][region.moving], found[1][region.moving]
         return sums, weights
 
     def shown(self, view: TrainingView) -> Picture:
-        """See ``PictureLoss``."""
+        """See ``CpuRenderer``."""
         drawn, shown = self.rasterizer.picture, pixels_of(self.rasterizer.drawn, view.camera)
         whole = Picture(self._base(view).copy(), self._base_rests[_key(view)].copy())
         for plane, new in zip((*whole.features, whole.rest), (*drawn.features, drawn.rest), strict=True):
@@ -164,7 +159,7 @@ class ChangedPixels(PictureLoss):
         return whole
 
     def colour_shift(self, view: TrainingView) -> tuple[float, float, float]:
-        """See ``PictureLoss``."""
+        """See ``CpuRenderer``."""
         shown = view.exposure[:3, 0] * self._shown_mean + view.exposure[:3, 1]
         red, green, blue = (view.mean - shown).tolist()
         return red, green, blue
@@ -185,7 +180,7 @@ class ChangedPixels(PictureLoss):
             region = self._regions[key] = self._made(self._marks(state, view.camera) | region.blocks, view)
 
     def _marks(self, state: State, camera: CameraArrays) -> NDArray[np.uint64]:
-        return reached(self.rasterizer, state, self._moving, camera)
+        return blocks_of(self.rasterizer, *taken(state, self._moving), camera)
 
     def _made(self, marks: NDArray[np.uint64], view: TrainingView) -> Region:
         """A region around marks, with those of the standing Gaussians that meet it."""
@@ -193,7 +188,7 @@ class ChangedPixels(PictureLoss):
         blocks, camera = widened(marks, view.camera, MARGIN), view.camera
         splats, rects, _ = self.rasterizer.project(*self._stood, camera)
         meets = np.empty(len(self._standing), bool)
-        tiles.find_meeting(splats, rects, camera.tiles[0], blocks, meets)
+        tiles.find_meeting(splats, rects, tile_grid(camera)[0], blocks, meets)
         rows = np.sort(np.concatenate([self._moving, self._standing[meets]]))
         learnt, shown = self._moves[rows].astype(np.uint8), pixels_of(blocks, camera)
         box = _box(shown)
@@ -206,10 +201,11 @@ class ChangedPixels(PictureLoss):
         base = self._base(view)
         where = (slice(None), *region.box)
         region.view, region.target = view, np.ascontiguousarray(view.target[where])
-        region.moments = (np.ascontiguousarray(view.moments[0][where]), np.ascontiguousarray(view.moments[1][where]))
+        whole = self._moments(view)
+        region.moments = np.ascontiguousarray(whole[0][where]), np.ascontiguousarray(whole[1][where])
         wanted = _around(region.box, region.near, view.camera.height, view.camera.width)
-        region.rest = self._losses(base, view, view.target, view.moments, wanted, base)
-        view.__dict__.pop("moments", None)  # those of the box are kept, and nobody needs both
+        region.rest = self._losses(base, view, view.target, whole, wanted, base)
+        forget_moments(view)  # those of the box are kept, and nobody needs both
 
     def _base(self, view: TrainingView) -> Array:
         """[4, H, W] of what stands alone."""
@@ -227,7 +223,7 @@ class ChangedPixels(PictureLoss):
         base, (rows, columns) = self._base(view), region.box
         box = (rows.start, rows.stop, columns.start, columns.stop)
         part, g_part = self._part(len(base), box)
-        drawn, tiles_x = self.rasterizer.drawn, view.camera.tiles[0]
+        drawn, tiles_x = self.rasterizer.drawn, tile_grid(view.camera)[0]
         shifts = np.zeros(len(base))
         tiles.take_blocks(self.rasterizer.planes, base, drawn, tiles_x, box, part, shifts)
         sums = region.rest + self._losses(part, view, region.target, region.moments, region.near, g_part)
@@ -274,9 +270,9 @@ class ChangedPixels(PictureLoss):
         """Scratch of the image loss for a box, its border 0."""
         shape = (6, channels, height + 2 * image_loss.REACH, image_loss.stride(width))
         size = int(np.prod(shape))
-        if self._scratch.size < size:
-            self._scratch = np.empty(size + size // 4, np.float32)
-        scratch: Array = self._scratch[:size].reshape(shape)
+        if self._box_scratch.size < size:
+            self._box_scratch = np.empty(size + size // 4, np.float32)
+        scratch: Array = self._box_scratch[:size].reshape(shape)
         scratch[:, :, : image_loss.REACH] = 0
         scratch[:, :, -image_loss.REACH :] = 0
         return scratch
@@ -286,17 +282,6 @@ def taken(state: State, rows: NDArray[np.int64]) -> State:
     """The rows of a state's arrays."""
     one, two, three, four = (np.take(array, rows, axis=0) for array in state)
     return one, two, three, four
-
-
-def reached(
-    rasterizer: CpuRasterizer, state: State, rows: NDArray[np.int64], camera: CameraArrays
-) -> NDArray[np.uint64]:
-    """[tiles] blocks of a picture that the supports of some Gaussians meet."""
-    splats, rects, _ = rasterizer.project(*taken(state, rows), camera)
-    tiles_x, tiles_y = camera.tiles
-    marks = np.zeros(tiles_x * tiles_y, np.uint64)
-    tiles.mark_blocks(splats, rects, np.ones(len(rects), np.uint8), tiles_x, marks)
-    return marks
 
 
 def _key(view: TrainingView) -> tuple[str, int, int]:

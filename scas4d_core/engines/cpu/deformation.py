@@ -1,6 +1,6 @@
 """D_t on the CPU: the parameters of one frame's deformation, and the fused kernels that apply and differentiate it.
 
-Twin: ``deformation``. Buffers are allocated once per hierarchy.
+Reference: ``engines.torch.deformation``. Buffers are allocated once per hierarchy.
 
 A Gaussian that is not finite when an update starts is held back: it stays as it is, weighs nothing in the pivots of its
 clusters and in the neighbour terms, and is counted.
@@ -25,28 +25,13 @@ from scas4d_core.structure.neighbours import Neighbours
 
 Array = NDArray[np.float32]
 
-MAX_SCALE = 0.02
-"""Metres; longer axes are held at their length of frame 0 (paper, scale loss)."""
-
-
-def first_lengths(hierarchy: Hierarchy, first: Gaussians) -> Array:
-    """[M, 3] metres, lengths of the moving Gaussians' axes at frame 0, which the scale loss lets them have."""
-    lengths: Array = np.sqrt(np.square(first.factors[hierarchy.rows]).sum(axis=1))
-    return lengths
-
-
-def length_bounds(hierarchy: Hierarchy, first: Gaussians) -> Array:
-    """[M, 3] metres, the length that each axis may have before the scale loss."""
-    bounds: Array = np.maximum(first_lengths(hierarchy, first), np.float32(MAX_SCALE))
-    return bounds
-
 
 class CpuDeformation:
     """The cascade of a hierarchy, what each Gaussian adds, and the terms that tie neighbours together.
 
     Args:
-        bounds: [M, 3] metres, see ``length_bounds``. cluster_map, covariance: see
-            ``deformation``.
+        bounds: [M, 3] metres, see ``Structure.length_bounds``. cluster_map, covariance: see
+            ``engines.torch.deformation``.
 
     Attributes:
         clusters: per layer [K, 10], columns r, t, c, s. deltas: [M, 9], columns Δp, Δr, Δs.

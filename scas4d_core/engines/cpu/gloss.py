@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.rasterize.cpu import CameraArrays
 
 Array = NDArray[np.float32]
 
@@ -23,20 +23,14 @@ RATE_GLOSS, RATE_ENVIRONMENT, RATE_NEARNESS = 1e-3, 2e-2, 5e-3
 """Adam rates in frame 0; that of the gloss at a strength of ``GLOSS`` (``gloss_rate``). Gloss that each Gaussian learns
 fast explains one camera's highlight by itself: on `gloss` test pictures lost 0.6 dB at 5e-3 for strengths and 3e-3 for
 normals."""
+UPDATE_RATE_GLOSS, UPDATE_RATE_ENVIRONMENT, UPDATE_RATE_NEARNESS = 2e-3, 1e-2, 1e-3
+"""The same in an update, where they fall to a tenth."""
 NEARNESS = 0.3
 """1/m, of the environment before any is learnt: lamps of a room."""
 NEIGHBOURS = 16
 """Over so many the changes of normals and strengths are averaged: a surface bends slowly, a highlight is small."""
-TURNED_TOGETHER = 32
-"""Gaussians whose places tell the rotation of a normal."""
 SAME_SIDE = 0.5
 """Cosine between normals above which neighbours are of one surface."""
-
-
-def camera_centre(camera: CameraArrays) -> Array:
-    """[3] where a camera stands."""
-    centre: Array = -(camera.pose[:, :3].T @ camera.pose[:, 3])
-    return centre
 
 
 def without_turn(count: int) -> Array:
@@ -64,7 +58,7 @@ def colours_seen(gaussians: Gaussians, camera: CameraArrays, turns: Array | None
     shown = np.empty((len(gaussians), 4), np.float32)
     shade(
         gaussians.means, gaussians.gloss, without_turn(len(gaussians)) if turns is None else turns, gaussians.colours,
-        gaussians.environment, camera_centre(camera), shown,
+        gaussians.environment, camera.centre, shown,
     )  # fmt: skip
     return np.ascontiguousarray(shown[:, :3])
 
@@ -121,12 +115,12 @@ class Shading:
 
     def show(self, means: Array, turns: Array, colours: Array, camera: CameraArrays, features: Array) -> None:
         """Fills RGB of ``features`` [N, 4] as a camera sees them."""
-        self._kernel.shade(means, self.gloss, turns, colours, self.environment, camera_centre(camera), features)
+        self._kernel.shade(means, self.gloss, turns, colours, self.environment, camera.centre, features)
 
     def saw(self, means: Array, turns: Array, colours: Array, camera: CameraArrays, g_features: Array) -> None:
         """Turns the gradient of the features into that of the colours, and keeps what is its own."""
         g_environment = self._kernel.shade_backward(
-            means, self.gloss, turns, colours, self.environment, camera_centre(camera), g_features, self._turned
+            means, self.gloss, turns, colours, self.environment, camera.centre, g_features, self._turned
         )
         self._gradients[0][:] += self._turned
         self._gradients[1][:] += g_environment
@@ -180,33 +174,6 @@ class Shading:
         self.gloss[:] = self.changed_from + np.einsum("nkc,nk->nc", change, weights)
 
 
-def neighbourhood_turns(before: Array, after: Array, near: NDArray[np.int64]) -> NDArray[np.float64]:
-    """[M, 3, 3] the rotation of each Gaussian's neighbourhood between two states (Kabsch 1976).
-
-    Normals are turned by it rather than by the rotations of single Gaussians: a normal belongs to a surface, and places
-    do not add up the errors of all frames before. On `gloss` both came out alike.
-
-    Args:
-        before, after: [N, 3] metres. near: [M, k] rows of the neighbourhood.
-    """
-    there, now = before[near].astype(np.float64), after[near].astype(np.float64)
-    there -= there.mean(axis=1, keepdims=True)
-    now -= now.mean(axis=1, keepdims=True)
-    spread = np.einsum("nki,nkj->nij", now, there)
-    spread[~np.isfinite(spread).all(axis=(1, 2))] = np.eye(3)  # such a place is held back; its neighbours keep theirs
-    left, _, right = np.linalg.svd(spread)
-    left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
-    turns: NDArray[np.float64] = left @ right
-    return turns
-
-
-def neighbourhoods(means: Array) -> NDArray[np.int64]:
-    """[N, k] the nearest of each, itself the first."""
-    count = len(means)
-    found: NDArray[np.int64] = np.asarray(cKDTree(means).query(means, min(TURNED_TOGETHER, count))[1])
-    return found.reshape(count, -1)
-
-
 def _cell_areas(side: int) -> Array:
     """[side²] share of the sphere of each cell of an octahedral map; sums to 1."""
     u, v = np.meshgrid(*[np.linspace(-1, 1, side)] * 2)
@@ -219,3 +186,42 @@ def _cell_areas(side: int) -> Array:
     area[:, [0, -1]] /= 2
     shares: Array = (area / area.sum()).astype(np.float32).ravel()
     return shares
+
+
+class LearntGloss:
+    """Gloss and environment as parameters of an attempt, and the turns by which normals follow the deformation.
+
+    Args:
+        gloss, environment: of Θ_{t−1}; the gloss is kept as it was turned there. count: N.
+        rows: [M] the moving Gaussians. roots: [N, 3] metres, places in frame 0, which give the neighbours.
+    """
+
+    def __init__(self, gloss: Array, environment: Array, count: int, rows: NDArray[np.int64], roots: Array) -> None:
+        rates = (gloss_rate(UPDATE_RATE_GLOSS, gloss), UPDATE_RATE_ENVIRONMENT, UPDATE_RATE_NEARNESS)
+        self._shading = Shading(gloss.copy(), environment.copy(), rates)
+        self._turns, self._rows, self._roots = without_turn(count), rows, roots
+
+    @property
+    def gloss(self) -> Array:
+        """[M, 3] as learnt so far, not yet turned."""
+        return self._shading.gloss
+
+    @property
+    def environment(self) -> Array:
+        """The environment as learnt so far."""
+        return self._shading.environment
+
+    def show(self, means: Array, turns: Array, colours: Array, camera: CameraArrays, features: Array) -> None:
+        """Fill RGB of ``features`` [N, 4] as a camera sees them; ``turns`` [M, 4] of the moving Gaussians."""
+        self._turns[self._rows] = turns
+        self._shading.show(means, self._turns, colours, camera, features)
+
+    def carry_back(self, means: Array, colours: Array, camera: CameraArrays, g_features: Array) -> None:
+        """Turn gradients of features into those of colours, in place, and keep those of gloss and environment."""
+        self._shading.saw(means, self._turns, colours, camera, g_features)
+
+    def step(self, factor: float, smooth: bool) -> None:
+        """Step both; ``smooth`` averages the changes of the gloss over neighbours afterwards."""
+        self._shading.step(factor)
+        if smooth:
+            self._shading.smooth(self._roots)

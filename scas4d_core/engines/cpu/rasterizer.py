@@ -1,7 +1,7 @@
 """The CPU rasterizer: projection, depth order, tile lists, blending, and the backward of all of them.
 
 Buffers are allocated once and grow only; forward and backward of the same view share them. Results do not depend
-on the number of threads. Twin: ``rasterize.twin``.
+on the number of threads. Reference: ``engines.torch.rasterizer``.
 
 A Gaussian that is not finite, or so large that its footprint overflows, is left out of the picture and its gradients
 are 0; so are gradients that overflow. ``CpuRasterizer.guards`` counts them.
@@ -15,61 +15,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.cameras import Camera
+from scas4d_core.engines.cpu.blocks import tile_grid
+from scas4d_core.engines.limits import DEFAULT, Limits
+from scas4d_core.engines.renderer import Gradients, Picture
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.guards import GuardCounts
 from scas4d_core.kernels import blend as blend_kernels
 from scas4d_core.kernels import feature_gradients, projection, tiles
 from scas4d_core.kernels.jit import threads
-from scas4d_core.rasterize.limits import DEFAULT, Limits
+from scas4d_core.kernels.projection import TILE
 
 Array = NDArray[np.float32]
-TILE = projection.TILE
-
-
-class CameraArrays(NamedTuple):
-    """A camera as kernels read it: ``pose`` [3, 4] and ``lens`` [6] (fx, fy, cx, cy, width, height), float32."""
-
-    pose: Array
-    lens: Array
-    width: int
-    height: int
-
-    @classmethod
-    def of(cls, camera: Camera) -> CameraArrays:
-        """From a ``Camera`` of the inside world."""
-        pose = np.ascontiguousarray(camera.world_to_camera[:3], dtype=np.float32)
-        lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height], dtype=np.float32)
-        return cls(pose, lens, camera.width, camera.height)
-
-    @property
-    def tiles(self) -> tuple[int, int]:
-        """Columns and rows of tiles."""
-        return -(-self.width // TILE), -(-self.height // TILE)
-
-
-class Picture(NamedTuple):
-    """Result of a forward pass: views into the rasterizer's buffers, valid until the next forward pass.
-
-    Attributes:
-        features: [C, H, W] float32. rest: [H, W] float32, transmittance left (alpha = 1 − rest).
-    """
-
-    features: Array
-    rest: Array
-
-
-class Gradients(NamedTuple):
-    """Result of a backward pass: views into the rasterizer's buffers, valid until the next; culled Gaussians have 0.
-
-    Attributes:
-        means: [N, 3]. factors: [N, 3, 3]. opacities: [N]. features: [N, C]. screen: [N, 2] of the projected means.
-    """
-
-    means: Array
-    factors: Array
-    opacities: Array
-    features: Array
-    screen: Array
 
 
 class Drawing(NamedTuple):
@@ -116,6 +72,7 @@ class CpuRasterizer:
         escaped: whether a Gaussian that is learnt reached a block that the last forward pass did not draw.
         drawn: [tiles] uint64, the blocks that it drew.
 
+    >>> from scas4d_core.cameras import Camera
     >>> from scas4d_core.gaussians import Gaussians
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
     >>> camera = Camera("front", [[100, 0, 8], [0, 100, 8], [0, 0, 1]], np.eye(4), 16, 16)
@@ -200,7 +157,7 @@ class CpuRasterizer:
             drawing: what is drawn; None: the whole picture.
         """
         count, channels = features.shape
-        width, height, (tiles_x, tiles_y) = camera.width, camera.height, camera.tiles
+        width, height, (tiles_x, tiles_y) = camera.width, camera.height, tile_grid(camera)
         if depth_channel >= 0:
             features[:, depth_channel] = 0
         splats, rects, counts = self.project(means, factors, opacities, features, camera)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from scas4d_core.engines.torch.deformation import quaternion_matrices
 from scas4d_core.kernels.appearance.direction import CELLS, DARK, DULL, FALL, MIDDLE, NEARNESS, OVER, SHEEN, SIDE
-from scas4d_core.torch_backend.deformation import quaternion_matrices
 
 
 def shade(means: Tensor, gloss: Tensor, turns: Tensor, colours: Tensor, environment: Tensor, centre: Tensor) -> Tensor:

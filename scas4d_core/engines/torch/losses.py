@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from scas4d_core.engines.torch.deformation import quaternion_matrices
 from scas4d_core.guards import ROOT_FLOOR, SMALLEST_SQUARE, SSIM_C1, SSIM_C2
-from scas4d_core.torch_backend.deformation import quaternion_matrices
 
 SSIM_WINDOW = 11
 """Pixels across the Gaussian window (Wang et al. 2004)."""

@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from scas4d_core.cameras import Camera
+from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.guards import FEATURE_CEILING, NOT_FINITE
-from scas4d_core.rasterize.limits import DEFAULT, Limits
 
 PAIRS_AT_ONCE = 4_000_000
 """Pixel–Gaussian pairs held in memory at a time; larger pictures go in strips and are computed anew for backward."""

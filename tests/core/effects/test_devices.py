@@ -10,23 +10,23 @@ import numpy as np
 import pytest
 from box_scene import moved, take_frame
 from effect_cases import BEFORE, RIG, UPDATE, builder
+from scas4d_core.effects.appearance.colours import Colours
+from scas4d_core.engines.torch.device_update import DeviceUpdate
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.effects import effect as effect_module
-from scas4d_core.effects.appearance.colours import Colours
 from scas4d_core.effects.effect import Effect, Group
-from scas4d_core.effects.parts import Part, PartsBuilder, Work, not_on_devices
 from scas4d_core.effects.presence.catching import Catching
 from scas4d_core.effects.registry import EFFECTS
 from scas4d_core.effects.switches import Switches, contradictions, first_switches, joined
+from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import Preparation
 from scas4d_core.presets import SettingError, preset
 from scas4d_core.settings import Settings
 from scas4d_core.storage.checkpoint import CarryOver
 from scas4d_core.structure.neighbours import build_neighbours
-from scas4d_core.torch_backend.device_update import DeviceUpdate
-from scas4d_core.update.picture_loss import PictureLoss
+from scas4d_core.update.parts import Part, PartsBuilder, Work, not_on_devices
 
 NAME = "drag"
 
@@ -97,7 +97,7 @@ def test_presets_that_a_gpu_knows() -> None:
 def test_a_scene_that_goes_on_on_another_device_leaves_what_is_not_known_there(monkeypatch: pytest.MonkeyPatch) -> None:
     settings = Settings(device="cuda")
     parts = builder()
-    made = Preparation(parts.factory, settings, WorldFrame(np.zeros(3)), PictureLoss(parts.factory, (0, 0, 0), 1, 0))
+    made = Preparation(parts.factory, settings, WorldFrame(np.zeros(3)), CpuRenderer(parts.factory, (0, 0, 0), 1, 0))
     seen: list[Switches] = []
     monkeypatch.setattr(Preparation, "updater", lambda self, first, switches: (seen.append(switches), 0))
     on_cpu = first_switches(Settings(effects={"camera_gain": "on", "entering": "on"}), 0)

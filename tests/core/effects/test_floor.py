@@ -8,7 +8,7 @@ import torch
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.effects.coherence.floor import floor_inside, floor_term
-from scas4d_core.torch_backend.losses import floor_loss
+from scas4d_core.engines.torch.losses import floor_loss
 
 WORLD = WorldFrame(np.array([100.0, -20.0, 5.0]), 0.25)
 PLANE = (0.6, 3.0, -1.2, 7.0)

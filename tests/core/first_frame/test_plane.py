@@ -13,7 +13,7 @@ from scas4d_core.first_frame.points.posed_pictures import InitialPointsError, Po
 from scas4d_core.first_frame.points.surroundings import Stage, surroundings
 from scas4d_core.first_frame.static_scene import first_trainer
 from scas4d_core.settings import SceneSettings, StaticSettings
-from scas4d_core.update.picture_loss import ViewFactory
+from scas4d_core.update.view_factory import ViewFactory
 
 NORMAL = np.array([0.1, -0.15, 1.0]) / np.linalg.norm([0.1, -0.15, 1.0])
 """Of the table: a little tilted against the cameras' common up."""

@@ -21,7 +21,7 @@ from scas4d_core.first_frame.static_scene import (
 )
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.settings import SceneSettings, StaticSettings
-from scas4d_core.update.picture_loss import ViewFactory
+from scas4d_core.update.view_factory import ViewFactory
 
 RIG = make_rig()
 BOX = make_box()

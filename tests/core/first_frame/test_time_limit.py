@@ -18,7 +18,7 @@ from scas4d_core.first_frame.time_limit import STEREO, TimeLimit
 from scas4d_core.frame_outcome import first_warnings
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings
-from scas4d_core.update.picture_loss import ViewFactory
+from scas4d_core.update.view_factory import ViewFactory
 
 RIG, BOX = make_rig(), make_box()
 

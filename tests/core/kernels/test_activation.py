@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from scas4d_core.engines.torch.deformation import quaternion_matrices
 from scas4d_core.kernels import activation
-from scas4d_core.torch_backend.deformation import quaternion_matrices
 
 
 def parameters(count: int) -> np.ndarray:

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
+from scas4d_core.engines.cpu.deformation import Blocks, CpuDeformation
+from scas4d_core.engines.torch import deformation, losses
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.structure.hierarchy import Hierarchy
-from scas4d_core.torch_backend import deformation, losses
-from scas4d_core.update.deformation import Blocks, CpuDeformation
 
 
 def hierarchy(points: int, sizes: tuple[int, ...], rng: np.random.Generator) -> list[np.ndarray]:

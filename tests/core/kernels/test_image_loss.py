@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from scas4d_core.engines.torch import losses
 from scas4d_core.kernels import image_loss
-from scas4d_core.torch_backend import losses
 
 
 @pytest.mark.parametrize(("height", "width"), [(7, 5), (40, 33), (16, 64), (50, 150)])

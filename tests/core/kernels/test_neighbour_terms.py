@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from scas4d_core.engines.torch import losses
 from scas4d_core.kernels import adam, neighbour_terms
-from scas4d_core.torch_backend import losses
 
 
 def test_losses_and_gradients_agree_with_the_twin() -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from law_cases import Motion, doubles, law, on_cpu, seeds, some_motion, some_rotation
 from torch.testing import assert_close
 
-from scas4d_core.torch_backend.deformation import (
+from scas4d_core.engines.torch.deformation import (
     ClusterParams,
     Deformed,
     Deltas,

@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 from law_cases import Motion, Splats, doubles, law, seeds, some_motion, some_splats
 from torch import Tensor
 
-from scas4d_core.rasterize import twin
-from scas4d_core.rasterize.limits import DEFAULT
-from scas4d_core.rasterize.twin import CameraParams
-from scas4d_core.torch_backend import deformation, losses
-from scas4d_core.torch_backend.deformation import ClusterParams, Deltas, Layer, deform, rotation_quaternions
+from scas4d_core.engines.limits import DEFAULT
+from scas4d_core.engines.torch import deformation, losses
+from scas4d_core.engines.torch import rasterizer as twin
+from scas4d_core.engines.torch.deformation import ClusterParams, Deltas, Layer, deform, rotation_quaternions
+from scas4d_core.engines.torch.rasterizer import CameraParams
 
 STEP = 1e-6
 """Of the central differences: their rounding is near 1e-10, and what they cut off near 1e-12."""

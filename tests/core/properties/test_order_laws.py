@@ -14,6 +14,7 @@ from hypothesis import given
 from law_cases import law, seeds
 
 from scas4d_core.cameras import Rig
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.settings import SceneSettings, UpdateSettings
@@ -21,10 +22,9 @@ from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.structure.neighbours import build_neighbours
 from scas4d_core.update import schedule
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.picture_loss import ViewFactory
 from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.schedule import ViewPlan
-from scas4d_core.update.training_view import TrainingView
+from scas4d_core.update.view_factory import ViewFactory
 
 MADE = make_box()
 JITTER = np.random.default_rng(1).normal(0, 0.003, MADE.means.shape).astype(np.float32)

@@ -13,26 +13,27 @@ import pytest
 import torch
 from box_scene import MOVING, make_box, make_rig, moved, take_frame
 from law_cases import doubles
+from scas4d_core.engines.torch.device_update import DeviceUpdate
 from torch import Tensor
 
+from scas4d_core.engines.cpu.deformation import CpuDeformation
+from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.torch import losses
+from scas4d_core.engines.torch import rasterizer as twin
+from scas4d_core.engines.torch.deformation import ClusterParams, Deltas, Layer, deform
+from scas4d_core.engines.torch.rasterizer import CameraParams
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels import projection
 from scas4d_core.kernels.adam import EVERY_ROW, adam
 from scas4d_core.preparation import SMALLEST_CLUSTER
-from scas4d_core.rasterize import twin
-from scas4d_core.rasterize.twin import CameraParams
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.structure.neighbours import build_neighbours
-from scas4d_core.torch_backend import losses
-from scas4d_core.torch_backend.deformation import ClusterParams, Deltas, Layer, deform
-from scas4d_core.torch_backend.device_update import DeviceUpdate
 from scas4d_core.update import schedule
-from scas4d_core.update.deformation import CpuDeformation
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
 from scas4d_core.update.result import UpdateResult
-from scas4d_core.update.training_view import TrainingView
+from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import Motion
 
 MADE = make_box()
@@ -94,7 +95,7 @@ def pictures(found: dict[str, float]) -> None:
     """Projection, rendering and the image loss, over all six cameras; the largest of each."""
     state = (BOX.means, BOX.factors, BOX.opacities, features_of(BOX))
     given = [doubles(array) for array in state]
-    loss = PictureLoss(FACTORY, (0.0, 0.0, 0.0), 1.0, 0.3)
+    loss = CpuRenderer(FACTORY, (0.0, 0.0, 0.0), 1.0, 0.3)
 
     def worst(name: str, value: float) -> None:
         found[name] = max(found.get(name, 0.0), value)

@@ -9,13 +9,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from law_cases import doubles, law
 
-from scas4d_core.gaussians import quaternions_to_matrices
-from scas4d_core.torch_backend.deformation import (
+from scas4d_core.engines.torch.deformation import (
     material_rotations,
     quaternion_matrices,
     quaternion_product,
     rotation_quaternions,
 )
+from scas4d_core.gaussians import quaternions_to_matrices
 from scas4d_core.update.warm_start import quaternion_products, rotate
 
 TINY = 1e-12

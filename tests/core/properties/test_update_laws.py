@@ -16,15 +16,15 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from law_cases import doubles, law, seeds, some_rotation
+from scas4d_core.engines.torch.arrays import ClusterArrays, DeltaArrays, Graph, TermWeights, TorchView
+from scas4d_core.engines.torch.update import TorchUpdate
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Camera
 from scas4d_core.effects.coherence.floor import FloorPart
+from scas4d_core.engines.torch import deformation
+from scas4d_core.engines.torch import update as update_torch
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.torch_backend import deformation
-from scas4d_core.torch_backend import update as update_torch
-from scas4d_core.torch_backend.arrays import ClusterArrays, DeltaArrays, Graph, TermWeights, TorchView
-from scas4d_core.torch_backend.update import TorchUpdate
 from scas4d_core.update.rates import Rates
 
 MOVING, STANDING, NEAREST = 24, 6, 4

@@ -3,10 +3,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Camera
+from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
+from scas4d_core.engines.limits import DEFAULT
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.ray_depth import ray_depths
-from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
-from scas4d_core.rasterize.limits import DEFAULT
 
 CAMERA = Camera("c", np.array([[120.0, 0, 32], [0, 110, 24], [0, 0, 1]]), np.eye(4), 64, 48)
 

@@ -12,10 +12,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Camera
+from scas4d_core.engines.cpu.rasterizer import CpuRasterizer, Drawing
+from scas4d_core.engines.limits import DEFAULT, GSPLAT, Limits
+from scas4d_core.engines.torch import rasterizer as twin
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.kernels import tiles
-from scas4d_core.rasterize import twin
-from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer, Drawing
-from scas4d_core.rasterize.limits import DEFAULT, GSPLAT, Limits
 
 SIZES = [(5, 3), (16, 16), (37, 29), (64, 48), (100, 33)]
 

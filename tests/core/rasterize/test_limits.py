@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from scas4d_core.cameras import Camera
-from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
-from scas4d_core.rasterize.limits import DEFAULT, NEAR_SHARE, scene_limits
+from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
+from scas4d_core.engines.limits import DEFAULT, NEAR_SHARE, scene_limits
+from scas4d_core.engines.views import CameraArrays
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,8 @@ import pytest
 
 from scas4d_core.cameras import rig_inside
 from scas4d_core.captures.frame import Frame
+from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust.checks import evened, gain_of, relit
@@ -19,17 +21,16 @@ from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.update.best_state import VIEWS, BestState, ProbeViews, by_size, mean_error, spread
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
 from scas4d_core.update.result import AttemptOptions
 from scas4d_core.update.schedule import Stopping
-from scas4d_core.update.training_view import TrainingView
+from scas4d_core.update.view_factory import ViewFactory
 from studies.hard_frames.footage import ANGLE, SyntheticFootage
 from studies.hard_frames.scene import BALL, GOES, first_state, gone
 
 FOOTAGE = SyntheticFootage()
 BEFORE = first_state(resting_may_move=False)
 FACTORY = ViewFactory(rig_inside(FOOTAGE.rig.world_frame(1.0), FOOTAGE.rig.cameras))
-PICTURE = PictureLoss(FACTORY, (0.0, 0.0, 0.0), 1.0, 0.0)
+PICTURE = CpuRenderer(FACTORY, (0.0, 0.0, 0.0), 1.0, 0.0)
 SETTINGS = UpdateSettings(iterations=30, clusters=(2, 12))
 
 

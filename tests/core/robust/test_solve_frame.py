@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from scas4d_core.cameras import Rig
-from scas4d_core.effects.parts import NOTHING, Arrays
+from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust import outliers as judge
@@ -23,9 +24,9 @@ from scas4d_core.robust.update_input import UpdateInput
 from scas4d_core.settings import UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.update.best_state import COMMITTED, CONFIRMING
-from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
+from scas4d_core.update.parts import NOTHING, Arrays
 from scas4d_core.update.result import AS_SET, AttemptOptions, UpdateResult, UpdateTrace, camera_fit
-from scas4d_core.update.training_view import TrainingView
+from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import Motion
 from studies.hard_frames.footage import SyntheticFootage
 from studies.hard_frames.scene import first_state, gone
@@ -39,7 +40,7 @@ NAMES = list(FRAME.images)
 BRIGHT = brightness(FRAME.images)
 FACTORY = ViewFactory(RIG)
 VIEWS = FACTORY.views(FRAME, {})
-PICTURE = PictureLoss(FACTORY, (0.0, 0.0, 0.0), 1.0, 0.0)
+PICTURE = CpuRenderer(FACTORY, (0.0, 0.0, 0.0), 1.0, 0.0)
 SETTINGS = UpdateSettings(iterations=30, clusters=(2,), patience=3)
 LEVEL = 33.0
 PAST = judge.settle(Past(), dict.fromkeys(NAMES, LEVEL), BRIGHT, 1.0)

@@ -18,7 +18,7 @@ from scas4d_core.reconstruction import Reconstruction, ResumeError
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings, UpdateSettings
 from scas4d_core.storage.checkpoint import CheckpointError, Checkpoints
 from scas4d_core.storage.history import History
-from scas4d_core.update.picture_loss import ViewFactory
+from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import Motion
 
 BOX = make_box()

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from scas4d_core.torch_backend import deformation
-from scas4d_core.torch_backend.deformation import (
+from scas4d_core.engines.torch import deformation
+from scas4d_core.engines.torch.deformation import (
     ClusterParams,
     Deltas,
     Layer,

@@ -12,8 +12,12 @@ import torch
 import torch.utils.cpp_extension
 from box_scene import MOVING, make_box, make_rig, moved, take_frame, to_user
 from effect_cases import of_whole_pictures
+from scas4d_core.engines.torch.device import DeviceError, require_device
+from scas4d_core.engines.torch.device_update import DeviceUpdate
 
 from scas4d_core import reconstruction
+from scas4d_core.engines.torch import device
+from scas4d_core.engines.torch import device_update as update_device
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
@@ -22,16 +26,12 @@ from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import LayerRates, SceneSettings, Settings, UpdateSettings, Weights
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.structure.neighbours import build_neighbours
-from scas4d_core.torch_backend import device
-from scas4d_core.torch_backend import device_update as update_device
-from scas4d_core.torch_backend.device import DeviceError, require_device
-from scas4d_core.torch_backend.device_update import DeviceUpdate
 from scas4d_core.update import schedule
 from scas4d_core.update.best_state import by_size, mean_error
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.picture_loss import ViewFactory
 from scas4d_core.update.result import AttemptOptions, UpdateResult
 from scas4d_core.update.schedule import COOLING, LOOK_EVERY, Stopping, TimeBudget
+from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import Motion
 
 BEFORE = make_box()

@@ -7,8 +7,8 @@ import pytest
 import torch
 from scipy.ndimage import correlate1d
 
-from scas4d_core.torch_backend import losses
-from scas4d_core.torch_backend.deformation import quaternion_matrices, rotation_quaternions
+from scas4d_core.engines.torch import losses
+from scas4d_core.engines.torch.deformation import quaternion_matrices, rotation_quaternions
 
 M, K = 6, 3
 

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 import torch
+from scas4d_core.rasterize import cuda, twin
 
 from scas4d_core.cameras import Camera
-from scas4d_core.rasterize import cuda, twin
-from scas4d_core.rasterize.limits import DEFAULT, GSPLAT
-from scas4d_core.rasterize.twin import CameraParams
+from scas4d_core.engines.limits import DEFAULT, GSPLAT
+from scas4d_core.engines.torch.rasterizer import CameraParams
 
 WIDTH, HEIGHT = 12, 9
 CAMERA = Camera("c", [[20.0, 0, 5.5], [0, 22, 4.5], [0, 0, 1]], np.eye(4), WIDTH, HEIGHT)  # type: ignore[arg-type]

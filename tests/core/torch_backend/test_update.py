@@ -5,15 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from scas4d_core.engines.torch.arrays import Graph, TermWeights, TorchResult, TorchView
+from scas4d_core.engines.torch.update import TorchUpdate
 
 from scas4d_core.cameras import Camera
+from scas4d_core.engines.torch import losses
+from scas4d_core.engines.torch import rasterizer as twin
+from scas4d_core.engines.torch.deformation import quaternion_matrices, quaternion_product, rotation_quaternions
+from scas4d_core.engines.torch.rasterizer import CameraParams
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.rasterize import twin
-from scas4d_core.rasterize.twin import CameraParams
-from scas4d_core.torch_backend import losses
-from scas4d_core.torch_backend.arrays import Graph, TermWeights, TorchResult, TorchView
-from scas4d_core.torch_backend.deformation import quaternion_matrices, quaternion_product, rotation_quaternions
-from scas4d_core.torch_backend.update import TorchUpdate
 from scas4d_core.update.rates import Rates
 
 MOVING, STANDING = 40, 8

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from box_scene import MOVING, make_box
 
+from scas4d_core.engines.cpu.deformation import CpuDeformation, length_bounds
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.update.best_state import BestState
-from scas4d_core.update.deformation import CpuDeformation, length_bounds
 from scas4d_core.update.warm_start import Motion
 
 BOX = make_box()

@@ -10,19 +10,20 @@ from box_scene import make_box, make_rig, moved, take_frame
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Camera, Rig
+from scas4d_core.engines.cpu.blocks import as_blocks, as_grid
+from scas4d_core.engines.cpu.changed_pixels import ChangedPixels, reached
+from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
+from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels import image_loss
 from scas4d_core.preparation import SMALLEST_CLUSTER
-from scas4d_core.rasterize.blocks import as_blocks, as_grid
-from scas4d_core.rasterize.cpu import CpuRasterizer
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.structure.neighbours import build_neighbours
 from scas4d_core.update import changed_pixels, frame_update
-from scas4d_core.update.changed_pixels import ChangedPixels, reached
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
 from scas4d_core.update.result import AttemptOptions, UpdateResult
+from scas4d_core.update.view_factory import ViewFactory
 
 RIG = make_rig()
 BOX = make_box()
@@ -149,7 +150,7 @@ def test_a_view_in_which_nothing_moves_has_no_gradient() -> None:
     state = few_move().replace(foreground=np.zeros(len(BOX), np.float32))
     factory = ViewFactory(RIG)
     picture = ChangedPixels(factory, (0.0, 0.0, 0.0), 1.0, 0.1, np.zeros(0, np.int64), len(BOX))
-    whole = PictureLoss(factory, (0.0, 0.0, 0.0), 1.0, 0.1)
+    whole = CpuRenderer(factory, (0.0, 0.0, 0.0), 1.0, 0.1)
     picture.begin(state)
     features = np.concatenate([state.colours, state.foreground[:, None]], axis=1)
     given = (state.means, state.factors, state.opacities, features)

@@ -13,23 +13,24 @@ import torch
 from box_scene import MOVING, SHIFT, TURN, make_box, make_rig, moved, take_frame
 from effect_cases import of_whole_pictures
 
-from scas4d_core.effects.parts import Work
+from scas4d_core.engines.cpu.deformation import MAX_SCALE, CpuDeformation
+from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.torch import arrays
+from scas4d_core.engines.torch import update as update_torch
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels import neighbour_terms
 from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.structure.neighbours import Neighbours, build_neighbours
-from scas4d_core.torch_backend import arrays
-from scas4d_core.torch_backend import update as update_torch
 from scas4d_core.update import rates, schedule
-from scas4d_core.update.deformation import MAX_SCALE, CpuDeformation
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.picture_loss import PictureLoss, ViewFactory, view_order
+from scas4d_core.update.parts import Work
 from scas4d_core.update.rates import Adam, Rates
 from scas4d_core.update.result import REPORT, AttemptOptions, Stopwatch, UpdateResult
-from scas4d_core.update.schedule import Stopping, ViewPlan, plan_samples
-from scas4d_core.update.training_view import TrainingView
+from scas4d_core.update.schedule import Stopping, ViewPlan, plan_samples, view_order
+from scas4d_core.update.view_factory import ViewFactory
 
 BEFORE = make_box()
 AFTER = moved(BEFORE)
@@ -183,9 +184,9 @@ class Iteration:
             self.gradients.append(gradients.copy())
             optimizer._parameters[:] = self.parameters[table]
 
-        evaluate, neighbour_losses = PictureLoss.evaluate, CpuDeformation.neighbour_losses
+        evaluate, neighbour_losses = CpuRenderer.evaluate, CpuDeformation.neighbour_losses
 
-        def rendered(loss: PictureLoss, *given: Any) -> Any:
+        def rendered(loss: CpuRenderer, *given: Any) -> Any:
             seen.append(RIG.names.index(given[4].name))
             return evaluate(loss, *given)
 
@@ -194,7 +195,7 @@ class Iteration:
             return neighbour_losses(deformation, sample, *given)
 
         monkeypatch.setattr(Adam, "step", step)
-        monkeypatch.setattr(PictureLoss, "evaluate", rendered)
+        monkeypatch.setattr(CpuRenderer, "evaluate", rendered)
         monkeypatch.setattr(CpuDeformation, "neighbour_losses", looked_at)
         self.loss = updater.run(BEFORE, views, None, 1.0, seed=9).trace.losses[1]
         self.gradients = self.gradients[len(self.parameters) :]
@@ -301,10 +302,10 @@ def test_the_reported_loss_is_that_of_the_twin(masks: bool, views: int, monkeypa
 def test_several_views_are_a_mean_and_one_is_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """The mean of a view and itself is that view to the last bit, and so is the whole update."""
     given: list[tuple[bool, float]] = []
-    inside, evaluate = FrameUpdate._pictures, PictureLoss.evaluate
+    inside, evaluate = FrameUpdate._pictures, CpuRenderer.evaluate
     last: list[Any] = []
 
-    def rendered(picture: PictureLoss, *arguments: Any) -> Any:
+    def rendered(picture: CpuRenderer, *arguments: Any) -> Any:
         last[:] = [evaluate(picture, *arguments), picture.image_part + picture.mask_part]
         return last[0]
 
@@ -313,7 +314,7 @@ def test_several_views_are_a_mean_and_one_is_as_it_is(monkeypatch: pytest.Monkey
         given.append((work.gradients is last[0], loss - last[1]))
         return loss
 
-    monkeypatch.setattr(PictureLoss, "evaluate", rendered)
+    monkeypatch.setattr(CpuRenderer, "evaluate", rendered)
     monkeypatch.setattr(FrameUpdate, "_pictures", pictures)
     found = []
     for count in (1, 2, 4):

@@ -7,10 +7,11 @@ import pytest
 from box_scene import make_box, make_rig, moved, take_frame
 from scipy.spatial.transform import Rotation
 
+from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.update import best_state
 from scas4d_core.update.best_state import VIEWS, ProbeViews
-from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
+from scas4d_core.update.view_factory import ViewFactory
 
 RIG = make_rig()
 BOX = make_box()
@@ -19,7 +20,7 @@ BOX = make_box()
 def probes(shown: Gaussians) -> tuple[ProbeViews, list[int]]:
     """Those of a frame in which a state is seen, and the widths at which it is rendered for them."""
     factory, widths = ViewFactory(RIG), list[int]()
-    picture = PictureLoss(factory, (0.0, 0.0, 0.0), 1.0, 0.0)
+    picture = CpuRenderer(factory, (0.0, 0.0, 0.0), 1.0, 0.0)
     measure = picture.measure
 
     def measured(*given: object) -> None:

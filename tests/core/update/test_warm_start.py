@@ -7,9 +7,9 @@ import pytest
 from box_scene import MOVING, make_box, moved
 from scipy.spatial.transform import Rotation
 
+from scas4d_core.engines.cpu.deformation import CpuDeformation
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.structure.hierarchy import build_hierarchy
-from scas4d_core.update.deformation import CpuDeformation
 from scas4d_core.update.warm_start import Motion, quaternion_products, rotate, warm_start
 from studies.constants import varied
 

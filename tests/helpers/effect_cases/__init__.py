@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 from box_scene import make_box, make_rig, moved, take_frame
-
 from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
-from scas4d_core.effects.parts import PartsBuilder
+
 from scas4d_core.effects.switches import first_switches, joined, names_on
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import SMALLEST_CLUSTER
@@ -14,7 +13,8 @@ from scas4d_core.settings import SceneSettings, Settings, UpdateSettings
 from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.structure.neighbours import build_neighbours
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.picture_loss import ViewFactory
+from scas4d_core.update.parts import PartsBuilder
+from scas4d_core.update.view_factory import ViewFactory
 
 BEFORE = make_box()
 RIG = make_rig()

@@ -8,10 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures.frame import Frame
+from scas4d_core.engines.cpu.gloss import colours_seen
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels.appearance.direction import CELLS, ROWS, SHEEN, SIDE
-from scas4d_core.rasterize.cpu import CameraArrays
-from scas4d_core.rasterize.shading import colours_seen
 
 RADIUS, COUNT, SIZE = 0.3, 1500, 96
 

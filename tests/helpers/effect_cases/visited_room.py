@@ -9,10 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Rig
 from scas4d_core.effects.evidence import Seen
+from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.limits import scene_limits
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.rasterize.limits import scene_limits
-from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
 from scas4d_core.update.result import UpdateResult, UpdateTrace
+from scas4d_core.update.view_factory import ViewFactory
 from tests.helpers.box_scene import look_at, take_frame
 
 SIZE = 80
@@ -89,7 +90,7 @@ def seen(
     rig = make_rig()
     factory = ViewFactory(rig)
     views = factory.views(take_frame(index, float(index), true, rig, masks), {})
-    picture = PictureLoss(factory, (0.0, 0.0, 0.0), 1.0, 0.0, limits=scene_limits("auto", rig.radius))
+    picture = CpuRenderer(factory, (0.0, 0.0, 0.0), 1.0, 0.0, limits=scene_limits("auto", rig.radius))
     return Seen(index, state, UpdateResult(state, None, UpdateTrace(), carried=carried or {}), rig, views, picture)
 
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from scas4d_core.engines.torch.device import DeviceError
 from typer.testing import CliRunner
 
-from scas4d_core.torch_backend import losses
-from scas4d_core.torch_backend.device import DeviceError
+from scas4d_core.engines.torch import losses
 from studies.commands import app
 from studies.kernels import device
 from studies.kernels.device import TOLERANCES, Bench, Stage, page

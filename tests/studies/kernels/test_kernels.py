@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 from box_scene import make_box, make_rig
 
+from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
+from scas4d_core.engines.limits import DEFAULT
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.kernels.blend import BLOCK
 from scas4d_core.kernels.projection import CONIC_A, CONIC_B, CONIC_C, DEPTH, MEAN_X, MEAN_Y, OPACITY
-from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
-from scas4d_core.rasterize.limits import DEFAULT
 from studies.kernels import kernels
 from studies.kernels.pairs import GAUSSIANS, PAIRS, SIDE, MicroKernel, blended_pairs
 

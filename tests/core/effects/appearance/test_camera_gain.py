@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from scas4d_core.captures.frame import Frame
 from scas4d_core.effects.appearance.camera_gain import FOOT, NAME, POWER, exposure_of, known_gains, measured
 from scas4d_core.effects.effect import effect
-from scas4d_core.effects.parts import PartsBuilder
 from scas4d_core.effects.switches import contradictions, joined
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.preparation import SMALLEST_CLUSTER
@@ -20,7 +19,8 @@ from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import SceneSettings, Settings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.picture_loss import ViewFactory
+from scas4d_core.update.parts import PartsBuilder
+from scas4d_core.update.view_factory import ViewFactory
 
 RIG = make_rig()
 BOX = make_box().replace(colours=np.random.default_rng(1).uniform(0.2, 0.7, (448, 3)).astype(np.float32))

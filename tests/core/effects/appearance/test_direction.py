@@ -15,8 +15,19 @@ from scipy.spatial.transform import Rotation
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.effects.appearance.direction import EFFECT
 from scas4d_core.effects.evidence import Evidence, Seen
-from scas4d_core.effects.parts import PartsBuilder
 from scas4d_core.effects.switches import first_switches, joined, names_on
+from scas4d_core.engines.cpu.gloss import (
+    GLOSS,
+    Shading,
+    colours_seen,
+    gloss_rate,
+    neighbourhood_turns,
+    neighbourhoods,
+    without_turn,
+)
+from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
+from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.first_frame.glossy import fit_by_direction
 from scas4d_core.first_frame.normals import surface_normals
 from scas4d_core.first_frame.static_result import StaticResult
@@ -28,21 +39,12 @@ from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.query.committed import CommittedScene
 from scas4d_core.query.harmonics import basis_of
 from scas4d_core.query.ply import write_ply
-from scas4d_core.rasterize.cpu import CameraArrays, CpuRasterizer
-from scas4d_core.rasterize.shading import (
-    GLOSS,
-    Shading,
-    colours_seen,
-    gloss_rate,
-    neighbourhood_turns,
-    neighbourhoods,
-    without_turn,
-)
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings
 from scas4d_core.storage.history import History
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
+from scas4d_core.update.parts import PartsBuilder
+from scas4d_core.update.view_factory import ViewFactory
 
 
 def fitted(state: Gaussians, mode: str, iterations: int = 1200) -> StaticResult:
@@ -65,7 +67,7 @@ def after(before: Gaussians, truth: Gaussians, effects: list[str]) -> tuple[Gaus
     parts = joined(PartsBuilder(SceneSettings(), settings, factory, hierarchy, before), effects)
     updater = FrameUpdate(factory, SceneSettings(), settings, hierarchy, None, before, parts)
     result = updater.run(before, views, None, 1.0, seed=1)
-    picture_loss = PictureLoss(factory, (0, 0, 0), 1.0, 0.0)
+    picture_loss = CpuRenderer(factory, (0, 0, 0), 1.0, 0.0)
     return result.gaussians, EFFECT.evidence(Seen(1, before, result, rig(), views, picture_loss))
 
 

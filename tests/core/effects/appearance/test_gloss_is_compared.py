@@ -8,31 +8,32 @@ from effect_cases.glossy_ball import COUNT, frame, rig, sphere
 from scipy.spatial import cKDTree
 
 from scas4d_core.effects.evidence import FitTime
-from scas4d_core.effects.parts import PartsBuilder
 from scas4d_core.effects.presence.growing import _Fit, settled
 from scas4d_core.effects.presence.novelty import novelties
 from scas4d_core.effects.switches import joined
+from scas4d_core.engines.cpu.deformation import CpuDeformation
+from scas4d_core.engines.cpu.gloss import colours_seen
+from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import SMALLEST_CLUSTER
-from scas4d_core.rasterize.shading import colours_seen
 from scas4d_core.robust.checks import gain_of
 from scas4d_core.robust.relocation import find_jump, shifted
 from scas4d_core.robust.solve_frame import FrameSolver
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.update.best_state import BestState, ProbeViews, mean_error
-from scas4d_core.update.deformation import CpuDeformation
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
+from scas4d_core.update.parts import PartsBuilder
 from scas4d_core.update.result import AttemptOptions, UpdateResult
 from scas4d_core.update.schedule import Stopping
-from scas4d_core.update.training_view import TrainingView
+from scas4d_core.update.view_factory import ViewFactory
 
 BALL = sphere()
 PLAIN = BALL.replace(gloss=None, environment=None)
 FACTORY = ViewFactory(rig())
-PICTURE = PictureLoss(FACTORY, (0.0, 0.0, 0.0), 1.0, 0.0)
+PICTURE = CpuRenderer(FACTORY, (0.0, 0.0, 0.0), 1.0, 0.0)
 SETTINGS = UpdateSettings(iterations=24, clusters=(2, 12))
 CLOSE = 0.7
 """Of the error without the gloss, that is left with it: probe views are coarser than the pictures."""

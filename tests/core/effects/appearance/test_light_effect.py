@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from box_scene import MOVING, make_box, make_rig, take_frame
 from effect_cases import builder, same, updated
-
 from scas4d_core.effects.appearance.colours import FASTER, Colours
+
 from scas4d_core.effects.appearance.light import change_of_light, orientation_and_place
 from scas4d_core.effects.switches import contradictions, first_switches, joined, names_on
 from scas4d_core.first_frame.static_result import StaticResult

@@ -9,13 +9,14 @@ from scipy.spatial.transform import Rotation
 
 from scas4d_core.effects.appearance import closed_form, shading
 from scas4d_core.effects.appearance.closed_form import MOST, SUBSETS, follow_pictures, from_all_sides
+from scas4d_core.engines.cpu.changed_pixels import ChangedPixels
+from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
-from scas4d_core.update.changed_pixels import ChangedPixels
-from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
+from scas4d_core.update.view_factory import ViewFactory
 
 RIG, BOX = make_rig(), make_box()
 MOVES = BOX.moving.astype(np.uint8)
@@ -106,9 +107,9 @@ def test_steps_are_those_of_a_dense_twin() -> None:
     assert np.abs(found.colours - shown.colours)[rows].max() > 0.01
 
 
-def pictures(shown: Gaussians) -> tuple[list, PictureLoss]:  # type: ignore[type-arg]
+def pictures(shown: Gaussians) -> tuple[list, CpuRenderer]:  # type: ignore[type-arg]
     factory = ViewFactory(RIG)
-    return factory.views(take_frame(1, 0.1, shown, RIG), {}), PictureLoss(factory, (0.1, 0.2, 0.3), 1.0, 0.0)
+    return factory.views(take_frame(1, 0.1, shown, RIG), {}), CpuRenderer(factory, (0.1, 0.2, 0.3), 1.0, 0.0)
 
 
 def test_the_pixels_that_move_alone_give_the_same_bits() -> None:

@@ -10,13 +10,13 @@ from box_scene import make_box, make_rig, take_frame
 
 from scas4d_core.effects.appearance.shadows import NAME
 from scas4d_core.effects.switches import contradictions, first_switches
+from scas4d_core.engines.views import SIDE
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
-from scas4d_core.update.picture_loss import ViewFactory
-from scas4d_core.update.training_view import SIDE
+from scas4d_core.update.view_factory import ViewFactory
 
 RIG = make_rig()
 BOX = make_box()

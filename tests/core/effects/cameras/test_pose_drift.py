@@ -17,8 +17,8 @@ from scas4d_core.effects.cameras.alignment import Equations, adjoint, in_pixels,
 from scas4d_core.effects.cameras.pose_drift import LEAST, NAME, TURN, Poses, bounded, centred, posed, stepped
 from scas4d_core.effects.effect import effect
 from scas4d_core.effects.switches import IDLE, contradictions, first_switches, kept_of
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.first_frame.static_result import StaticResult
-from scas4d_core.rasterize.cpu import CameraArrays
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History

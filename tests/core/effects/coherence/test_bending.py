@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from box_scene import look_at, make_box, take_frame
 from effect_cases import BEFORE, UPDATE, builder, same, updated
+from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Rig
 from scas4d_core.effects.coherence.bending import EFFECT, PATCH, Bends, bend, turns_of
-from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
 from scas4d_core.effects.switches import contradictions, first_switches, joined, names_on
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians

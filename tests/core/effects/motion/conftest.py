@@ -9,15 +9,15 @@ import pytest
 from effect_cases import RIG, builder
 
 from scas4d_core.cameras import WorldFrame
+from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.preparation import Preparation
 from scas4d_core.settings import Settings
-from scas4d_core.update.picture_loss import PictureLoss
 
 
 @pytest.fixture
 def preparation() -> Callable[[Settings], Preparation]:
     """Of the box, with settings."""
     factory = builder().factory
-    picture = PictureLoss(factory, (0, 0, 0), 1.0, 0.0)
+    picture = CpuRenderer(factory, (0, 0, 0), 1.0, 0.0)
     assert factory.rig is RIG
     return lambda settings: Preparation(factory, settings, WorldFrame(np.zeros(3)), picture)

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scas4d_core.effects.parts import PartsBuilder, Work
 from scas4d_core.effects.presence.catching import Catching
 from scas4d_core.effects.presence.entering import EFFECT, NAME
+from scas4d_core.engines.cpu.deformation import CpuDeformation
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
-from scas4d_core.update.deformation import CpuDeformation
-from scas4d_core.update.picture_loss import ViewFactory
+from scas4d_core.update.parts import PartsBuilder, Work
+from scas4d_core.update.view_factory import ViewFactory
 from tests.helpers.effect_cases.visited_room import CENTRE, known, scene, seen, visitor
 
 WAY = np.array([-0.05, -0.12, 0.08])

@@ -10,12 +10,12 @@ import pytest
 from scas4d_core.effects.evidence import Seen
 from scas4d_core.effects.presence import entering, novelty, uncovered
 from scas4d_core.effects.presence.novelty import GLANCE, glance
+from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.renderer import Picture
+from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.rasterize.cpu import Picture
-from scas4d_core.update.picture_loss import PictureLoss
 from scas4d_core.update.result import ROWS, SHOWN, UpdateTrace
-from scas4d_core.update.training_view import TrainingView
 from tests.helpers.effect_cases.visited_room import known, scene, seen, visitor
 
 
@@ -33,15 +33,15 @@ def shown(frame: Seen, kept: Candidate = Candidate.END, most: int = SHOWN) -> Se
 def rendered(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the cameras whose pictures are rendered for the evidence."""
     names: list[str] = []
-    render = PictureLoss.render
+    render = CpuRenderer.render
 
     def counted(
-        self: PictureLoss, state: Gaussians, features: np.ndarray, view: TrainingView, depth_channel: int = -1
+        self: CpuRenderer, state: Gaussians, features: np.ndarray, view: TrainingView, depth_channel: int = -1
     ) -> Picture:
         names.append(view.name)
         return render(self, state, features, view, depth_channel)
 
-    monkeypatch.setattr(PictureLoss, "render", counted)
+    monkeypatch.setattr(CpuRenderer, "render", counted)
     return names
 
 

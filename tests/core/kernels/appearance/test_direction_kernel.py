@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from scas4d_core.engines.torch.gloss import shade
 from scas4d_core.kernels.appearance import direction
-from scas4d_core.torch_backend.direction import shade
 
 
 def scene(count: int) -> dict[str, np.ndarray]:

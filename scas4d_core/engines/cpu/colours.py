@@ -1,0 +1,66 @@
+"""Colours as parameters of an update: one table of RGB, with a rate for each Gaussian, and the soft-colour term."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.engines.cpu.adam import Adam
+from scas4d_core.engines.engine import AttemptStart
+
+Array = NDArray[np.float32]
+
+MOST = 0.6
+"""Share of moving Gaussians above which all have a place in the table: picking rows costs more than it saves."""
+
+
+class Colours:
+    """The colours that an attempt learns.
+
+    Args:
+        colours: [N, 3] RGB, changed in place. before: [N, 3] of Θ_{t−1}. rows: [M] the moving Gaussians.
+        standing: whether static Gaussians learn too. weight: of the mean absolute change (Dynamic3DGaussians).
+        start: rates and decays.
+    """
+
+    def __init__(
+        self,
+        colours: Array,
+        before: Array,
+        rows: NDArray[np.int64],
+        standing: bool,
+        weight: float,
+        start: AttemptStart,
+    ) -> None:
+        count = len(colours)
+        self._colours, self._rows = colours, rows
+        self._weight = np.float32(weight / max(colours.size, 1))
+        self._whole = standing or len(rows) > MOST * count
+        if self._whole:
+            self._before, self._table = before, colours
+            by_row = np.full(count, start.colour_standing, np.float32)
+            by_row[rows] = start.colour
+        else:
+            self._before, self._table = before[rows], colours[rows]
+            by_row = np.full(len(rows), start.colour, np.float32)
+        self._adam = Adam(self._table, [1.0] * 3, (start.beta1, start.beta2), by_row=by_row)
+        self.guards = self._adam.guards
+        self._change: Array
+
+    def loss(self, curve: bool) -> float:
+        """The weighted mean absolute change; 0 where nobody reads it (``curve``)."""
+        self._change = self._table - self._before
+        return float(self._weight * np.abs(self._change).sum(dtype=np.float64)) if curve else 0.0
+
+    def gradient(self, g_features: Array) -> Array:
+        """[rows of the table, 3], of the pictures (``g_features`` [N, 4]) and of the term."""
+        pull: Array = self._weight * np.sign(self._change)
+        chosen = g_features if self._whole else g_features[self._rows]
+        total: Array = chosen[:, :3] + pull
+        return total
+
+    def step(self, g_features: Array, factor: float) -> None:
+        """Take a step; ``factor`` is on all rates."""
+        self._adam.step(self.gradient(g_features), factor)
+        if not self._whole:
+            self._colours[self._rows] = self._table

@@ -1,0 +1,25 @@
+"""The floor term: moving Gaussians stay above a plane (Dynamic3DGaussians' floor loss, for a plane of any pose)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.engines.plan import Plane
+
+Array = NDArray[np.float32]
+
+
+def floor_term(plane: Plane, means: Array, rows: NDArray[np.int64], weight: float, g_means: Array) -> float:
+    """The weighted mean depth below the floor; its gradient is added to ``g_means``.
+
+    Args:
+        plane: see ``UpdatePlan.floor``. means: [N, 3] metres. rows: [M] moving Gaussians. g_means: [N, 3], added to.
+    """
+    if len(rows) == 0:
+        return 0.0
+    normal = np.array(plane[:3], np.float32)
+    depth = means[rows] @ normal + np.float32(plane[3])
+    below = rows[depth > 0]
+    g_means[below] += np.float32(weight / len(rows)) * normal
+    return float(weight * np.maximum(depth, 0).mean())

@@ -1,0 +1,228 @@
+"""The renderer of the CPU: draws states, compares them with pictures, and carries the image and mask loss back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import log10
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.engines.cpu.blocks import as_grid, tile_grid
+from scas4d_core.engines.cpu.gloss import features_seen
+from scas4d_core.engines.cpu.rasterizer import CpuRasterizer, Drawing
+from scas4d_core.engines.limits import DEFAULT, Limits
+from scas4d_core.engines.renderer import Comparison, Gradients, Picture
+from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView, means
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.guards import SMALLEST_SQUARE
+from scas4d_core.kernels import image_loss, tiles
+
+Array = NDArray[np.float32]
+Moments = tuple[Array, Array]
+
+CHANNELS = 4
+"""Red, green, blue, label."""
+
+_moments: WeakKeyDictionary[TrainingView, Moments] = WeakKeyDictionary()
+"""SSIM's windowed means of the target and of its square, by view: made once, shared by the renderers of a scene."""
+
+
+def no_lap(stage: str) -> None:
+    """Nobody takes the time."""
+
+
+class CpuRenderer:
+    """Renders states of a scene; the ``Renderer`` of the CPU, and the loss of the iterations there.
+
+    Args:
+        background: RGB behind everything.
+        image_weight, mask_weight: weights of the two terms of the loss.
+        mask_moves: whether the mask loss pulls at positions and shapes, or at the labels alone: masks have hard edges,
+            and a silhouette fitted to them is not the one that fits the pictures.
+        limits: constants of the rasterizer.
+
+    Attributes:
+        image_part, mask_part, psnr: of the last comparison; weighted losses and dB.
+        exposure_gradient: [C, 2] gradient of its loss with respect to the camera's gain and offset.
+    """
+
+    def __init__(
+        self,
+        background: tuple[float, float, float],
+        image_weight: float = 1.0,
+        mask_weight: float = 0.0,
+        mask_moves: bool = True,
+        limits: Limits = DEFAULT,
+    ) -> None:
+        self.rasterizer = CpuRasterizer(limits)
+        self._detached = -1 if mask_moves else LABEL
+        self._background = np.array([*background, 0.0], np.float32)
+        self._weights = np.array([image_weight / 3] * 3 + [mask_weight], np.float32)
+        self._scratch: dict[tuple[int, int, int], Array] = {}
+        self.exposure_gradient = np.zeros((CHANNELS, 2), np.float32)
+        self.image_part = 0.0
+        self.mask_part = 0.0
+        self.psnr = 0.0
+
+    def apart(self) -> CpuRenderer:
+        """A renderer with the same background and limits, the image loss alone, and buffers of its own."""
+        red, green, blue, _ = self._background.tolist()
+        return CpuRenderer((red, green, blue), limits=Limits(*self.rasterizer.limits.tolist()))
+
+    # The ``Renderer`` interface: states.
+
+    def render(
+        self, state: Gaussians, camera: CameraArrays, features: Array | None = None, depth_channel: int = -1
+    ) -> Picture:
+        """See ``Renderer.render``."""
+        shown = features_seen(state, camera) if features is None else features
+        background = np.zeros(shown.shape[1], np.float32)
+        background[: min(CHANNELS, len(background))] = self._background[: len(background)]
+        given = (state.means, state.factors, state.opacities, shown, camera, background)
+        return self.rasterizer.forward(*given, depth_channel)
+
+    def compare(self, state: Gaussians, view: TrainingView, features: Array | None = None) -> Comparison:
+        """See ``Renderer.compare``."""
+        shown = features_seen(state, view.camera) if features is None else features
+        self.measure(state.means, state.factors, state.opacities, shown, view)
+        return Comparison(self.psnr, self.image_part, self.mask_part, self.colour_shift(view))
+
+    def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
+        """See ``Renderer.gather``."""
+        self.render(state, camera, state.features(state.colours))
+        g_image, _ = self.rasterizer.gradient_buffers()
+        g_image[:] = 0
+        g_image[: len(planes), : camera.height, : camera.width] = planes
+        sums = self.rasterizer.feature_gradients(g_image)[:, : len(planes)].copy()
+        g_image[:] = 0
+        return sums
+
+    def residuals(
+        self, state: Gaussians, view: TrainingView, learnt: NDArray[np.uint8], most: float
+    ) -> tuple[Array, Array]:
+        """See ``Renderer.residuals``."""
+        tiles_x, tiles_y = tile_grid(view.camera)
+        drawing = Drawing(np.full(tiles_x * tiles_y, 2**64 - 1, np.uint64), learnt)
+        shown = features_seen(state, view.camera)
+        given = (state.means, state.factors, state.opacities, shown, view.camera, self._background)
+        self.rasterizer.forward(*given, drawing=drawing)
+        return self._lacking(view, most)
+
+    def reached(self, state: Gaussians, rows: NDArray[np.int64], camera: CameraArrays) -> NDArray[np.bool_]:
+        """See ``Renderer.reached``."""
+        features = np.zeros((len(state), CHANNELS), np.float32)
+        means, factors, opacities, features = (
+            np.take(array, rows, axis=0) for array in (state.means, state.factors, state.opacities, features)
+        )
+        return as_grid(blocks_of(self.rasterizer, means, factors, opacities, features, camera), camera)
+
+    # The loss of an iteration: arrays that change in place.
+
+    def load_state(self, previous: Gaussians) -> None:
+        """Take the state that a frame starts from; here nothing depends on it."""
+
+    def evaluate(
+        self,
+        means: Array,
+        factors: Array,
+        opacities: Array,
+        features: Array,
+        view: TrainingView,
+        lap: Callable[[str], None] = no_lap,
+    ) -> Gradients:
+        """Render the view, set ``image_part``, ``mask_part`` and ``psnr`` (dB), and return the gradients.
+
+        The gradients are buffers, valid until the next call.
+
+        Args:
+            means, factors, opacities, features: [N, 3], [N, 3, 3], [N], [N, 4] (RGB, label), float32.
+            lap: called when each stage is done.
+        """
+        self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background)
+        lap("render")
+        g_image, g_alpha = self.rasterizer.gradient_buffers()
+        self._compare(view, g_image)
+        lap("picture loss")
+        gradients = self.rasterizer.backward(g_image, g_alpha, self._detached)
+        lap("render backward")
+        return gradients
+
+    def measure(self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView) -> None:
+        """Render the view and set ``image_part``, ``mask_part`` and ``psnr``, without gradients; see ``evaluate``."""
+        self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background)
+        g_image, _ = self.rasterizer.gradient_buffers()
+        self._compare(view, g_image)
+
+    def shown(self, view: TrainingView) -> Picture:
+        """The view's whole picture as ``evaluate`` rendered it last; valid until anything else is rendered."""
+        return self.rasterizer.picture
+
+    def colour_shift(self, view: TrainingView) -> tuple[float, float, float]:
+        """Mean of the view's picture minus mean of what was rendered for it last, exposure included, RGB in 0…1."""
+        height, width = view.camera.height, view.camera.width
+        rendered = means(self.rasterizer.planes[:3, :height, :width])
+        shown = view.exposure[:3, 0] * rendered + view.exposure[:3, 1]
+        red, green, blue = (view.mean - shown).tolist()
+        return red, green, blue
+
+    def _compare(self, view: TrainingView, g_image: Array) -> None:
+        """Fill the losses of what was rendered, and its gradient."""
+        channels, height, width = view.target.shape
+        rows = np.empty((channels, height, 2), np.float32)
+        g_exposure = np.empty((channels, height, 2), np.float32)
+        image_loss.image_loss(
+            self.rasterizer.planes, view.exposure, view.target, *self._moments(view), self._weights[:channels],
+            height * width, self._scratch_of(channels, height, width), image_loss.EVERYWHERE, g_image, rows,
+            g_exposure,
+        )  # fmt: skip
+        g_image[channels:] = 0
+        sums = rows.sum(axis=1, dtype=np.float64)
+        self.image_part, self.mask_part = float(sums[:3, 0].sum()), float(sums[3:, 0].sum())
+        self.psnr = 10 * log10(3 * height * width / max(float(sums[:3, 1].sum()), SMALLEST_SQUARE))
+        self.exposure_gradient[:channels] = g_exposure.sum(axis=1)
+
+    def _lacking(self, view: TrainingView, most: float) -> tuple[Array, Array]:
+        """The sums of ``residuals`` over what was drawn."""
+        height, width = view.camera.height, view.camera.width
+        g_image, _ = self.rasterizer.gradient_buffers()
+        gain, offset = view.exposure[:3, :1, None], view.exposure[:3, 1:, None]
+        here = (slice(None, 3), slice(height), slice(width))
+        g_image[here] = np.clip((view.target[:3] - offset) / gain - self.rasterizer.planes[here], -most, most)
+        g_image[LABEL, :height, :width] = 1
+        sums = self.rasterizer.feature_gradients(g_image)
+        return sums[:, :3].copy(), sums[:, LABEL].copy()
+
+    def _moments(self, view: TrainingView) -> Moments:
+        """[C, H, W] twice: SSIM's windowed means of a view's target and of its square."""
+        moments = _moments.get(view)
+        if moments is None:
+            moments = np.empty_like(view.target), np.empty_like(view.target)
+            image_loss.target_moments(view.target, self._scratch_of(*view.target.shape), *moments)
+            _moments[view] = moments
+        return moments
+
+    def _scratch_of(self, channels: int, height: int, width: int) -> Array:
+        """Zero-bordered scratch of the image loss, one for each size of picture."""
+        key = (channels, height, width)
+        if key not in self._scratch:
+            padded = (6, channels, height + 2 * image_loss.REACH, image_loss.stride(width))
+            self._scratch[key] = np.zeros(padded, np.float32)
+        return self._scratch[key]
+
+
+def forget_moments(view: TrainingView) -> None:
+    """Free the moments of a view, of which its renderer has kept the part that it needs."""
+    _moments.pop(view, None)
+
+
+def blocks_of(
+    rasterizer: CpuRasterizer, means: Array, factors: Array, opacities: Array, features: Array, camera: CameraArrays
+) -> NDArray[np.uint64]:
+    """[tiles] blocks of a picture that the supports of Gaussians meet."""
+    splats, rects, _ = rasterizer.project(means, factors, opacities, features, camera)
+    tiles_x, tiles_y = tile_grid(camera)
+    marks = np.zeros(tiles_x * tiles_y, np.uint64)
+    tiles.mark_blocks(splats, rects, np.ones(len(rects), np.uint8), tiles_x, marks)
+    return marks

@@ -1,0 +1,117 @@
+"""Makes the training views of a frame: pictures at the size of the inside rig's cameras, exposures, masks."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scas4d_core.cameras import Rig
+from scas4d_core.captures.frame import Frame
+from scas4d_core.captures.images import area_average, resize_area
+from scas4d_core.engines.views import CameraArrays, TrainingView
+
+Array = NDArray[np.float32]
+
+
+class ViewFactory:
+    """Makes the training views of each frame of a rig; keeps the cameras.
+
+    Args:
+        rig: the cameras inside. source: the cameras as the pictures come in, where they are to be resized.
+
+    Attributes:
+        posed: the rig as it stands by now, of which the views are.
+    """
+
+    def __init__(self, rig: Rig, source: Rig | None = None) -> None:
+        self.rig = self.posed = rig
+        self._source = source
+
+    def scaled(self, frame: Frame) -> Frame:
+        """The frame with its pictures of the rig's cameras at the size that those have.
+
+        Raises:
+            ValueError: a picture or a mask is not of the size that it should come in.
+        """
+        if self._source is None:
+            return frame
+        images, masks = {}, {}
+        for camera in self.rig.cameras:
+            name, size = camera.name, (camera.width, camera.height)
+            if name in frame.images:
+                image, mask = pictures_of(frame, name, (self._source[name].width, self._source[name].height))
+                images[name] = resize_area(image, size)
+                if mask is not None:
+                    masks[name] = (resize_area(255 * mask, size) >= 128).astype(np.uint8)
+        return Frame(frame.index, frame.time, images, masks)
+
+    def views(self, frame: Frame, exposures: dict[str, Array], use_masks: bool = True) -> list[TrainingView]:
+        """The views of a frame, in the rig's order; cameras that the frame lacks are left out.
+
+        Args:
+            exposures: [3, 2] gain and offset per camera; a camera that is not named has 1 and 0.
+
+        Raises:
+            ValueError: a picture's size is not its camera's, or no camera of the rig is in the frame.
+        """
+        views = []
+        for name in self.rig.names:
+            if name not in frame.images:
+                continue
+            camera = CameraArrays.of(self.posed[name])
+            image, mask = pictures_of(frame, name, (camera.width, camera.height), use_masks)
+            masked = mask is not None
+            target = np.empty((3 + masked, camera.height, camera.width), np.float32)
+            np.multiply(np.moveaxis(image, -1, 0), np.float32(1 / 255), out=target[:3])
+            if masked:
+                target[3] = mask
+            exposure = np.tile(np.array([1, 0], np.float32), (3 + masked, 1))
+            exposure[:3] = exposures.get(name, exposure[:3])
+            views.append(TrainingView(name, camera, target, exposure))
+        if not views:
+            raise ValueError(f"frame {frame.index} has none of the rig's cameras ({', '.join(self.rig.names)})")
+        return views
+
+    def coarser(self, view: TrainingView, scale: float) -> TrainingView:
+        """The view with its pictures resized by area averaging, and the camera that sees them so."""
+        camera = self.posed[view.name].scaled(scale)
+        target = np.moveaxis(view.target, 0, -1)
+        rows, columns = view.camera.height // camera.height, view.camera.width // camera.width
+        if (rows * camera.height, columns * camera.width) == (view.camera.height, view.camera.width):
+            small = target.reshape(camera.height, rows, camera.width, columns, -1).mean(axis=(1, 3))
+        else:
+            small = area_average(target.astype(np.float64), (camera.width, camera.height)).astype(np.float32)
+        planes = np.ascontiguousarray(np.moveaxis(small, -1, 0))
+        return TrainingView(view.name, CameraArrays.of(camera), planes, view.exposure)
+
+    def retouched(self, view: TrainingView, target: Array) -> TrainingView:
+        """The view with other planes [C, H, W] of the same size."""
+        return TrainingView(view.name, view.camera, target, view.exposure)
+
+    def cropped(self, view: TrainingView, left: int, top: int, right: int, bottom: int) -> TrainingView:
+        """The part of a view in a rectangle of whole pixels, ``right`` and ``bottom`` excluded."""
+        lens = view.camera.lens.copy()
+        lens[2:] = lens[2] - left, lens[3] - top, right - left, bottom - top
+        camera = view.camera._replace(lens=lens, width=right - left, height=bottom - top)
+        target = np.ascontiguousarray(view.target[:, top:bottom, left:right])
+        return TrainingView(view.name, camera, target, view.exposure)
+
+
+def pictures_of(
+    frame: Frame, name: str, size: tuple[int, int], use_masks: bool = True
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+    """A camera's picture [H, W, 3] and mask [H, W] (None where there is none), of the size (width, height).
+
+    Raises:
+        ValueError: they are of another size.
+    """
+    width, height = size
+    image = frame.images[name]
+    mask = frame.masks[name] if use_masks and name in frame.masks else None
+    for what, array, shape in (("picture", image, (height, width, 3)), ("mask", mask, (height, width))):
+        if array is not None and array.shape != shape:
+            raise ValueError(
+                f"frame {frame.index}, camera {name!r}: {what} is {'x'.join(map(str, array.shape[1::-1]))} "
+                f"(array {array.shape}), the rig says {width}x{height} (array {shape})"
+            )
+    return image, mask
