@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from scas4d_core.engines.renderer import Renderer
     from scas4d_core.engines.views import TrainingView
     from scas4d_core.gaussians import Gaussians
+    from scas4d_core.update.result import UpdateTrace
 
 Bool = NDArray[np.bool_]
 Array = NDArray[np.float32]
