@@ -96,14 +96,14 @@ def test_they_come_and_go(populated: None) -> None:
     born = history.gaussians(2).means[COUNT], history.gaussians(3).means[COUNT]
     assert np.linalg.norm(born[1] - born[0]) > 1e-3
     assert not any(history.report(index)["cold"] for index in (3, 4, 5))  # the motion went over to the new clusters
-    carried = scene._carried.effects[NAME]
+    carried = scene._prepared.carried.effects[NAME]
     assert len(carried["rows"]) == COUNT + 6
     assert carried["seen"].shape == ()
 
 
 def test_what_effects_carry_is_lengthened_by_the_founders(populated: None) -> None:
     scene = go_on(start(History(), masks=True), FRAMES[True][:3])
-    assert scene._carried.effects[NAME]["rows"][-4:].tolist() == [3, 0, 3, COUNT - 1]
+    assert scene._prepared.carried.effects[NAME]["rows"][-4:].tolist() == [3, 0, 3, COUNT - 1]
 
 
 @pytest.mark.parametrize("masks", [True, False])
@@ -114,8 +114,8 @@ def test_resumed_after_any_frame_it_goes_on_with_the_same_bits(populated: None, 
         whole.step(frame)
         shutil.copytree(tmp_path / "live", tmp_path / f"after {frame.index}")
     if not masks:
-        assert whole._carried.labels is not None
-        assert len(whole._carried.labels) == COUNT + 6
+        assert whole._prepared.carried.labels is not None
+        assert len(whole._prepared.carried.labels) == COUNT + 6
     for index in range(2, len(frames) - 1):
         folder = shutil.copytree(tmp_path / f"after {index}", tmp_path / f"again {index}")
         scene = Reconstruction.resume(RIG, SETTINGS, History.open(folder))

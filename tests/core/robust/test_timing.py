@@ -164,7 +164,7 @@ def test_a_scene_goes_on_with_its_looks(undisturbed: tuple[Reconstruction, list[
         again = Reconstruction.resume(FOOTAGE.rig, FOOTAGE.settings, History.open(tmp_path / "scene"))
     assert again.resumed is not None
     assert not again.resumed.cold
-    assert again._carried.past.timing
+    assert again._prepared.carried.past.timing
     assert play(again, range(9, 19), APART_BY)[-1].timing == undisturbed[1][-1].timing
 
 

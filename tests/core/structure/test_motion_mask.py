@@ -74,7 +74,7 @@ def test_until_something_is_seen_to_move_nothing_does() -> None:
     assert [report.outcome for report in reports] == 2 * [FrameOutcome.STOOD]
     assert [report.attempts for report in reports] == 2 * [["nothing is seen to move"]]
     np.testing.assert_array_equal(scene.history.newest.means, BOX.means)
-    assert len(scene._carried.seen) == len(RIG)
+    assert len(scene._prepared.carried.seen) == len(RIG)
 
 
 def test_a_camera_that_is_off_ends_the_rest() -> None:
