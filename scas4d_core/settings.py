@@ -337,7 +337,14 @@ class Settings(SettingsModel):
         description='Effects (docs/effects.md) that are pinned "on" or "off", by name; the others are "auto": on where '
         "the scene calls for them.",
     )
-    device: Literal["cpu", "cuda"] = Field("cpu", description="Where the update runs.")
+    device: Literal["cpu"] = Field("cpu", description="Where the update runs: the CPU; it is the only engine so far.")
+
+    @field_validator("device", mode="before")
+    @classmethod
+    def _has_an_engine(cls, device: object) -> object:
+        if device != "cpu":
+            raise InputError(f"device {device!r} has no engine; updates run on the CPU so far", "give 'cpu'")
+        return device
 
     @field_validator("effects")
     @classmethod

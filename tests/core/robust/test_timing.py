@@ -215,7 +215,7 @@ def test_frames_and_cameras_that_are_not_believed_say_nothing(tmp_path: Path, mo
 
 
 def test_others_are_looked_at_in_each_frame(undisturbed: tuple[Reconstruction, list[FrameReport]]) -> None:
-    rows = undisturbed[0]._carried.past.timing
+    rows = undisturbed[0]._prepared.carried.past.timing
     assert rows.keys() == set(FOOTAGE.rig.names)
     assert min(Looks(*row).last for row in rows.values()) >= 10
 
