@@ -102,7 +102,7 @@ class ViewRenderer:
         return View(colour, alpha, depth, parts)
 
     def _parts_picture(self, gaussians: Gaussians, labels: NDArray[Any], camera: CameraArrays) -> NDArray[np.uint8]:
-        """[H, W] uint8: the label whose Gaussians weigh most in the pixel, plus 1. A pass renders ``CHANNELS`` labels."""
+        """[H, W] uint8: the label whose Gaussians weigh most in the pixel, plus 1. A pass has ``CHANNELS`` labels."""
         if labels.shape != (len(gaussians),) or not ((labels >= -1) & (labels <= MOST_LABEL)).all():
             raise ValueError(
                 f"labels {labels.shape} must be [{len(gaussians)}], one a Gaussian, each in -1...{MOST_LABEL}"
