@@ -118,7 +118,7 @@ def preset(name: str, *changes: Mapping[str, Any]) -> Settings:
 
     >>> preset("adaptive").update.iterations
     50
-    >>> preset("adaptive", {"update": {"iterations": 20}}, {"device": "cuda"}).update.iterations
+    >>> preset("adaptive", {"update": {"iterations": 20}}, {"device": "cpu"}).update.iterations
     20
     """
     if name not in PRESETS:
