@@ -12,6 +12,8 @@ import pytest
 from effect_cases import UPDATE, same, updated
 from source_tree import ROOT
 
+from scas4d_core import settings as settings_module
+from scas4d_core.effect_names import EFFECT_NAMES
 from scas4d_core.effects import effect as effect_module
 from scas4d_core.effects.registry import EFFECTS
 from scas4d_core.effects.switches import first_switches, names_on
@@ -28,7 +30,7 @@ def test_the_table_is_todays() -> None:
 
 @pytest.fixture
 def drag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """The example of the page, its file and its line in place."""
+    """The example of the page, its file and both its lines in place."""
     line = re.search(r'^    "(\w+)": "([\w.]+)",$', PAGE, re.MULTILINE)
     assert line is not None
     name, place = line.groups()
@@ -37,6 +39,7 @@ def drag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     (tmp_path / f"{module}.py").write_text(source)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setitem(EFFECTS, name, module)
+    monkeypatch.setattr(settings_module, "EFFECT_NAMES", (*EFFECT_NAMES, name))
     effect_module.effect.cache_clear()
     yield name
     sys.modules.pop(module, None)

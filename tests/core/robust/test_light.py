@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from scas4d_core.captures.frame import Frame
-from scas4d_core.effects.registry import Mode
+from scas4d_core.effect_names import Mode
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.frame_report import FrameReport
