@@ -70,7 +70,7 @@ class FrameReport:
     """Report of frame 0, or of the update of a frame.
 
     Attributes:
-        outcome: of the frame; ``frame_outcome.outcome_of`` reads it from a record of any version.
+        outcome: of the frame.
         seconds: by stage; ``report`` is what this report costs, and the writing of the one before.
         loss: each iteration's weighted sum; of frame 0 at most ``REPORTED_LOSSES`` means.
         psnr: dB, over the training views of the last iterations, each as it was rendered then; NaN where not measured.
