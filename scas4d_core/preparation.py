@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.captures.frame import Frame
+from scas4d_core.checkpoint import CarryOver
 from scas4d_core.effects.appearance.camera_gain import known_gains
 from scas4d_core.effects.cameras.pose_drift import posed
 from scas4d_core.effects.coherence.floor import floor_inside
@@ -41,7 +42,6 @@ from scas4d_core.frame_outcome import FrameOutcome
 from scas4d_core.gaussians import UNBORN, Gaussians
 from scas4d_core.settings import Settings
 from scas4d_core.storage.births import FOUNDERLESS, grown_roots
-from scas4d_core.storage.checkpoint import CarryOver
 from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.structure.motion_mask import labelled, labels_learnt
 from scas4d_core.structure.neighbours import Neighbours, build_neighbours

@@ -17,6 +17,7 @@ from numba import get_num_threads
 
 from scas4d_core.cameras import Rig, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
+from scas4d_core.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, cold_start, find_commit
 from scas4d_core.effects.evidence import FitTime, Seen
 from scas4d_core.effects.switches import kept_of, switches_record
 from scas4d_core.errors import StepError
@@ -36,7 +37,6 @@ from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.solve_frame import FrameSolver
 from scas4d_core.robust.update_input import RESTING, UpdateInput
 from scas4d_core.settings import Settings, UpdateSettings
-from scas4d_core.storage.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, cold_start, find_commit
 from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.structure.motion_mask import first_labels, labelled
 from scas4d_core.torch_backend.device import require_device

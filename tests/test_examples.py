@@ -55,7 +55,7 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "scas4d_core.presets": ("preset",),
     "scas4d_core.reconstruction": ("Reconstruction",),
     "scas4d_core.settings": ("SceneSettings", "StaticSettings", "UpdateSettings"),
-    "scas4d_core.storage.checkpoint": ("Checkpoints",),
+    "scas4d_core.checkpoint": ("Checkpoints",),
     "scas4d_core.storage.history": ("History",),
     "scas4d_core.storage.npz": ("read_npz", "write_npz"),
     "scas4d_core.structure.hierarchy": ("build_hierarchy",),

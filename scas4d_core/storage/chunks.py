@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from scas4d_core.compact import CompactReader, FileError
+from scas4d_core.compact import CompactReader, FileError, FormatError
 from scas4d_core.errors import message_of
 from scas4d_core.storage.births import Int
 from scas4d_core.storage.frame_arrays import EVENTS, Arrays, Stamp
@@ -42,7 +42,7 @@ class Chunk:
         path: of it. size, changed: bytes, and time of change in ns, when it was looked at.
         times: seconds of its frames by index. stamps: of its frames: bytes of the file that they take, and −1 less
             the checksum of the state, which no file of a frame of its own has.
-        damage: why frames after those are not listed; None where nothing is wrong.
+        damage: why frames after those are not listed; None where nothing is wrong. foreign: it is of another format.
     """
 
     path: Path
@@ -51,6 +51,7 @@ class Chunk:
     times: dict[int, float] = field(default_factory=dict)
     stamps: dict[int, Stamp] = field(default_factory=dict)
     damage: str | None = None
+    foreign: bool = False
 
     @property
     def first(self) -> int:
@@ -129,6 +130,11 @@ class Chunks:
     def damages(self) -> list[str]:
         """A sentence for each chunk that is damaged so that frames of it are not listed."""
         return [chunk.damage for chunk in self.known.values() if chunk.damage is not None]
+
+    @property
+    def foreign(self) -> list[str]:
+        """A sentence for each chunk of another format."""
+        return [str(chunk.damage) for chunk in self.known.values() if chunk.foreign]
 
     def read(self, index: int, names: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
         """Arrays of a frame, as its own file would have them; ``report`` is its note.
@@ -270,7 +276,9 @@ def _listed(path: Path, status: os.stat_result) -> Chunk:
             stamps = {index: (taken, -1 - checksum) for index, taken, checksum in reader.sizes()}
             return Chunk(path, size, changed, times, stamps, reader.damage)
     except (FileError, OSError) as error:
-        return Chunk(path, size, changed, damage=f"{path.name}: {message_of(error)}")
+        return Chunk(
+            path, size, changed, damage=f"{path.name}: {message_of(error)}", foreign=isinstance(error, FormatError)
+        )
 
 
 @contextmanager

@@ -23,6 +23,9 @@ from scas4d_core.storage.chunks import Chunks
 from scas4d_core.storage.frame_arrays import Arrays, Stamp
 from scas4d_core.storage.npz import read_npz, sync_folder, verify, write_npz
 
+FORMAT = 1
+"""Of a folder of states, in ``fixed.npz``; a folder of another format is refused."""
+_FORMAT = "format"
 INDEX = "index"
 """Array in the copy of the first frame: its index."""
 
@@ -34,6 +37,10 @@ _BORN_FILE = re.compile(r"born_(\d{6,})(\.copy)?\.npz")
 
 class HistoryError(ValueError):
     """A history that cannot be extended or read; the message names the frame or file, the fault and the remedy."""
+
+
+class OtherFormatError(HistoryError):
+    """Files of another format than this scas4d reads; they stay as they are."""
 
 
 class UnreadableFrameError(HistoryError):
@@ -125,8 +132,8 @@ class FrameFiles:
 
     def write_fixed(self, arrays: Arrays, index: int, first: Mapping[str, Any]) -> None:
         """Writes the arrays that all frames share, and both copies; before the first frame, ``index``, is committed."""
-        write_npz(self.fixed, arrays)
-        write_npz(self.fixed_copy, arrays)
+        write_npz(self.fixed, with_format(arrays))
+        write_npz(self.fixed_copy, with_format(arrays))
         write_npz(self.first_copy, {**first, INDEX: np.int64(index)})
 
     def time(self, index: int, stamp: Stamp | None = None) -> float:
@@ -179,6 +186,20 @@ class FrameFiles:
             return self.chunks.fault(index)
         return fault_of(self.path(index))
 
+    def require_format(self) -> None:
+        """Looks at the format of the folder, where a file that names it can be read.
+
+        Raises:
+            OtherFormatError: it is another than ``FORMAT``.
+        """
+        try:
+            known = self._either(self.fixed, self.fixed_copy, (), (_FORMAT,))
+        except UnreadableFrameError:  # reading the states says so
+            return
+        written = int(known[_FORMAT]) if _FORMAT in known else None
+        if written != FORMAT:
+            raise other_format(f"{self.directory.name}, a folder of states,", written, FORMAT)
+
     def read_fixed(self, names: Sequence[str]) -> Arrays:
         """Named arrays of those that all frames share.
 
@@ -204,14 +225,14 @@ class FrameFiles:
         """Frames with a file of the born, committed or not, rising."""
         return sorted({index for name in os.listdir(self.directory) if (index := born_of(name)) is not None})
 
-    def _either(self, path: Path, copy: Path, names: Sequence[str] | None) -> Arrays:
+    def _either(self, path: Path, copy: Path, names: Sequence[str] | None, optional: Sequence[str] = ()) -> Arrays:
         try:
-            return _read(path, names)
+            return _read(path, names, optional)
         except (FileNotFoundError, UnreadableFrameError) as error:
             reason = _reason(path, error)
             self.faults[path.name] = reason
             try:
-                return _read(copy, names)
+                return _read(copy, names, optional)
             except FileNotFoundError:
                 raise UnreadableFrameError(reason) from error
 
@@ -226,7 +247,7 @@ class FrameFiles:
             The fault of each file that was written, by name. A file without a whole copy is left.
         """
         mended: dict[str, str] = {}
-        needed = {self.fixed: fixed, self.fixed_copy: fixed}
+        needed = dict.fromkeys((self.fixed, self.fixed_copy), with_format(fixed))
         for index, arrays in born.items():
             needed |= {self.directory / born_file(index, copy): arrays for copy in (False, True)}
         for file, arrays in needed.items():
@@ -282,6 +303,27 @@ class FrameFiles:
     def sync(self) -> None:
         """Syncs the directory: deleted files stay deleted after a power cut."""
         sync_folder(self.directory)
+
+
+def other_format(what: str, written: int | None, read: int) -> OtherFormatError:
+    """The refusal of files of another format.
+
+    Args:
+        what: is of that format. written: it, None where the files name none. read: the format that is read.
+
+    >>> str(other_format("states, a folder,", 3, 1))[:54]
+    'states, a folder, has format 3; this scas4d reads form'
+    """
+    known = "names no format" if written is None else f"has format {written}"
+    return OtherFormatError(
+        f"{what} {known}; this scas4d reads format {read}: "
+        "use the scas4d that wrote it, or begin the scene again from its pictures"
+    )
+
+
+def with_format(fixed: Arrays) -> Arrays:
+    """The arrays of ``fixed.npz``: those that all frames share, and the format of the folder."""
+    return {**fixed, _FORMAT: np.asarray(FORMAT, np.int64)}
 
 
 def frame_file(index: int) -> str:

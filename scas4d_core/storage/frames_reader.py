@@ -20,6 +20,7 @@ from scas4d_core.storage.frame_files import (
     DamagedFrameError,
     FrameFiles,
     HistoryError,
+    OtherFormatError,
     UnreadableFrameError,
     frame_file,
 )
@@ -65,14 +66,18 @@ class FramesReader:
             only: the frames that are read, where these are known; else every file of the directory is looked at.
 
         Raises:
-            HistoryError: no history there, or the file that all frames need is damaged.
+            HistoryError: no history there, or the file that all frames need is damaged. OtherFormatError: the folder,
+                or a compact file in it, is of another format.
         """
         files = FrameFiles(Path(directory))
         if not files.exists:
             raise HistoryError(f"{files.directory.name} holds no history: {files.fixed.name} is missing")
+        files.require_format()
         history = cls()
         history._files = files
         history.refresh(only)
+        if foreign := files.chunks.foreign:
+            raise OtherFormatError("; ".join(foreign))
         if history._stamps:
             history._fixed = files.read_fixed(FIXED)
         return history
@@ -209,10 +214,10 @@ class FramesReader:
             HistoryError: its file is damaged, and the copy as well.
         """
         if self._background is None and self._times:
-            found = self.report(next(iter(self._times))).get("background")
-            if found is None:  # of an earlier version; or the first frame cannot be read, for now
+            given = self.report(next(iter(self._times))).get("background")
+            if given is None:  # its report was lost
                 return 0.0, 0.0, 0.0
-            red, green, blue = found
+            red, green, blue = given
             self._background = (red, green, blue)
         return self._background or (0.0, 0.0, 0.0)
 

@@ -8,7 +8,7 @@
 The values that one update passes through, from ``Reconstruction.step`` to the commit:
 
 1. ``training_view.TrainingView``: one camera's pictures of the frame.
-2. ``storage.checkpoint.CarryOver``: all that the update before left beside Θ_{t−1}; in the end, that of this one.
+2. ``checkpoint.CarryOver``: all that the update before left beside Θ_{t−1}; in the end, that of this one.
 3. ``robust.outliers.Past``: the usual figures of the scene and its cameras; a part of the carry-over.
 4. ``warm_start.Motion``: the motion that was found; a part of the carry-over.
 5. ``robust.update_input.UpdateInput``: the above, and the limits in time, for one frame.

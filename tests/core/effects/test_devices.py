@@ -12,6 +12,7 @@ from box_scene import moved, take_frame
 from effect_cases import BEFORE, RIG, UPDATE, builder
 
 from scas4d_core.cameras import WorldFrame
+from scas4d_core.checkpoint import CarryOver
 from scas4d_core.effects import effect as effect_module
 from scas4d_core.effects.appearance.colours import Colours
 from scas4d_core.effects.effect import Effect, Group
@@ -23,7 +24,6 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import Preparation
 from scas4d_core.presets import SettingError, preset
 from scas4d_core.settings import Settings
-from scas4d_core.storage.checkpoint import CarryOver
 from scas4d_core.structure.neighbours import build_neighbours
 from scas4d_core.torch_backend.device_update import DeviceUpdate
 from scas4d_core.update.picture_loss import PictureLoss

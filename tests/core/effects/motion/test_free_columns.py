@@ -10,13 +10,13 @@ import pytest
 from box_scene import MOVING, moved, take_frame
 from effect_cases import BEFORE, RIG, UPDATE, builder, same
 
+from scas4d_core.checkpoint import CarryOver
 from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
 from scas4d_core.effects.motion.free_columns import MOVES
 from scas4d_core.effects.switches import first_switches, joined, names_on
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.presets import SettingError, preset
 from scas4d_core.settings import Settings, UpdateSettings
-from scas4d_core.storage.checkpoint import CarryOver
 from scas4d_core.structure.neighbours import build_neighbours
 from scas4d_core.torch_backend.device_update import DeviceUpdate
 from scas4d_core.update import frame_update

@@ -26,7 +26,7 @@ from scas4d_core.effects.switches import Switches, switches_of, switches_record
 from scas4d_core.errors import message_of
 from scas4d_core.frame_outcome import FrameOutcome
 from scas4d_core.robust.outliers import Past
-from scas4d_core.storage.frame_files import checkpoint_file, checkpoint_of
+from scas4d_core.storage.frame_files import OtherFormatError, checkpoint_file, checkpoint_of, other_format
 from scas4d_core.storage.history import NEWEST_KEPT, History, HistoryError
 from scas4d_core.storage.npz import read_npz, write_npz
 from scas4d_core.update.picture_loss import ViewFactory
@@ -35,7 +35,7 @@ from scas4d_core.update.training_view import TrainingView
 from scas4d_core.update.warm_start import Motion
 
 FORMAT = 2
-"""Version of a checkpoint's file; others are refused."""
+"""Of a checkpoint's file; a scene with one of another format is not resumed."""
 
 
 class CheckpointError(ValueError):
@@ -144,7 +144,7 @@ class Checkpoints:
             factory: of the scene's views; makes views of the pictures.
 
         Raises:
-            CheckpointError: it is not there, damaged, or of another format.
+            CheckpointError: it is not there, or damaged. OtherFormatError: it is of another format.
         """
         file = self._file(index)
         try:
@@ -154,7 +154,7 @@ class Checkpoints:
             if missing:
                 raise ValueError(f"{file.name}: {', '.join(sorted(missing))} went missing")
             if int(arrays["format"]) != FORMAT:
-                raise ValueError(f"{file.name}: format {int(arrays['format'])}, this version reads {FORMAT}")
+                raise other_format(f"{file.name}, a checkpoint,", int(arrays["format"]), FORMAT)
             pictures = {name[5:]: array for name, array in arrays.items() if name.startswith("seen.")}
             seen = factory.views(Frame(index, 0.0, pictures, {}), {}, use_masks=False) if pictures else ()
             motion = _unpacked(arrays) if "motion.seconds" in arrays else None
@@ -165,6 +165,8 @@ class Checkpoints:
             return CarryOver(motion, labels, seen, structure, past, shown, switches, _by_effect(arrays))
         except FileNotFoundError:
             raise CheckpointError(f"{file.name} is missing") from None
+        except OtherFormatError:
+            raise
         except (ValueError, KeyError, TypeError) as error:
             raise CheckpointError(message_of(error)) from error
 
@@ -275,7 +277,7 @@ def find_commit(
         held: true for a committed frame whose pictures can be given again.
 
     Raises:
-        ResumeError: no state can be read.
+        ResumeError: no state can be read, or a checkpoint is of another format.
     """
     faults = list(history.damaged.values())
     whole: list[int] = []
@@ -287,6 +289,8 @@ def find_commit(
             whole.append(index)
             carry_over = checkpoints.load(index, factory)
             break
+        except OtherFormatError as error:
+            raise ResumeError(str(error)) from error
         except (HistoryError, CheckpointError) as error:
             faults.append(str(error))
             if index not in checkpoints.indices() and whole:
