@@ -26,7 +26,8 @@ from scas4d_core.effects.switches import Switches, switches_of, switches_record
 from scas4d_core.errors import message_of
 from scas4d_core.frame_outcome import FrameOutcome
 from scas4d_core.robust.outliers import Past
-from scas4d_core.storage.frame_files import OtherFormatError, checkpoint_file, checkpoint_of, other_format
+from scas4d_core.storage.faults import OtherFormatError, other_format
+from scas4d_core.storage.frame_files import checkpoint_file, checkpoint_of
 from scas4d_core.storage.history import NEWEST_KEPT, History, HistoryError
 from scas4d_core.storage.npz import read_npz, write_npz
 from scas4d_core.update.picture_loss import ViewFactory

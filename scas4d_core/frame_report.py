@@ -38,20 +38,6 @@ CHECKPOINTS = 10
 """Points of the curve of an update at most."""
 
 
-@dataclass(frozen=True)
-class Progress:
-    """Progress of a long task.
-
-    Attributes:
-        stage: in words. done, total: of its steps. detail: figures by name, as the loss.
-    """
-
-    stage: str
-    done: int
-    total: int
-    detail: dict[str, float] = field(default_factory=dict)
-
-
 class CurvePoint(TypedDict):
     """A point of an update's curve, as it is on disk.
 

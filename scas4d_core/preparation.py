@@ -24,6 +24,7 @@ from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
 from scas4d_core.effects.effect import Effect, effect
 from scas4d_core.effects.evidence import Seen
 from scas4d_core.effects.parts import Arrays, PartsBuilder
+from scas4d_core.effects.presence.motion_mask import labelled, labels_learnt
 from scas4d_core.effects.registry import EFFECTS
 from scas4d_core.effects.switches import (
     Switch,
@@ -43,7 +44,6 @@ from scas4d_core.gaussians import UNBORN, Gaussians
 from scas4d_core.settings import Settings
 from scas4d_core.storage.births import FOUNDERLESS, grown_roots
 from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
-from scas4d_core.structure.motion_mask import labelled, labels_learnt
 from scas4d_core.structure.neighbours import Neighbours, build_neighbours
 from scas4d_core.update.frame_update import FrameUpdate, Updater
 from scas4d_core.update.picture_loss import PictureLoss, ViewFactory

@@ -19,15 +19,17 @@ from scas4d_core.cameras import Rig, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, cold_start, find_commit
 from scas4d_core.effects.evidence import FitTime, Seen
+from scas4d_core.effects.presence.motion_mask import first_labels, labelled
 from scas4d_core.effects.switches import kept_of, switches_record
 from scas4d_core.errors import StepError
 from scas4d_core.first_frame.calibration.record import Calibration, in_use
 from scas4d_core.first_frame.calibration.refine import first_calibration
 from scas4d_core.first_frame.start import FirstFrame, as_begun, fit_first, with_background
 from scas4d_core.first_frame.static_result import StaticResult
-from scas4d_core.frame_report import FrameReport, Progress, report_of_first, report_of_update
+from scas4d_core.frame_report import FrameReport, report_of_first, report_of_update
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import Preparation, room_for_births
+from scas4d_core.progress import Progress
 from scas4d_core.query.committed import CommittedScene
 from scas4d_core.rasterize.limits import rig_limits
 from scas4d_core.rig_checks import check_rig
@@ -38,7 +40,6 @@ from scas4d_core.robust.solve_frame import FrameSolver
 from scas4d_core.robust.update_input import RESTING, UpdateInput
 from scas4d_core.settings import Settings, UpdateSettings
 from scas4d_core.storage.history import History, HistoryError
-from scas4d_core.structure.motion_mask import first_labels, labelled
 from scas4d_core.torch_backend.device import require_device
 from scas4d_core.update.frame_update import Updater
 from scas4d_core.update.picture_loss import PictureLoss, ViewFactory

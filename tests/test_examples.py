@@ -29,6 +29,7 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "scas4d_core.exports.spz": ("read_spz", "write_spz"),
     "scas4d_core.exports.tables": ("PoseTable", "TrackTable", "write_tracks"),
     "scas4d_core.exports.usd": ("UsdSequence",),
+    "scas4d_core.effects.presence.motion_mask": ("changed_pixels", "with_reliable_labels"),
     "scas4d_core.errors": ("message_of", "without_paths"),
     "scas4d_core.first_frame.initial_points": ("initial_points",),
     "scas4d_core.first_frame.start": ("fit_static_scene",),
@@ -59,7 +60,6 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "scas4d_core.storage.history": ("History",),
     "scas4d_core.storage.npz": ("read_npz", "write_npz"),
     "scas4d_core.structure.hierarchy": ("build_hierarchy",),
-    "scas4d_core.structure.motion_mask": ("changed_pixels", "with_reliable_labels"),
     "scas4d_core.structure.neighbours": ("build_neighbours",),
     "scas4d_core.torch_backend.deformation": (
         "cascade", "cluster_map", "cluster_pivots", "deform", "material_rotations", "polar_rotation",

@@ -20,6 +20,7 @@ import numpy as np
 
 from scas4d_core.compact import FileError
 from scas4d_core.storage.chunks import Chunks
+from scas4d_core.storage.faults import UnreadableFrameError, other_format
 from scas4d_core.storage.frame_arrays import Arrays, Stamp
 from scas4d_core.storage.npz import read_npz, sync_folder, verify, write_npz
 
@@ -33,22 +34,6 @@ FIXED_FILE, FIXED_COPY, FIRST_COPY = "fixed.npz", "fixed.copy.npz", "first.copy.
 _CHECKPOINT_FILE = re.compile(r"checkpoint_(\d{6,})\.npz")
 _FRAME_FILE = re.compile(r"frame_(\d{6,})\.npz")
 _BORN_FILE = re.compile(r"born_(\d{6,})(\.copy)?\.npz")
-
-
-class HistoryError(ValueError):
-    """A history that cannot be extended or read; the message names the frame or file, the fault and the remedy."""
-
-
-class OtherFormatError(HistoryError):
-    """Files of another format than this scas4d reads; they stay as they are."""
-
-
-class UnreadableFrameError(HistoryError):
-    """A frame that is not in the history, or whose file is damaged."""
-
-
-class DamagedFrameError(UnreadableFrameError):
-    """A frame whose file is damaged, in contrast to one that was deleted."""
 
 
 class FrameFiles:
@@ -303,22 +288,6 @@ class FrameFiles:
     def sync(self) -> None:
         """Syncs the directory: deleted files stay deleted after a power cut."""
         sync_folder(self.directory)
-
-
-def other_format(what: str, written: int | None, read: int) -> OtherFormatError:
-    """The refusal of files of another format.
-
-    Args:
-        what: is of that format. written: it, None where the files name none. read: the format that is read.
-
-    >>> str(other_format("states, a folder,", 3, 1))[:54]
-    'states, a folder, has format 3; this scas4d reads form'
-    """
-    known = "names no format" if written is None else f"has format {written}"
-    return OtherFormatError(
-        f"{what} {known}; this scas4d reads format {read}: "
-        "use the scas4d that wrote it, or begin the scene again from its pictures"
-    )
 
 
 def with_format(fixed: Arrays) -> Arrays:

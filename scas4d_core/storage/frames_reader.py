@@ -15,15 +15,9 @@ from numpy.typing import NDArray
 
 from scas4d_core.gaussians import FIXED
 from scas4d_core.storage.births import NO_EVENTS, Int
+from scas4d_core.storage.faults import DamagedFrameError, HistoryError, OtherFormatError, UnreadableFrameError
 from scas4d_core.storage.frame_arrays import EFFECTS, EVENTS, Arrays, Stamp, unpacked
-from scas4d_core.storage.frame_files import (
-    DamagedFrameError,
-    FrameFiles,
-    HistoryError,
-    OtherFormatError,
-    UnreadableFrameError,
-    frame_file,
-)
+from scas4d_core.storage.frame_files import FrameFiles, frame_file
 
 FRAMES_KEPT = 4
 """Frames of a history on disk that stay in memory: the newest, and the last ones read."""

@@ -21,7 +21,7 @@ from scas4d_core.storage.births import (
     revived_in,
     rows_among,
 )
-from scas4d_core.storage.frame_files import DamagedFrameError, HistoryError, UnreadableFrameError
+from scas4d_core.storage.faults import DamagedFrameError, HistoryError, UnreadableFrameError
 from scas4d_core.storage.frames_reader import FramesReader
 
 ROOT = "root."

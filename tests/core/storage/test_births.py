@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.storage.births import Life, grown_roots
-from scas4d_core.storage.frame_files import DamagedFrameError, HistoryError
+from scas4d_core.storage.faults import DamagedFrameError, HistoryError
 from scas4d_core.storage.history import History
 from scas4d_core.storage.npz import read_npz
 

@@ -11,7 +11,8 @@ from histories import filled, same, state
 
 from scas4d_core.checkpoint import Checkpoints
 from scas4d_core.errors import message_of, without_paths
-from scas4d_core.storage.frame_files import FIRST_COPY, FIXED_COPY, FIXED_FILE, DamagedFrameError
+from scas4d_core.storage.faults import DamagedFrameError
+from scas4d_core.storage.frame_files import FIRST_COPY, FIXED_COPY, FIXED_FILE
 from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.storage.npz import read_npz, verify, write_npz
 

@@ -16,7 +16,7 @@ from scas4d_core.compact import CompactWriter, FormatError, Head
 from scas4d_core.compact import head as head_module
 from scas4d_core.storage import frame_files
 from scas4d_core.storage.chunks import chunk_file
-from scas4d_core.storage.frame_files import HistoryError, OtherFormatError
+from scas4d_core.storage.faults import HistoryError, OtherFormatError
 from scas4d_core.storage.history import History
 from scas4d_core.storage.npz import read_npz, write_npz
 from scas4d_core.update.picture_loss import ViewFactory
