@@ -1,12 +1,12 @@
 """Checkpoints: the state of an update beside Θ_{t−1}, on disk, and the commit from which a scene is resumed.
 
-A scene whose process died goes on as if nothing had happened.
+A scene whose process died goes on with the same bits.
 
 Beside the frames of a ``History`` lies one ``checkpoint_<index>.npz`` for each of its newest commits. It is written,
 synced and renamed *before* the frame's own rename, which is the commit: a committed frame has its checkpoint, and a
 checkpoint without its frame does not count. The checkpoint before the newest is kept as well, in case the newest state
 or checkpoint is damaged. Facts that never change (exposures, presence of masks) are in the report of the first frame;
-clusters and neighbours are built again from the first frame, and a digest tells their changes.
+clusters and neighbours are built again from the first frame, and a digest shows whether they changed.
 """
 
 from __future__ import annotations
@@ -89,9 +89,9 @@ class CarryOver:
         )
         if result.outcome.held:
             return carried
-        # A change of another light has not moved; and what is too little to be seen from frame to frame adds up.
-        stands = self.labels is None and result.outcome is FrameOutcome.STOOD and bool(self.seen)
-        if views is not None and result.exposure == 1.0 and not stands:
+        # A change of another light is no motion; a motion too small to be seen between two frames adds up.
+        resting = self.labels is None and result.outcome is FrameOutcome.STOOD and bool(self.seen)
+        if views is not None and result.exposure == 1.0 and not resting:
             carried = replace(carried, seen=[view for view in views if view.name not in result.trace.left_out])
         return replace(carried, shown=shown)
 
@@ -150,12 +150,13 @@ class Checkpoints:
         file = self._file(index)
         try:
             arrays = read_npz(file)
+            written = int(arrays["format"]) if "format" in arrays else None
+            if written != FORMAT:
+                raise other_format(f"{file.name}, a checkpoint,", written, FORMAT)
             names = {str(name) for name in arrays.pop("names")}
             missing = names ^ set(arrays)
             if missing:
                 raise ValueError(f"{file.name}: {', '.join(sorted(missing))} went missing")
-            if int(arrays["format"]) != FORMAT:
-                raise other_format(f"{file.name}, a checkpoint,", int(arrays["format"]), FORMAT)
             pictures = {name[5:]: array for name, array in arrays.items() if name.startswith("seen.")}
             seen = factory.views(Frame(index, 0.0, pictures, {}), {}, use_masks=False) if pictures else ()
             motion = _unpacked(arrays) if "motion.seconds" in arrays else None
@@ -184,8 +185,8 @@ class Checkpoints:
 
     def indices(self) -> list[int]:
         """Frames that have a checkpoint, rising."""
-        found = (checkpoint_of(file.name) for file in self.directory.iterdir())
-        return sorted(index for index in found if index is not None)
+        listed = (checkpoint_of(file.name) for file in self.directory.iterdir())
+        return sorted(index for index in listed if index is not None)
 
     def _file(self, index: int) -> Path:
         return self.directory / checkpoint_file(index)
@@ -206,13 +207,13 @@ def _packed(motion: Motion) -> dict[str, Any]:
 
 def _by_effect(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Arrays]:
     """The arrays of effects, by effect and name, of those in a file."""
-    found: dict[str, Arrays] = {}
+    effects: dict[str, Arrays] = {}
     for key, array in arrays.items():
         kind, _, rest = key.partition(".")
         if kind == "effect":
             effect, _, name = rest.partition(".")
-            found.setdefault(effect, {})[name] = array
-    return found
+            effects.setdefault(effect, {})[name] = array
+    return effects
 
 
 def _unpacked(arrays: dict[str, NDArray[Any]]) -> Motion:

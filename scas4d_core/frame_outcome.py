@@ -218,5 +218,5 @@ def timing_warnings(timing: Mapping[str, CameraTiming] | None) -> list[str]:
     off = {name: one["frames"] for name, one in sorted((timing or {}).items()) if one["off"]}
     if not off:
         return []
-    told = ", ".join(f"{name!r} is {'late' if way > 0 else 'early'}" for name, way in off.items())
-    return [f"cameras are out of step: {told}; check their trigger or genlock"]
+    cameras = ", ".join(f"{name!r} is {'late' if way > 0 else 'early'}" for name, way in off.items())
+    return [f"cameras are out of step: {cameras}; check their trigger or genlock"]

@@ -118,8 +118,8 @@ class FrameReport:
     def warnings(self) -> list[str]:
         """Sentences on what looks wrong, or was too much for its time (``first_warnings``, ``timing_warnings``)."""
         named = {"cloud": self.cloud, "calibration": self.calibration}
-        told = {name: asdict(found) for name, found in named.items() if found is not None}
-        first = first_warnings({**told, "shortened": self.shortened, "grey": self.grey})
+        given = {name: asdict(value) for name, value in named.items() if value is not None}
+        first = first_warnings({**given, "shortened": self.shortened, "grey": self.grey})
         return [*first, *timing_warnings(self.timing)]
 
     def record(self) -> dict[str, Any]:

@@ -68,7 +68,7 @@ def as_begun(settings: Settings, history: History) -> Settings:
     """The settings with the background with which a scene began; as they are where its first frame cannot be read."""
     if settings.scene.background != "auto":
         return settings
-    with suppress(HistoryError, KeyError):
+    with suppress(HistoryError):
         return _over(settings, history.background)
     return settings
 

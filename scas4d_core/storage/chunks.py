@@ -79,10 +79,10 @@ class Chunks:
     def look(self) -> None:
         """Picks up chunks that are new, grew or are gone; others stay unopened."""
         firsts = sorted(first for name in os.listdir(self.directory) if (first := chunk_of(name)) is not None)
-        found = {first: chunk for first in firsts if (chunk := self._looked_at(first)) is not None}
-        for first in self.known.keys() - found.keys():
+        known = {first: chunk for first in firsts if (chunk := self._looked_at(first)) is not None}
+        for first in self.known.keys() - known.keys():
             self._close(self.known[first].path)
-        self.known, self._firsts = found, list(found)
+        self.known, self._firsts = known, list(known)
 
     def look_at(self, first: int) -> None:
         """Picks up the chunk that begins with a frame, which is new or grew."""
@@ -155,24 +155,24 @@ class Chunks:
             return self._read_from(chunk, index, names, optional)
 
     def _read_from(self, chunk: Chunk, index: int, names: Sequence[str], optional: Sequence[str]) -> Arrays:
-        found: Arrays = {}
+        arrays: Arrays = {}
         asked = {*names, *optional}
         if "time" in asked:
-            found["time"] = np.asarray(chunk.times[index], np.float64)
+            arrays["time"] = np.asarray(chunk.times[index], np.float64)
         if asked <= {"time"}:
-            return found
+            return arrays
         reader = self._reader(chunk)
         if "report" in asked:
             text = json.dumps(reader.note(index).get(REPORT, {}))
-            found["report"] = np.frombuffer(text.encode(), np.uint8)
+            arrays["report"] = np.frombuffer(text.encode(), np.uint8)
         if EVENTS in asked and len(log := _log(reader, index)):
-            found[EVENTS] = log
+            arrays[EVENTS] = log
         if asked - {"time", "report", EVENTS}:
-            arrays = reader.state(index).arrays()
-            found |= {name: arrays[name] for name in asked & arrays.keys()}
-        if missing := set(names) - found.keys():
+            state = reader.state(index).arrays()
+            arrays |= {name: state[name] for name in asked & state.keys()}
+        if missing := set(names) - arrays.keys():
             raise FileError(f"{chunk.path.name}: frame {index} has no {', '.join(sorted(missing))}")
-        return found
+        return arrays
 
     def reader(self, index: int) -> CompactReader:
         """An open reader of the chunk that holds a frame; it is this object's own.

@@ -65,39 +65,39 @@ class FrameFiles:
 
     def listed(self) -> dict[int, Stamp]:
         """Stamps of the frames in the directory, rising; the first one is listed also where only its copy exists."""
-        found: dict[int, Stamp] = {}
+        stamps: dict[int, Stamp] = {}
         with os.scandir(self.directory) as entries:
             for entry in entries:
                 if (index := frame_of(entry.name)) is None:
                     continue
                 try:
-                    found[index] = _stamp(entry.stat())
+                    stamps[index] = _stamp(entry.stat())
                 except FileNotFoundError:  # deleted, or compacted, meanwhile
                     continue
         self.chunks.look()  # after the files: a frame goes to a chunk before its own file goes
-        found = self.chunks.stamps() | found
+        stamps = self.chunks.stamps() | stamps
         first = self._first()
-        if found and first is not None and first[1] < min(found):
-            found[first[1]] = first[0]
-        return dict(sorted(found.items()))
+        if stamps and first is not None and first[1] < min(stamps):
+            stamps[first[1]] = first[0]
+        return dict(sorted(stamps.items()))
 
     def stamped(self, indices: Iterable[int]) -> dict[int, Stamp]:
         """Stamps of the given frames that exist, without listing the directory."""
-        found: dict[int, Stamp] = {}
+        stamps: dict[int, Stamp] = {}
         absent: list[int] = []
         for index in sorted(indices):
             try:
-                found[index] = _stamp(self.path(index).stat())
+                stamps[index] = _stamp(self.path(index).stat())
             except FileNotFoundError:
                 first = self._first()
                 if first is not None and first[1] == index:
-                    found[index] = first[0]
+                    stamps[index] = first[0]
                 else:
                     absent.append(index)
         if absent:
             self.chunks.look()
-        found |= {index: stamp for index in absent if (stamp := self.chunks.stamp(index)) is not None}
-        return dict(sorted(found.items()))
+        stamps |= {index: stamp for index in absent if (stamp := self.chunks.stamp(index)) is not None}
+        return dict(sorted(stamps.items()))
 
     def _first(self) -> tuple[Stamp, int] | None:
         """Stamp and frame of the copy of the first frame, if there is one that can be read."""
@@ -154,9 +154,9 @@ class FrameFiles:
                 if index in self.chunks:  # it was made again, or not deleted: the other is better than none
                     return self.chunks.read(index, names, optional)
                 raise
-            found = _read(self.first_copy, names, optional)
+            arrays = _read(self.first_copy, names, optional)
             self.faults[self.path(index).name] = _reason(self.path(index), error)
-            return found
+            return arrays
 
     def _from_chunk(self, index: int, names: Sequence[str], optional: Sequence[str]) -> Arrays:
         try:

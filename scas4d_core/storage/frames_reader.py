@@ -222,11 +222,11 @@ class FramesReader:
     def _left(self, index: int) -> NDArray[np.uint8] | None:
         """The same, packed; None: nothing."""
         self._require(index)
-        found = self._packed.get(index)
-        if found is None and self._files is not None:
+        left = self._packed.get(index)
+        if left is None and self._files is not None:
             with suppress(FileNotFoundError, UnreadableFrameError):  # the state may be whole all the same
-                found = self._files.read(index, (), (EFFECTS,)).get(EFFECTS)
-        return found
+                left = self._files.read(index, (), (EFFECTS,)).get(EFFECTS)
+        return left
 
     def _events(self) -> Int:
         """[E, 4] the log of the newest frame that can be read."""

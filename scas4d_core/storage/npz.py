@@ -105,11 +105,11 @@ def _checksums(archive: zipfile.ZipFile) -> dict[str, str]:
     """Checksums by array."""
     if not archive.comment:
         raise ValueError("it has no checksums")
-    found: dict[str, str] = json.loads(archive.comment)["blake2b"]
+    kept: dict[str, str] = json.loads(archive.comment)["blake2b"]
     names = {name.removesuffix(".npy") for name in archive.namelist()}
-    if names != found.keys():
+    if names != kept.keys():
         raise ValueError("its arrays are not those that were written")
-    return found
+    return kept
 
 
 def sync_folder(folder: Path) -> None:
@@ -152,11 +152,11 @@ def read_npz(path: Path, names: Sequence[str] | None = None, optional: Sequence[
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             checksums = _checksums(file.zip)
             wanted = file.files if names is None else [*names, *(name for name in optional if name in file.files)]
-            found = {name: np.asarray(file[member(name)]) for name in wanted}
-            for name, array in found.items():
+            arrays = {name: np.asarray(file[member(name)]) for name in wanted}
+            for name, array in arrays.items():
                 if not _agrees(checksums[name], _digest(array)):
                     raise ValueError(f"{name} fails its checksum")
-            return found
+            return arrays
     except FileNotFoundError:
         raise
     except DAMAGE as error:

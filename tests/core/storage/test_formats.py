@@ -82,21 +82,22 @@ def test_a_mended_folder_has_its_format(tmp_path: Path) -> None:
     assert History.load(tmp_path / "states").indices == list(range(FRAMES))
 
 
-def test_a_checkpoint_of_another_format(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("format_", "said"), [(9, "has format 9"), (None, "names no format")])
+def test_a_checkpoint_of_another_format(format_: int | None, said: str, tmp_path: Path) -> None:
     folder = tmp_path / "states"
     history, checkpoints = written(folder), Checkpoints(folder)
     factory: ViewFactory = None  # type: ignore[assignment]  # no checkpoint here has pictures
     for index in (FRAMES - 2, FRAMES - 1):
         checkpoints.save(index, CarryOver())
     file = folder / frame_files.checkpoint_file(FRAMES - 1)
-    write_npz(file, {**read_npz(file), "format": np.int64(9)})
+    arrays = read_npz(file)
+    del arrays["format"]
+    write_npz(file, arrays if format_ is None else {**arrays, "format": np.int64(format_)})
     before = contents(folder)
-    said = (
-        r"checkpoint_000002\.npz, a checkpoint, has format 9; this scas4d reads format 2: use the scas4d that wrote it"
-    )
-    with pytest.raises(OtherFormatError, match=said):
+    words = rf"checkpoint_000002\.npz, a checkpoint, {said}; this scas4d reads format 2: use the scas4d that wrote it"
+    with pytest.raises(OtherFormatError, match=words):
         checkpoints.load(FRAMES - 1, factory)
-    with pytest.raises(ResumeError, match=said):
+    with pytest.raises(ResumeError, match=words):
         find_commit(history, checkpoints, factory, lambda index: True)
     assert contents(folder) == before
 
