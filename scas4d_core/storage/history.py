@@ -85,8 +85,9 @@ class History(HistoryReader):
         """
         folder = Path(directory)
         folder.mkdir(parents=True, exist_ok=True)
+        history = cls.load(folder) if FrameFiles(folder).exists else cls(folder)
         clear_parts(folder)
-        return cls.load(folder) if FrameFiles(folder).exists else cls(folder)
+        return history
 
     def save(self, directory: Path | str) -> None:
         """Writes a copy of this history into another directory, one frame at a time."""

@@ -56,6 +56,7 @@ def test_a_folder_of_states_of_another_format(format_: int | None, said: str, fr
         (folder / frame_files.frame_file(index)).unlink()
     (folder / frame_files.FIRST_COPY).unlink()
     with_format(folder, format_)
+    (folder / ".frame_000009.npz.1.part").write_bytes(b"of a process that died")
     before = contents(folder)
     for opened in (History.load, History.open):
         with pytest.raises(OtherFormatError, match=said):
