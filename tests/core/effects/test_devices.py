@@ -13,6 +13,7 @@ from effect_cases import BEFORE, RIG, UPDATE, builder
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.checkpoint import CarryOver
+from scas4d_core.effect_names import EFFECT_NAMES
 from scas4d_core.effects import effect as effect_module
 from scas4d_core.effects.appearance.colours import Colours
 from scas4d_core.effects.effect import Effect, Group
@@ -54,6 +55,7 @@ def drag(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     module.EFFECT, module.DragPart = Drag(NAME, Group.MOTION, "says", "gauge", "cost"), DragPart  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "made_up_drag", module)
     monkeypatch.setitem(EFFECTS, NAME, "made_up_drag")
+    monkeypatch.setattr("scas4d_core.settings.EFFECT_NAMES", (*EFFECT_NAMES, NAME))
     effect_module.effect.cache_clear()
     yield
     effect_module.effect.cache_clear()

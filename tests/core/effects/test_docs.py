@@ -12,7 +12,6 @@ import pytest
 from effect_cases import UPDATE, same, updated
 from source_tree import ROOT
 
-from scas4d_core import settings as settings_module
 from scas4d_core.effect_names import EFFECT_NAMES
 from scas4d_core.effects import effect as effect_module
 from scas4d_core.effects.registry import EFFECTS
@@ -39,7 +38,7 @@ def drag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     (tmp_path / f"{module}.py").write_text(source)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setitem(EFFECTS, name, module)
-    monkeypatch.setattr(settings_module, "EFFECT_NAMES", (*EFFECT_NAMES, name))
+    monkeypatch.setattr("scas4d_core.settings.EFFECT_NAMES", (*EFFECT_NAMES, name))
     effect_module.effect.cache_clear()
     yield name
     sys.modules.pop(module, None)

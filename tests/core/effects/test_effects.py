@@ -11,6 +11,7 @@ import pytest
 from effect_cases import BEFORE, RIG, UPDATE, builder, same, updated
 from source_tree import ROOT
 
+from scas4d_core.effect_names import EFFECT_NAMES
 from scas4d_core.effects import effect as effect_module
 from scas4d_core.effects.appearance.colours import Colours
 from scas4d_core.effects.coherence.floor import FloorPart
@@ -146,6 +147,7 @@ SHY = Shy("shy", Group.MOTION, "It moves.", "none", "none", auto=True, on_above=
 @pytest.fixture
 def shy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(EFFECTS, "shy", "nowhere")
+    monkeypatch.setattr("scas4d_core.settings.EFFECT_NAMES", (*EFFECT_NAMES, "shy"))
     found = effect_module.effect
     for module in ("scas4d_core.effects.switches",):
         monkeypatch.setattr(sys.modules[module], "effect", lambda name: SHY if name == "shy" else found(name))

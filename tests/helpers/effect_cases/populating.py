@@ -10,6 +10,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from scas4d_core.effect_names import EFFECT_NAMES
 from scas4d_core.effects import effect as effect_module
 from scas4d_core.effects.effect import Effect, Group
 from scas4d_core.effects.evidence import Seen
@@ -43,6 +44,7 @@ def install(monkeypatch: pytest.MonkeyPatch, plan: Plan) -> None:
     module.EFFECT = Own(NAME, Group.PRESENCE, "says", "gauge", "cost")  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, MODULE, module)
     monkeypatch.setitem(EFFECTS, NAME, MODULE)
+    monkeypatch.setattr("scas4d_core.settings.EFFECT_NAMES", (*EFFECT_NAMES, NAME))
     effect_module.effect.cache_clear()
 
 
