@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.captures.frame import Frame
+from scas4d_core.checkpoint import CarryOver
 from scas4d_core.effects.appearance.camera_gain import known_gains
 from scas4d_core.effects.cameras.pose_drift import posed
 from scas4d_core.effects.coherence.floor import floor_inside
 from scas4d_core.effects.effect import Effect, effect
 from scas4d_core.effects.evidence import Seen
+from scas4d_core.effects.presence.motion_mask import labelled, labels_learnt
 from scas4d_core.effects.switches import (
     Switch,
     Switches,
@@ -41,9 +43,7 @@ from scas4d_core.frame_outcome import FrameOutcome
 from scas4d_core.gaussians import UNBORN, Gaussians
 from scas4d_core.settings import Settings
 from scas4d_core.storage.births import FOUNDERLESS, grown_roots
-from scas4d_core.storage.checkpoint import CarryOver
 from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
-from scas4d_core.structure.motion_mask import labelled, labels_learnt
 from scas4d_core.structure.neighbours import Neighbours, build_neighbours
 from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.parts import Arrays, PlanBuilder
@@ -145,9 +145,10 @@ class Preparation:
         Args:
             roots: Θ_0 with all born since.
         """
+        known = {**first_switches(self._settings, 0), **carried.switches}  # where a report was lost, none are carried
         switches = {
             name: replace(switch, on=switch.on and effect(name).refused(self._settings) is None)
-            for name, switch in carried.switches.items()
+            for name, switch in known.items()
         }
         carried = replace(carried, switches=switches)  # a replay may have other settings than the scene
         updater, structure = self._updater(labelled(roots, carried.labels), switches)

@@ -17,7 +17,9 @@ from numba import get_num_threads
 
 from scas4d_core.cameras import Rig, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
+from scas4d_core.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, cold_start, find_commit
 from scas4d_core.effects.evidence import FitTime, Seen
+from scas4d_core.effects.presence.motion_mask import first_labels, labelled
 from scas4d_core.effects.switches import kept_of, switches_record
 from scas4d_core.engines.choose import renderer_of
 from scas4d_core.engines.engine import REPORT
@@ -29,9 +31,10 @@ from scas4d_core.first_frame.calibration.refine import first_calibration
 from scas4d_core.first_frame.start import FirstFrame, as_begun, fit_first, with_background
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_context import FrameContext, Observed
-from scas4d_core.frame_report import FrameReport, Progress, report_of_first, report_of_update
+from scas4d_core.frame_report import FrameReport, report_of_first, report_of_update
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import Preparation, Prepared, room_for_births
+from scas4d_core.progress import Progress
 from scas4d_core.query.committed import CommittedScene
 from scas4d_core.rig_checks import check_rig
 from scas4d_core.robust.alarms import first_watched, sharpness
@@ -40,9 +43,7 @@ from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.solve_frame import FrameSolver
 from scas4d_core.robust.update_input import RESTING, UpdateInput
 from scas4d_core.settings import Settings, UpdateSettings
-from scas4d_core.storage.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, cold_start, find_commit
 from scas4d_core.storage.history import History, HistoryError
-from scas4d_core.structure.motion_mask import first_labels, labelled
 from scas4d_core.update.result import Stopwatch
 from scas4d_core.update.schedule import TimeBudget
 from scas4d_core.update.view_factory import ViewFactory

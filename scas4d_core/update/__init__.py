@@ -9,7 +9,7 @@ act before and after the iterations. ``robust`` decides around it which pictures
 The values that one update passes through, from ``Reconstruction.step`` to the commit:
 
 1. ``engines.views.TrainingView``: one camera's pictures of the frame, made by ``view_factory``.
-2. ``storage.checkpoint.CarryOver``: all that the update before left beside Θ_{t−1}; in the end, that of this one.
+2. ``checkpoint.CarryOver``: all that the update before left beside Θ_{t−1}; in the end, that of this one.
 3. ``robust.outliers.Past``: the usual figures of the scene and its cameras; a part of the carry-over.
 4. ``warm_start.Motion``: the motion of the update before; a part of the carry-over.
 5. ``preparation.Prepared``: the updater for today's clusters and effects, with the carry-over.

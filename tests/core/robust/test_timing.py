@@ -128,13 +128,11 @@ def test_who_is_clearly_off_is_named() -> None:
     assert timing_warnings(None) == []
 
 
-def test_looks_go_through_arrays_and_older_checkpoints_have_none() -> None:
+def test_looks_go_through_arrays() -> None:
     past = past_of({"a": {0.2: 5}, "b": {0.1: 2}})
     arrays = past.arrays()
     assert Past.of_arrays(arrays).timing == past.timing
     assert Past.of_arrays(Past().arrays()).timing == {}
-    older = {name: array for name, array in arrays.items() if name not in ("timed", "timing")}
-    assert Past.of_arrays(older).timing == {}
 
 
 def play(scene: Reconstruction, indices: range, offsets: Mapping[str, float]) -> list[FrameReport]:

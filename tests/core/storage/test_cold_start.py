@@ -114,7 +114,7 @@ def test_what_is_damaged_costs_no_state(tmp_path: Path) -> None:
     assert len(found.gaussians(0)) == len(STATE)
 
 
-def test_scenes_of_an_earlier_version_have_none() -> None:
+def test_a_frame_without_effects_has_none() -> None:
     history = History()
     history.append(0, 0.0, STATE, {})
     assert history.effects(0) == {}

@@ -10,6 +10,7 @@ from box_scene import MOVING, make_box, make_rig, moved, take_frame
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.captures.frame import Frame
+from scas4d_core.effects.presence.motion_mask import INSIDE_SHARE, changed_pixels, first_labels, with_reliable_labels
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_outcome import FrameOutcome
@@ -17,7 +18,6 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings, UpdateSettings
 from scas4d_core.structure import motion_mask
-from scas4d_core.structure.motion_mask import INSIDE_SHARE, changed_pixels, first_labels, with_reliable_labels
 from scas4d_core.update.result import camera_fit
 from scas4d_core.update.view_factory import ViewFactory
 

@@ -13,10 +13,10 @@ from box_scene import SHIFT, make_box, make_rig, moved, take_frame
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.captures.frame import Frame, InitialPoints
+from scas4d_core.checkpoint import CheckpointError, Checkpoints
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.reconstruction import Reconstruction, ResumeError
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings, UpdateSettings
-from scas4d_core.storage.checkpoint import CheckpointError, Checkpoints
 from scas4d_core.storage.history import History
 from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import Motion
