@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from client.cli import pictures
-from client.cli.progress import Bars, console
+from client import pictures
 from client.exports.video.video_file import video_file
+from client.progress import Bars, console
 from scas4d_core.captures import Capture
 from scas4d_core.compact import CompactWriter, Head
 from scas4d_core.frame_outcome import AlarmKind

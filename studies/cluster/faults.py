@@ -17,9 +17,9 @@ from server.storage.fencing import epoch_read, epochs
 from server.storage.layout import DataFolder, epoch_folder
 from studies.cluster.nodes import Nodes
 from studies.options import Echo
-from studies.service.outcome import ScenarioResult
-from studies.service.process import PATIENCE_S, Service, StudyError, wait_until
-from studies.service.study import AGAIN_S, FrameSender, Study, compare, digests, undisturbed
+from studies.running.outcome import ScenarioResult
+from studies.running.process import PATIENCE_S, Service, StudyError, wait_until
+from studies.running.study import AGAIN_S, FrameSender, Study, compare, digests, undisturbed
 
 Run = Callable[[Study, Sequence[str]], list[ScenarioResult]]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.captures import Capture, Frame
 from scas4d_core.gaussians import Gaussians
-from studies.frontier.timing import started
+from studies.quality.first_frame import started
 from studies.quality.settings import settings_of
 
 

@@ -19,8 +19,8 @@ from scas4d_core.settings import SceneSettings, Settings, StaticSettings, Update
 from scas4d_core.storage.history import History
 from studies.constants import all_varied
 from studies.hard_frames.scene import BALL, cameras, first_state, gone
-from studies.kernels.synthetic import photograph
 from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
+from studies.synthetic.ball import photograph
 
 Pictures = Mapping[str, NDArray[np.uint8]]
 

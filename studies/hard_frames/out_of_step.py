@@ -30,10 +30,10 @@ from scas4d_core.robust import timing
 from scas4d_core.settings import Settings
 from studies.hard_frames.footage import ANGLE, NOISE, SyntheticFootage
 from studies.hard_frames.scene import first_state, gone
-from studies.kernels.synthetic import photograph
 from studies.machine import core_version, machine
 from studies.quality.first_frame import first_of
 from studies.quality.settings import settings_of
+from studies.synthetic.ball import photograph
 
 COLUMNS = (
     Column("capture", "capture"),

@@ -25,7 +25,7 @@ from scas4d_core.storage.history import History
 from studies.constants import all_varied
 from studies.hard_frames.footage import SyntheticFootage
 from studies.hard_frames.scene import cameras, first_state, gone, rows
-from studies.kernels.synthetic import photograph
+from studies.synthetic.ball import photograph
 
 SIZE = 48
 """Pixels, side of the six pictures."""

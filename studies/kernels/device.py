@@ -34,8 +34,8 @@ from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.picture_loss import PictureLoss, ViewFactory
 from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.warm_start import Motion
-from studies.kernels import synthetic
 from studies.machine import in_words, machine
+from studies.synthetic import ball as synthetic
 
 Array = NDArray[np.float32]
 Arrays = Mapping[str, Any]

@@ -21,6 +21,7 @@ from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
+from scas4d_core.storage.history import History
 
 VERSION = 5
 """Raise this when frame 0 comes out different from the same pictures and settings: what is kept is then fitted anew."""
@@ -108,3 +109,16 @@ def first_of(capture: Capture, out: Path, settings: Settings) -> StaticResult:
         found = load_first_frame(path)
         assert found is not None
     return found[0]
+
+
+def started(capture: Capture, settings: Settings, out: Path, states: Path | None = None) -> Reconstruction:
+    """A reconstruction after frame 0, which is read from the study or, the first time, fitted and kept there.
+
+    Args:
+        states: empty folder to commit to; None: in memory.
+    """
+    static = first_of(capture, out, settings)
+    history = History() if states is None else History(states)
+    return Reconstruction.start(
+        capture.rig, capture.frame(0), settings, points=capture.points, static=static, history=history
+    )

@@ -15,9 +15,9 @@ from server.storage.events import ReconstructionBegun
 from server.storage.journal import read_journal
 from server.storage.layout import DataFolder
 from studies.options import Echo
-from studies.service.outcome import ScenarioResult
-from studies.service.process import PATIENCE_S, Service, StudyError
-from studies.service.study import AGAIN_S, FrameSender, Study, compare, digests
+from studies.running.outcome import ScenarioResult
+from studies.running.process import PATIENCE_S, Service, StudyError
+from studies.running.study import AGAIN_S, FrameSender, Study, compare, digests
 
 SPREADS_S = (0.1, 1.0)
 """A kill comes within one of these seconds after the request: before its event, after it, or in the first frame."""

@@ -24,8 +24,8 @@ from scas4d_core.storage.npz import read_npz
 from server.storage.frame_store import FrameDamage, read_pictures
 from server.storage.journal import read_journal
 from server.storage.layout import DataFolder
-from studies.service.process import Service, StudyError
-from studies.service.study import AGAIN_S, FrameSender, Study, digests
+from studies.running.process import Service, StudyError
+from studies.running.study import AGAIN_S, FrameSender, Study, digests
 
 KINDS = ("state", "checkpoint", "fixed", "journal", "frame")
 BEFORE = 6

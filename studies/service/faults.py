@@ -24,12 +24,12 @@ from server.storage.events import FrameAccepted
 from server.storage.journal import read_journal
 from server.storage.layout import DataFolder, SceneFolder
 from studies.options import Echo
+from studies.running.outcome import ScenarioResult
+from studies.running.process import PATIENCE_S, Service, StudyError
+from studies.running.study import AGAIN_S, FrameSender, Study, compare, digests, encoded_frames, undisturbed
 from studies.service import damage
 from studies.service.beginnings import beginnings
-from studies.service.outcome import ScenarioResult
-from studies.service.process import PATIENCE_S, Service, StudyError
 from studies.service.strangers import Attack, strangers
-from studies.service.study import AGAIN_S, FrameSender, Study, compare, digests, encoded_frames, undisturbed
 
 TURN_S = 15.0
 """Of updates without strangers; with them, until the last connection is closed."""

@@ -33,7 +33,7 @@ from studies.hard_frames.footage import AnyFootage
 from studies.hard_frames.frames import FrameCase, FrameStep, Pictures, Sent, good, named, teleported, violations
 from studies.hard_frames.study import AT, sound
 from studies.options import Echo
-from studies.service.process import PATIENCE_S, Service, StudyError
+from studies.running.process import PATIENCE_S, Service, StudyError
 
 FARTHEST = 1.0
 """Sizes that the object jumps: where it is by then, twice its size is out of the pictures."""

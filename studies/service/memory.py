@@ -25,7 +25,7 @@ from server.settings import ServerSettings
 from server.storage.definition import read_definition, write_definition
 from server.storage.layout import DataFolder, SceneFolder
 from studies.constants import varied
-from studies.service.process import Service
+from studies.running.process import Service
 
 
 def ring(count: int, size: int) -> Rig:

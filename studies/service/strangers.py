@@ -21,9 +21,9 @@ import numpy as np
 
 from client.wire import FrameState
 from studies.options import Echo
-from studies.service.outcome import ScenarioResult
-from studies.service.process import Service, StudyError
-from studies.service.study import Study
+from studies.running.outcome import ScenarioResult
+from studies.running.process import Service, StudyError
+from studies.running.study import Study
 
 P99_MS, MEMORY_MB, CLOSED_S, SLOWER = 50.0, 50.0, 60.0, 1.1
 TOKEN = "of-the-study-and-of-nobody-else"

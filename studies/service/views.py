@@ -27,8 +27,8 @@ from client.wire import FrameState
 from scas4d_core.captures import Capture
 from studies.machine import in_words, machine
 from studies.options import Echo
-from studies.service.process import Service, StudyError
-from studies.service.study import encoded_frames
+from studies.running.process import Service, StudyError
+from studies.running.study import encoded_frames
 
 TARGET_RATE, TARGET_LATENCY, TARGET_SLOWER = 5.0, 2.0, 0.25
 IDLE_S = 6.0

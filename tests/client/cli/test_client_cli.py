@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 from client.cli.changes import parse_changes
 from client.cli.commands import frame_line, out_of_step
 from client.cli.main import app
-from client.cli.pictures import coloured, comparison, psnr
 from client.errors import ServiceError
+from client.pictures import coloured, comparison, psnr
 from client.rig import push
 from client.sdk import Client
 from client.wire import FrameReportModel, part_colour

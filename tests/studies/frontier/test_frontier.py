@@ -30,6 +30,7 @@ from studies.frontier.tradeoff import (
     spread,
     undominated,
 )
+from studies.quality import first_frame
 from studies.quality.first_frame import first_frame_key, save_first_frame
 
 FRAMES = 4
@@ -281,7 +282,7 @@ def test_settings_are_timed_in_turns_and_the_first_round_does_not_count(box_capt
     short, long = Variant("short", iterations=10), Variant("long", iterations=1000)
     paces = {short.settings.update.iterations: 1.0, long.settings.update.iterations: 3.0}
     monkeypatch.setattr(
-        timing,
+        first_frame,
         "started",
         lambda capture, settings, out: Paced(settings.update.iterations, paces[settings.update.iterations]),
     )
@@ -316,7 +317,7 @@ def test_watching_an_update_does_not_change_it(box_capture, with_frame_0):
     assert drawn["iterations"] == [0, 1, 2, 4, 7, 10, 12]
     assert drawn["psnr"][-1] > drawn["psnr"][0] + 1
     capture = open_capture(box_capture)
-    unwatched = timing.started(capture, convergence.once(short.settings), with_frame_0)
+    unwatched = first_frame.started(capture, convergence.once(short.settings), with_frame_0)
     ends = []
     for index in (1, 2):
         unwatched.step(capture.frame(index))

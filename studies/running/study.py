@@ -17,7 +17,7 @@ from scas4d_core.captures import Capture
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.storage.history import History
 from server.storage.layout import DataFolder
-from studies.service.process import PATIENCE_S, Service, StudyError
+from studies.running.process import PATIENCE_S, Service, StudyError
 
 AGAIN_S = 0.05
 
