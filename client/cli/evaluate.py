@@ -150,7 +150,7 @@ def evaluate(
     row = None if again else store.row(job.key)
     if row is None:
         report(f"[1/1] {job.key}")
-        compile_kernels(job.settings)
+        compile_kernels()
         _, row = measure(job, store, report)
         store.put(row)
     else:

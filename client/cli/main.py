@@ -97,14 +97,13 @@ def reconstruct(
     out: Out = Path("out/reconstruct"),
     frames: Frames = None,
     preset: Preset = "scas4d",
-    device: Annotated[str | None, typer.Option(help="Device of the updates: cpu or cuda.")] = None,
     videos: Annotated[bool, typer.Option("--videos", help="Leave the pictures of each camera as an MP4, too.")] = False,
     changes: Changes = None,
 ) -> None:
     """Reconstructs a capture in this process, without a service: pictures, states, and a .ply of the last frame."""
     from client.cli.reconstruct import reconstruct as run
 
-    given = parse_changes([*(changes or []), *([f"device={device}"] if device else [])])
+    given = parse_changes(changes)
     run(opened(capture, options), out, frames=frames, preset=preset, changes=given, videos=videos)
 
 

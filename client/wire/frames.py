@@ -236,11 +236,9 @@ class FrameReportModel(Model):
     )
     psnr: float | None = Field(default=None, description="dB, training views of the last iterations.")
     cameras: dict[str, CameraFitModel] = Field(default_factory=dict, description="By camera that the update saw.")
-    alarms: list[AlarmModel] = Field(
-        default_factory=list, description="What a person should look at; frames of earlier versions have none."
-    )
+    alarms: list[AlarmModel] = Field(default_factory=list, description="What a person should look at.")
     timing: dict[str, CameraTimingModel] = Field(
-        default_factory=dict, description="By camera; only where motion tells it well enough. Never on a GPU."
+        default_factory=dict, description="By camera; only where motion tells it well enough."
     )
     moving: int | None = None
     gaussians: int | None = Field(default=None, description="That are there; those retired are not counted.")

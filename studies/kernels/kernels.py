@@ -53,19 +53,17 @@ def study(
 
     Args:
         folder: of the capture.
-        settings: of frame 0 and the updates; on the CPU.
+        settings: of frame 0 and the updates.
         store: folder of the study.
         frames: of the run; the first update compiles or loads kernels and is not counted, so at least 3.
         repeats: of the rasterizer and the micro-kernel.
 
     Raises:
-        ValueError: fewer than 3 frames, or another device.
+        ValueError: fewer than 3 frames.
         RuntimeError: the run's process ended before its time.
     """
     if frames < 3:
         raise ValueError(f"frames is {frames}; give at least 3: the first update is not counted")
-    if settings.device != "cpu":
-        raise ValueError(f"device is {settings.device!r}; this study is of the CPU kernels: give cpu")
     capture = open_source(folder)
     first_file = store / "first" / f"{first_frame_key(capture, settings)}.npz"
     report(f"a run of {min(frames, capture.frame_count)} frames, frame 0 first, in a process of its own")

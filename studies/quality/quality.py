@@ -37,7 +37,6 @@ def run(
     iterations: Sequence[int] = (),
     seeds: Sequence[int] = (0,),
     changes: Sequence[str] = (),
-    device: str | None = None,
     frames: int | None = None,
     masks: bool = True,
     points: bool = True,
@@ -56,7 +55,6 @@ def run(
         iterations: of an update, each tried; none: the preset's own.
         seeds: of frame 0 and of the updates, each tried.
         changes: further settings as ``"update.clusters=[64]"``, JSON behind the sign.
-        device: "cpu" or "cuda"; None: the preset's.
         frames: only so many frames of each capture; None: all.
         masks: False withholds the masks from the method.
         points: False withholds the initial cloud.
@@ -76,7 +74,7 @@ def run(
         Job(
             capture=Path(capture),
             preset=name,
-            settings=settings_of(name, count, seed, changes, device),
+            settings=settings_of(name, count, seed, changes),
             frames=frames,
             masks=masks,
             points=points,
@@ -95,7 +93,7 @@ def run(
 def run_jobs(jobs: Sequence[Job], out: Path, *, again: bool = False, report: Report = print) -> list[Row]:
     """Measures what is not on disk yet, one process a row; prints the table and leaves it in ``out/table.md``."""
     store = Store(out)
-    if any(job.settings.device == "cpu" for job in jobs):
+    if jobs:
         warm_up_elsewhere()
     rows = []
     for number, job in enumerate(jobs, 1):

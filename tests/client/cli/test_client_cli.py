@@ -294,10 +294,10 @@ def test_labels_where_there_is_no_cluster_are_refused(service, capture_folder):
 
 
 def test_changes_are_parsed():
-    changes = ["update.iterations=200", "device=cuda", "update.clusters=[64]", "scene.metres_per_unit=auto"]
+    changes = ["update.iterations=200", "device=cpu", "update.clusters=[64]", "scene.metres_per_unit=auto"]
     assert parse_changes(changes) == {
         "update": {"iterations": 200, "clusters": [64]},
-        "device": "cuda",
+        "device": "cpu",
         "scene": {"metres_per_unit": "auto"},
     }
     for bad in (["update"], ["a=1", "a.b=2"]):
