@@ -40,11 +40,7 @@ def first_frame_key(capture: Capture, settings: Settings) -> str:
         settings: those of the scene and of frame 0 count.
     """
     hasher = hashlib.sha256()
-    static = settings.static.model_dump(mode="json")
-    for name, off in (("seconds", None), ("refine_calibration", False)):
-        if static[name] == off:  # those that were kept before it was a setting have the same name
-            del static[name]
-    described = [VERSION, settings.scene.model_dump(mode="json"), static]
+    described = [VERSION, settings.scene.model_dump(mode="json"), settings.static.model_dump(mode="json")]
     hasher.update(json.dumps(described, sort_keys=True).encode())
     for camera in capture.full_rig.cameras:
         hasher.update(f"{camera.name} {camera.width} {camera.height}".encode())
@@ -66,12 +62,12 @@ def load_first_frame(path: Path) -> tuple[StaticResult, float] | None:
     if not path.exists():
         return None
     with np.load(path, allow_pickle=False) as file:
-        gaussians = Gaussians(**{name: file[name] for name in ARRAYS if name in file})
+        arrays = {name: file[name] for name in ARRAYS if name in file}  # those that are None are not kept
         names, exposures = file["exposure_names"].tolist(), file["exposures"]
         told = zip(*(file[f"evidence_{name}"].tolist() for name in ("names", "shares", "texts")), strict=True)
         evidence = {name: Evidence(share, text) for name, share, text in told}
         losses = file["losses"].tolist()
-        result = StaticResult(gaussians, dict(zip(names, exposures, strict=True)), losses, evidence=evidence)
+        result = StaticResult(Gaussians(**arrays), dict(zip(names, exposures, strict=True)), losses, evidence=evidence)
         return result, float(file["seconds"])
 
 
