@@ -18,9 +18,9 @@ from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings, UpdateSettings
 from scas4d_core.storage.history import History
 from studies.constants import all_varied
-from studies.hard_frames.scene import BALL, cameras, first_state, gone
+from studies.hard_frames.scene import BALL, first_state, gone
 from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
-from studies.synthetic.ball import photograph
+from studies.synthetic.ball import photograph, rig
 
 Pictures = Mapping[str, NDArray[np.uint8]]
 
@@ -52,8 +52,8 @@ class SyntheticFootage:
             static=StaticSettings(iterations=600, max_gaussians=1200),
             update=UpdateSettings(iterations=60, clusters=(2, 12, 48)),
         )
-        self.rig = cameras(CAMERAS, SIZE)
-        self._others = cameras(4, SIZE, turned=0.4, names="h")
+        self.rig = rig(SIZE, CAMERAS)
+        self._others = rig(SIZE, 4, turned=0.4, names="h")
         self._true = first_state(resting_may_move=False)
         self.frame = cache(self.frame)  # type: ignore[method-assign]
         self.truth = cache(self.truth)  # type: ignore[method-assign]

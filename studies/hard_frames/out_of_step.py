@@ -21,6 +21,7 @@ import numpy as np
 from client.cli.evaluate import Report, recorded
 from client.cli.scores import Column, Row, digest, kept_row, markdown
 from client.importers.open_source import open_source
+from client.rig.sequence import there_and_back
 from scas4d_core.cameras import Rig
 from scas4d_core.captures import Capture
 from scas4d_core.captures.frame import Frame
@@ -117,10 +118,10 @@ def played(capture: Capture, index: int, step: int, shifts: Mapping[str, int]) -
     Args:
         shifts: by camera, frames of the capture after the others'.
     """
-    frame = capture.frame(_there_and_back(step * index, capture.frame_count))
+    frame = capture.frame(there_and_back(abs(step * index), capture.frame_count))
     images, masks = dict(frame.images), dict(frame.masks)
     for name, shift in shifts.items():
-        other = capture.frame(_there_and_back(step * index + shift, capture.frame_count))
+        other = capture.frame(there_and_back(abs(step * index + shift), capture.frame_count))
         images[name] = other.images[name]
         if name in masks:
             masks[name] = other.masks[name]
@@ -140,11 +141,6 @@ def clocked() -> Iterator[list[float]]:
 
     with mock.patch.object(timing, "noted", noted):
         yield spent
-
-
-def _there_and_back(place: int, count: int) -> int:
-    place = abs(place) % (2 * count - 2)
-    return place if place < count else 2 * count - 2 - place
 
 
 def shown_out_of_step(footage: SyntheticFootage, index: int, offsets: Mapping[str, float]) -> Frame:
