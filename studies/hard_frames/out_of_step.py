@@ -26,13 +26,12 @@ from scas4d_core.cameras import Rig
 from scas4d_core.captures import Capture
 from scas4d_core.captures.frame import Frame
 from scas4d_core.frame_report import FrameReport
-from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.robust import timing
 from scas4d_core.settings import Settings
 from studies.hard_frames.footage import ANGLE, NOISE, SyntheticFootage
 from studies.hard_frames.scene import first_state, gone
 from studies.machine import core_version, machine
-from studies.quality.first_frame import first_of
+from studies.quality.first_frame import started
 from studies.quality.settings import settings_of
 from studies.synthetic.ball import photograph
 
@@ -101,8 +100,7 @@ def _row(key: str, folder: Path, out: Path, settings: Settings, updates: int, ca
     capture = open_source(folder, use_masks=masks)
     names = capture.rig.names
     shifts = {names[2]: case.shift, names[len(names) // 2 - 1]: -case.shift} if case.shift else {}
-    first = first_of(capture, out, settings)
-    scene = Reconstruction.start(capture.rig, capture.frame(0), settings, points=capture.points, static=first)
+    scene = started(capture, settings, out)
     with clocked() as spent:
         reports = [scene.step(played(capture, index, case.step, shifts)) for index in range(1, updates + 1)]
     found = summary(reports, {name: shift / case.step for name, shift in shifts.items()})

@@ -114,7 +114,7 @@ def started(capture: Capture, settings: Settings, out: Path, states: Path | None
         states: empty folder to commit to; None: in memory.
     """
     static = first_of(capture, out, settings)
-    history = History() if states is None else History(states)
+    history = History() if states is None else History.open(states)
     return Reconstruction.start(
         capture.rig, capture.frame(0), settings, points=capture.points, static=static, history=history
     )
