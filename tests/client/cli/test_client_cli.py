@@ -16,8 +16,8 @@ from typer.testing import CliRunner
 from client.cli.changes import parse_changes
 from client.cli.commands import frame_line, out_of_step
 from client.cli.main import app
-from client.cli.pictures import coloured, comparison, psnr
 from client.errors import ServiceError
+from client.pictures import coloured, comparison, psnr
 from client.rig import push
 from client.sdk import Client
 from client.wire import FrameReportModel, part_colour
@@ -294,10 +294,10 @@ def test_labels_where_there_is_no_cluster_are_refused(service, capture_folder):
 
 
 def test_changes_are_parsed():
-    changes = ["update.iterations=200", "device=cuda", "update.clusters=[64]", "scene.metres_per_unit=auto"]
+    changes = ["update.iterations=200", "device=cpu", "update.clusters=[64]", "scene.metres_per_unit=auto"]
     assert parse_changes(changes) == {
         "update": {"iterations": 200, "clusters": [64]},
-        "device": "cuda",
+        "device": "cpu",
         "scene": {"metres_per_unit": "auto"},
     }
     for bad in (["update"], ["a=1", "a.b=2"]):

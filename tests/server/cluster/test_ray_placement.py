@@ -20,7 +20,7 @@ from server.processes import worker
 from server.storage.fencing import epoch_read, epochs
 from server.storage.layout import DataFolder
 from studies.cluster.nodes import Nodes
-from studies.service.process import Service
+from studies.running.process import Service
 
 pytest.importorskip("ray", reason="Ray is not installed: pip install 'scas4d[ray]'")
 pytestmark = pytest.mark.filterwarnings("default")

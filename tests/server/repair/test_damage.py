@@ -16,8 +16,8 @@ from sending import put_form as put
 from client.sdk import Client
 from scas4d_core.captures import open_capture
 from server.repair.mending import SENTENCES_KEPT, DamageKind, DamageLog
+from studies.running import study as of
 from studies.service import faults
-from studies.service import study as of
 
 ROOT = Path(__file__).parents[3]
 CAPTURE = ROOT / "samples" / "robot"

@@ -13,7 +13,7 @@ from running import pictures, problem
 from sending import filled, finished, put_form, put_to_sleep, serving_with, status, view, wait_for
 
 from client.stream import Stream, scene_changes
-from studies.service import study as of
+from studies.running import study as of
 
 LONG, SHORT = 3600.0, 1.0
 
