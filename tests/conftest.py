@@ -1,4 +1,4 @@
-"""Kernels are compiled once for all of pytest's processes; the longest tests come first; failures are named at once."""
+"""Tests get their marks; kernels are compiled once for all processes; the longest come first; failures are named."""
 
 import os
 
@@ -9,7 +9,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 WITHOUT_KERNELS = (
     "tests/core/captures", "tests/client/importers", "tests/core/metrics", "tests/docker", "tests/server/connections",
-    "tests/test_docs.py", "tests/test_house.py", "tests/test_imports.py", "tests/test_wheel.py",
+    "tests/test_docs.py", "tests/test_imports.py", "tests/test_wheel.py",
 )  # fmt: skip
 """Tests that run no kernel, in no process: they go on while another process compiles."""
 LONGEST = (
@@ -26,17 +26,47 @@ LONGEST = (
 @pytest.fixture(autouse=True)
 def kernels(request: pytest.FixtureRequest) -> None:
     """Kernels are compiled once, in a process beside: of the tests' processes one asks for it, the others wait."""
-    if not request.path.relative_to(request.config.rootpath).as_posix().startswith(WITHOUT_KERNELS):
+    if not path_of(request.node).startswith(WITHOUT_KERNELS):
         from scas4d_core.warm_up import warm_up_elsewhere
 
         warm_up_elsewhere()
 
 
+SERVICE_FIXTURES = {"service", "app"}
+SERVICE_STARTERS = {"Running", "serving", "serving_with", "stub"}
+"""A test that has one of those fixtures, or whose file imports one of those helpers, gets the mark `service`."""
+MARKS_OF_FOLDERS = {
+    "tests/browser": "browser",
+    "tests/core/kernels": "second_processor",
+    "tests/core/properties": "second_processor",
+    "tests/core/rasterize": "second_processor",
+    "tests/core/torch_backend": "second_processor",
+    "tests/studies/hard_cases": "second_processor",
+}
+
+
+def path_of(item: pytest.Item) -> str:
+    return item.path.relative_to(item.config.rootpath).as_posix()
+
+
+def add_marks(item: pytest.Item) -> None:
+    """Adds the marks that folders, fixtures and helpers imply; a file adds others itself, with `pytestmark`."""
+    assert isinstance(item, pytest.Function)
+    for folder, mark in MARKS_OF_FOLDERS.items():
+        if path_of(item).startswith(f"{folder}/"):
+            item.add_marker(mark)
+    if SERVICE_FIXTURES & set(item.fixturenames) or SERVICE_STARTERS & vars(item.module).keys():
+        item.add_marker("service")
+
+
+@pytest.hookimpl(tryfirst=True)  # before `-m` selects
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Puts first what needs no kernels, where they may have to be compiled, then the longest."""
+    """Adds the marks; puts first what needs no kernels, where they may have to be compiled, then the longest."""
+    for item in items:
+        add_marks(item)
 
     def turn(item: pytest.Item) -> int:
-        path = item.path.relative_to(item.config.rootpath).as_posix()
+        path = path_of(item)
         return 0 if path.startswith("tests/server/connections") else 1 if item.path.name in LONGEST else 2
 
     items.sort(key=turn)  # stable: files stay together

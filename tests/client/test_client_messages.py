@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from waiting import HANG_S
 
 from client.cli.extras import CUDA, SERVER, remedy
 
@@ -31,7 +32,7 @@ def scas4d(*arguments, before=(), **environment):
         [sys.executable, "-m", "client.cli.main", *map(str, arguments)],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=HANG_S,
         env={**os.environ, "PYTHONPATH": path, "COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb", **environment},
     )
 

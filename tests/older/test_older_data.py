@@ -14,6 +14,7 @@ from box_scene import SHIFT, make_box, make_rig, moved, take_frame
 from PIL import Image
 from running import Running
 from scipy.spatial.transform import Rotation
+from waiting import HANG_S
 
 from client.sdk import Client
 from scas4d_core.storage.history import History
@@ -50,12 +51,12 @@ def opened(tmp_path_factory):
     shutil.copytree(HERE / "data_folder", folder)
     running = Running(ServerSettings(data=folder, scrub_mb_per_second=0), core=None)
     try:
-        with Client(running.url, patience=60) as sdk:
+        with Client(running.url, patience=HANG_S) as sdk:
             read = {index: sdk.frame(ID, index) for index in (0, 1, 2, 3, 4)}
-            sdk.wait(ID, 5, seconds=120)
+            sdk.wait(ID, 5, seconds=HANG_S)
             for name, (image, mask) in list(pictures_of(6).items())[3:]:
                 sdk.put_camera(ID, 6, name, image, mask, 0.6)
-            sdk.wait(ID, 6, seconds=120)
+            sdk.wait(ID, 6, seconds=HANG_S)
             yield sdk, read, folder / "scenes" / ID
     finally:
         running.stop()

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from running import HEIGHT, WIDTH
+from waiting import HANG_S
 
 from client.cli.demo import _unready, running_service
 from client.errors import ServiceError
@@ -33,7 +34,7 @@ def demo(capture, out, *more, before=(), **environment):
         [sys.executable, "-m", "client.cli.main", "demo", "--capture", str(capture), "--out", str(out), *more],
         capture_output=True,
         text=True,
-        timeout=100,
+        timeout=HANG_S,
         env=fakes.environment(*before, TERM="dumb", **environment),
     )
 

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Awaitable, Callable
 
 import pytest
+from waiting import HANG_S
 
 from server.cluster.calls import THREADS, Calls
 
@@ -61,7 +62,7 @@ def test_a_fault_while_they_are_waited_for_is_told_to_who_has_asked_alone(caplog
         fails = threading.Event()
 
         def fail() -> None:
-            fails.wait(10)
+            fails.wait(HANG_S)
             raise ConnectionError("no head")
 
         call = calls.asked(fail)

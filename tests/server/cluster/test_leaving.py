@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sending import wait_for_soon
+from waiting import HANG_S, wait_for_soon
 
 ray_placement = pytest.importorskip(
     "server.cluster.ray_placement", reason="Ray is not installed: pip install 'scas4d[ray]'"
@@ -65,7 +65,7 @@ class Cluster(LosableCluster):
     def _shutdown(self) -> None:
         self.looks()
         self.leaves.set()
-        self.may_leave.wait(5)
+        self.may_leave.wait(HANG_S)
         super()._shutdown()
 
     def _host(self, name: str, needs: Needs) -> Any:
@@ -123,7 +123,7 @@ def test_answers_are_kept_until_the_service_has_left_and_calls_are_made_afterwar
         cluster.lost = True
         assert await asyncio.to_thread(cluster.leaves.wait, 10)
         asked = cluster.placement.asked(called.append, 1)
-        await asyncio.wait_for(stopping, 10)
+        await asyncio.wait_for(stopping, HANG_S)
         await asyncio.sleep(0.05)
         gc.collect()
         assert len(cluster.pending) - cluster.dropped() == there == 4

@@ -6,7 +6,7 @@ import asyncio
 import threading
 
 import pytest
-from sending import wait_for_soon
+from waiting import HANG_S, wait_for_soon
 
 membership = pytest.importorskip("server.cluster.membership", reason="Ray is not installed: pip install 'scas4d[ray]'")
 
@@ -57,7 +57,7 @@ def test_a_silent_head_is_told_of_once_and_is_no_lost_node(
         asked.append(True)
         if len(asked) == 1:
             raise RuntimeError("no head")
-        answers.wait(10)
+        answers.wait(HANG_S)
         return False
 
     async def nothing() -> None:
@@ -108,7 +108,7 @@ def test_a_service_that_ray_does_not_let_join_again_ends(
     member.join()
     monkeypatch.setattr(membership, "JOIN_S", 0.05)
     monkeypatch.setattr(membership.os, "_exit", end)
-    monkeypatch.setattr(membership.ray, "shutdown", lambda: stands_still.wait(10))
+    monkeypatch.setattr(membership.ray, "shutdown", lambda: stands_still.wait(HANG_S))
     asyncio.run(test())
     assert set(ended) == {1}
 
@@ -141,7 +141,7 @@ def test_a_service_that_ray_does_not_let_leave_ends(cluster: LosableCluster, mon
     stands_still = threading.Event()
     monkeypatch.setattr(membership, "LEAVE_S", 0.05)
     monkeypatch.setattr(membership.os, "_exit", ended.append)
-    monkeypatch.setattr(membership.ray, "shutdown", lambda: stands_still.wait(10))
+    monkeypatch.setattr(membership.ray, "shutdown", lambda: stands_still.wait(HANG_S))
     membership.Membership(None).leave()
     stands_still.set()
     assert ended == [1]

@@ -14,6 +14,7 @@ import fakes
 import pytest
 from running import pictures
 from sending import create, put_framed
+from waiting import HANG_S
 
 from client.wire import Cluster
 from server.processes import worker
@@ -24,7 +25,6 @@ from studies.service.process import Service
 
 pytest.importorskip("ray", reason="Ray is not installed: pip install 'scas4d[ray]'")
 pytestmark = pytest.mark.filterwarnings("default")
-PATIENCE_S = 60.0
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +54,7 @@ def scene(service: Service) -> Iterator[str]:
 
 
 def until(done: Callable[[], object]) -> None:
-    end = time.monotonic() + PATIENCE_S
+    end = time.monotonic() + HANG_S
     while not done():
         assert time.monotonic() < end
         time.sleep(0.05)
@@ -285,7 +285,7 @@ def test_what_is_no_cluster_is_one_line(placement: str, words: str, tmp_path: Pa
         env={**environment, "SCAS4D_PLACEMENT": placement},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=HANG_S,
         check=False,
     )
     assert done.returncode == 1

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sending import wait_for_soon
+from waiting import HANG_S, wait_for_soon
 
 ray_placement = pytest.importorskip(
     "server.cluster.ray_placement", reason="Ray is not installed: pip install 'scas4d[ray]'"
@@ -76,7 +76,7 @@ class FakePlacement:
         return asyncio.get_running_loop().run_in_executor(None, function, *arguments)
 
     def host(self, name: str, needs: Needs) -> FakeActor:
-        self.may_make.wait(10)
+        self.may_make.wait(HANG_S)
         return self.actor
 
 
@@ -225,7 +225,7 @@ def test_one_that_is_stopped_when_the_cluster_is_lost_is_not_waited_for(killed: 
         await asyncio.sleep(0.05)
         running.process.lose()
         await running.process.let_go()
-        await asyncio.wait_for(stopping, 10)
+        await asyncio.wait_for(stopping, HANG_S)
         assert running.ends == []
         assert killed == []
 

@@ -7,7 +7,8 @@ import socket
 import time
 
 import pytest
-from peers import GET, HOST, LARGE_MB, SHORT, Peer, drip, put, refused, stub, until
+from peers import GET, HOST, LARGE_MB, SHORT, Peer, drip, put, refused, stub
+from waiting import wait_for
 
 from server.connections import guard
 from server.connections.connection import Connection
@@ -165,8 +166,8 @@ def test_a_body_without_end_behind_its_answer_is_ended(app):
 def test_an_answer_that_nobody_reads_is_given_up(app):
     with Peer(app.port, receive_buffer=4096) as peer:
         peer.send(b"GET /large HTTP/1.1\r\n" + HOST + b"\r\n")
-        until(lambda: app.guard.counts()["answer"] == 1)
-        until(lambda: app.guard.counts()["answer"] == 0)
+        wait_for(lambda: app.guard.counts()["answer"] == 1)
+        wait_for(lambda: app.guard.counts()["answer"] == 0)
         peer.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         assert len(peer.rest()) < LARGE_MB << 20
 
@@ -183,4 +184,4 @@ def test_an_answer_that_is_read_slowly_is_sent_to_its_end():
 
 
 def test_nobody_is_left(app):
-    until(lambda: sum(app.guard.counts().values()) == 0)
+    wait_for(lambda: sum(app.guard.counts().values()) == 0)

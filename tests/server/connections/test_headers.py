@@ -6,7 +6,8 @@ import json
 import time
 
 import pytest
-from peers import GET, HOST, SHORT, Peer, drip, parsed, refused, until
+from peers import GET, HOST, SHORT, Peer, drip, parsed, refused
+from waiting import wait_for
 
 LIMIT = SHORT["header_kb"] << 10
 
@@ -153,4 +154,4 @@ def test_thousands_of_pipelined_requests_do_not_pile_up(app):
 
 
 def test_nobody_is_left(app):
-    until(lambda: sum(app.guard.counts().values()) == 0)
+    wait_for(lambda: sum(app.guard.counts().values()) == 0)

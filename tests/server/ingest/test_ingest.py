@@ -12,6 +12,7 @@ import pytest
 from running import make_rig, picture, pictures, problem
 from sending import FRAMED, finished, framed, put_camera, status, wait_for
 from sending import put_framed as put
+from waiting import HANG_S
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -60,7 +61,7 @@ def test_frames_that_come_side_by_side_are_taken_in_order(http, make, service):
     def send(index):
         import httpx
 
-        with httpx.Client(base_url=service.url, timeout=30) as own:
+        with httpx.Client(base_url=service.url, timeout=HANG_S) as own:
             answer = put(own, id, index)
             while answer.status_code == 409:  # its sender is ahead of the one before
                 answer = put(own, id, index)
@@ -70,7 +71,7 @@ def test_frames_that_come_side_by_side_are_taken_in_order(http, make, service):
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join()
+        thread.join(HANG_S)
     assert answers == dict.fromkeys(range(6), 202)
     assert status(http, id)["next_frame"] == 6
 
@@ -301,7 +302,7 @@ def test_a_scene_has_only_so_many_sending_websockets(http, make, service, monkey
 
 
 def retried(action, error):
-    until = time.monotonic() + 20
+    until = time.monotonic() + HANG_S
     while True:
         try:
             return action()

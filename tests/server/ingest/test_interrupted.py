@@ -10,6 +10,7 @@ import pytest
 from running import picture, problem
 from sending import create, finished, framed, put_camera, put_form, serving, status, wait_for
 from sending import put_framed as put
+from waiting import HANG_S
 
 from client.wire import FRAME_MEDIA_TYPE
 from server.ingest import camera_files, receive
@@ -89,7 +90,7 @@ def test_a_frame_accepted_while_the_first_one_fails_does_not_wait_for_ever(http,
     http.post(f"/v1/scenes/{id}/pause")
     put(http, id, 0)
     monkeypatch.setattr(Journal, "_write", slow)
-    on_the_loop(scene, race()).result(20)
+    on_the_loop(scene, race()).result(HANG_S)
     wait_for(lambda: status(http, id)["queued"] == 0)
     assert http.get(f"/v1/scenes/{id}/frames/1").json()["state"] == "set_aside"
 

@@ -12,6 +12,7 @@ import pytest
 from running import Running, fake_settings, pictures, problem
 from sending import create, settled
 from sending import put_form as put
+from waiting import HANG_S
 
 from client.sdk import Client
 from scas4d_core.captures import open_capture
@@ -29,7 +30,7 @@ NEVER = {"scrub_mb_per_second": 0}
 def serving(folder, **changes):
     running = Running(fake_settings(folder, **changes))
     try:
-        with httpx.Client(base_url=running.url, timeout=30) as http, Client(running.url, patience=20) as sdk:
+        with httpx.Client(base_url=running.url, timeout=HANG_S) as http, Client(running.url, patience=HANG_S) as sdk:
             yield http, sdk
     finally:
         running.stop()

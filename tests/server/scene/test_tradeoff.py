@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import fakes
 import pytest
 from running import Running, fake_settings, make_rig, pictures, problem
+from waiting import HANG_S
 
 from client.sdk import Client
 from client.wire import IngestSettings, Retention
@@ -22,7 +23,7 @@ def push(sdk, id, indices, red=0):
 
 
 def replayed(sdk, id):
-    until = time.monotonic() + 60
+    until = time.monotonic() + HANG_S
     while (found := sdk.tradeoff(id)).replay.state == "running":
         assert time.monotonic() < until
         time.sleep(0.05)
@@ -36,7 +37,7 @@ def points(found, kind):
 @pytest.fixture(scope="module")
 def ran(service):
     """A scene that ran 100 and 40 iterations."""
-    with Client(service.url, patience=20) as sdk:
+    with Client(service.url, patience=HANG_S) as sdk:
         id = sdk.create_scene(make_rig(), frames_per_second=10).id
         push(sdk, id, range(4))
         sdk.set_budget(id, iterations=40)
@@ -164,7 +165,7 @@ def test_what_cannot_be_replayed_says_what_would_help(http, sdk):
     document = problem(http.post(f"/v1/scenes/{id}/tradeoff"), 409)
     assert document["field"] == "frames"
     push(sdk, id, range(7))
-    until = time.monotonic() + 20
+    until = time.monotonic() + HANG_S
     while sdk.frame(id, 4).held:
         assert time.monotonic() < until
         time.sleep(0.02)
@@ -176,7 +177,7 @@ def test_what_cannot_be_replayed_says_what_would_help(http, sdk):
     few = IngestSettings(keep_states=Retention(last=3), queue_frames=9)
     id = sdk.create_scene(make_rig(), frames_per_second=10, ingest=few).id
     push(sdk, id, range(7))
-    until = time.monotonic() + 20
+    until = time.monotonic() + HANG_S
     while sdk.scene(id).states_deleted < 3:
         assert time.monotonic() < until
         time.sleep(0.02)
@@ -204,14 +205,14 @@ def test_what_is_no_replay_is_refused(http, quiet_scene, body):
 
 def test_after_a_restart_what_was_measured_is_read_again(tmp_path):
     running = Running(fake_settings(tmp_path))
-    with Client(running.url, patience=20) as sdk:
+    with Client(running.url, patience=HANG_S) as sdk:
         id = sdk.create_scene(make_rig(), frames_per_second=10).id
         push(sdk, id, range(4))
         before = sdk.tradeoff(id)
     running.stop()
     running = Running(fake_settings(tmp_path))
     try:
-        with Client(running.url, patience=20) as sdk:
+        with Client(running.url, patience=HANG_S) as sdk:
             assert sdk.tradeoff(id) == before
             assert sdk.tradeoff(id) == before
     finally:
