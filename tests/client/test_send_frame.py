@@ -85,12 +85,6 @@ def stored(service, scene):
     return {found.index: found for found in (read_pictures(file.parent, file.name) for file in files)}
 
 
-def test_it_is_short_enough_to_read():
-    lines = SOURCE.read_text(encoding="utf-8").splitlines()
-    assert len(lines) <= 150
-    assert max(map(len, lines)) <= 120
-
-
 def test_pictures_arrive_byte_for_byte(guarded_service, sdk, scene, begin):
     images = {"c0": picture(3, format="JPEG"), "c1": picture(4)}
     masks = {name: picture(255, mode="L") for name in images}

@@ -33,16 +33,16 @@ def put(path, length=None, *more):
     return b"PUT %s HTTP/1.1\r\n" % path + HOST + b"".join(line + b"\r\n" for line in (kind, *more)) + b"\r\n"
 
 
-def drip(peer, piece, most=20):
-    """Sends a piece every tenth of a second; seconds until the service had enough."""
-    began = time.monotonic()
-    while time.monotonic() - began < most:
+def drip(peer, piece):
+    """Sends a piece every tenth of a second until the service has had enough."""
+    until = time.monotonic() + HANG_S
+    while True:
+        assert time.monotonic() < until
         try:
             peer.send(piece)
         except OSError:
-            break
+            return
         time.sleep(0.1)
-    return time.monotonic() - began
 
 
 class Peer:
@@ -86,12 +86,6 @@ class Peer:
         except ConnectionError:
             pass
         return found
-
-    def closed_after(self):
-        """Seconds until the service closes the connection."""
-        began = time.monotonic()
-        self.rest()
-        return time.monotonic() - began
 
     def answer(self):
         """One answer: status, headers, body."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import httpx
 import pytest
 from peers import HOST, SHORT, Peer, parsed
@@ -52,8 +50,7 @@ def test_nobody_without_a_token_can_stop_it(running, sdk):
     before = counted(running, "scas4d_connections_refused_total")
     path = f"/v1/scenes/{scene}/frames/9"
     sdk.put_frame(scene, 0, pictures())
-    began = time.monotonic()
-    found = attack(running.port, path, header=50_000_000, halves=0, uploads=0, patience=30)
+    found = attack(running.port, path, header=50_000_000, halves=0, uploads=0, patience=HANG_S)
     assert found["open"] == 0
     assert found["sent"] < 30_000_000
     attack(running.port, path, header=0, halves=60, uploads=60, patience=0.3)
@@ -61,9 +58,8 @@ def test_nobody_without_a_token_can_stop_it(running, sdk):
         sdk.put_frame(scene, index, pictures())
         assert httpx.get(f"{running.url}/health/live", timeout=HANG_S).status_code == 200
         sdk.wait(scene, index)
-    ended = attack(running.port, path, header=50_000_000, halves=60, uploads=60, patience=30)
+    ended = attack(running.port, path, header=50_000_000, halves=60, uploads=60, patience=HANG_S)
     assert ended["open"] == 0
-    assert time.monotonic() - began < 60
     after = counted(running, "scas4d_connections_refused_total")
     risen = {reason for reason, count in after.items() if count > before[reason]}
     assert {"head_size", "displaced"} <= risen

@@ -191,7 +191,9 @@ def test_a_paused_scene_takes_frames_and_reconstructs_none(http, make):
     id = make(queue_frames=3)
     assert http.post(f"/v1/scenes/{id}/pause").json()["state"] == "paused"
     put(http, id, 0)
-    time.sleep(0.3)
+    other = make()
+    put(http, other, 0)
+    assert finished(http, other, 0)["state"] == "committed"  # made and sent later
     assert (status(http, id)["state"], status(http, id)["queued"]) == ("paused", 1)
     assert http.post(f"/v1/scenes/{id}/resume").json()["paused"] is False
     assert finished(http, id, 0)["state"] == "committed"
@@ -233,11 +235,14 @@ def test_retention_deletes_pictures_and_states_and_says_so(http, make, service):
 
 
 def test_nothing_uncommitted_is_deleted(http, make):
-    id = make(queue_frames=8, keep_frames={"last": 0})
+    id, other = (make(queue_frames=8, keep_frames={"last": 0}) for _ in range(2))
     http.post(f"/v1/scenes/{id}/pause")
     for index in range(4):
         put(http, id, index)
-    time.sleep(0.2)
+    for index in range(4):
+        put(http, other, index)
+    finished(http, other, 3)
+    wait_for(lambda: status(http, other)["frames_held"] == 1)  # sent later, and deleted
     assert status(http, id)["frames_held"] == 4
     http.post(f"/v1/scenes/{id}/resume")
     finished(http, id, 3)
