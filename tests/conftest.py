@@ -42,6 +42,7 @@ MARKS_OF_FOLDERS = {
     "tests/core/rasterize": "second_processor",
     "tests/core/torch_backend": "second_processor",
     "tests/studies/hard_cases": "second_processor",
+    "tests/studies": "slow",
 }
 
 

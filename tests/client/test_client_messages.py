@@ -13,6 +13,8 @@ from waiting import HANG_S
 
 from client.cli.extras import CUDA, SERVER, remedy
 
+pytestmark = pytest.mark.slow
+
 FAKES = str(Path(__file__).parents[1] / "helpers")
 ALONE = f"""
 import sys

@@ -20,6 +20,8 @@ from waiting import HANG_S
 from server.serve import address, listen
 from server.storage.disk import FolderLock
 
+pytestmark = pytest.mark.service
+
 ENVIRONMENT = fakes.environment(SCAS4D_WARM_UP="false")
 
 

@@ -21,6 +21,8 @@ from client.wire.service import ProblemDetails
 from scas4d_core.captures import open_capture
 from server.storage.disk import FolderLock
 
+pytestmark = pytest.mark.service
+
 SLOW = """
 import time
 import fakes

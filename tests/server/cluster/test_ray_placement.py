@@ -6,15 +6,14 @@ import os
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import fakes
 import pytest
 from running import pictures
 from sending import create, put_framed
-from waiting import HANG_S
+from waiting import HANG_S, wait_for
 
 from client.wire import Cluster
 from server.processes import worker
@@ -24,7 +23,7 @@ from studies.cluster.nodes import Nodes
 from studies.service.process import Service
 
 pytest.importorskip("ray", reason="Ray is not installed: pip install 'scas4d[ray]'")
-pytestmark = pytest.mark.filterwarnings("default")
+pytestmark = [pytest.mark.filterwarnings("default"), pytest.mark.ray, pytest.mark.service]
 
 
 @pytest.fixture(scope="module")
@@ -53,13 +52,6 @@ def scene(service: Service) -> Iterator[str]:
     service.http.delete(f"/v1/scenes/{id}")
 
 
-def until(done: Callable[[], object]) -> None:
-    end = time.monotonic() + HANG_S
-    while not done():
-        assert time.monotonic() < end
-        time.sleep(0.05)
-
-
 def sent(service: Service, scene: str, frames: range) -> None:
     for index in frames:
         assert put_framed(service.http, scene, index, pictures(index)).status_code == 202
@@ -86,13 +78,13 @@ def node_of(service: Service, nodes: Nodes, scene: str) -> int:
         found.extend([] if node is None else [node])
         return bool(found)
 
-    until(there)
+    wait_for(there)
     return found[0]
 
 
 def test_frames_are_committed_on_a_node_and_views_are_answered(service: Service, nodes: Nodes, scene: str) -> None:
     sent(service, scene, range(3))
-    until(lambda: committed(service, scene) == 3)
+    wait_for(lambda: committed(service, scene) == 3)
     assert node_of(service, nodes, scene)
     assert epoch_read(states(service, scene)) == 0
     view = service.http.post(f"/v1/scenes/{scene}/render", json={"camera": "c0", "frame": 1})
@@ -114,7 +106,7 @@ def test_frames_are_committed_on_a_node_and_views_are_answered(service: Service,
 def test_a_worker_is_as_nice_as_locally_and_does_not_load_ray(service: Service, scene: str) -> None:
     """Ray's 15 more made it give way to idle daemons: updates took 3 % longer. Ray in a process takes 40 MB."""
     sent(service, scene, range(1))
-    until(lambda: committed(service, scene) == 1)
+    wait_for(lambda: committed(service, scene) == 1)
     pid = service.worker_pid(scene)
     assert pid is not None
     assert os.getpriority(os.PRIO_PROCESS, pid) == os.getpriority(os.PRIO_PROCESS, service.pid) + worker.NICE
@@ -123,13 +115,13 @@ def test_a_worker_is_as_nice_as_locally_and_does_not_load_ray(service: Service, 
 
 def test_a_worker_that_dies_is_followed_by_one_of_the_next_epoch(service: Service, scene: str) -> None:
     sent(service, scene, range(2))
-    until(lambda: committed(service, scene) == 2)
+    wait_for(lambda: committed(service, scene) == 2)
     pid = service.worker_pid(scene)
     assert pid is not None
     sent(service, scene, range(2, 4))
-    until(lambda: service.status(scene).state == "updating")
+    wait_for(lambda: service.status(scene).state == "updating")
     os.kill(pid, signal.SIGKILL)
-    until(lambda: committed(service, scene) == 4)
+    wait_for(lambda: committed(service, scene) == 4)
     assert epoch_read(states(service, scene)) == 1
     assert service.status(scene).worker_deaths == 1
     assert service.deaths(scene) == 1
@@ -137,12 +129,12 @@ def test_a_worker_that_dies_is_followed_by_one_of_the_next_epoch(service: Servic
 
 def test_a_scene_goes_on_when_its_node_is_lost(service: Service, nodes: Nodes, scene: str) -> None:
     sent(service, scene, range(2))
-    until(lambda: committed(service, scene) == 2)
+    wait_for(lambda: committed(service, scene) == 2)
     lost = node_of(service, nodes, scene)
     sent(service, scene, range(2, 5))
-    until(lambda: service.status(scene).state == "updating")
+    wait_for(lambda: service.status(scene).state == "updating")
     nodes.kill(lost)
-    until(lambda: committed(service, scene) == 5)
+    wait_for(lambda: committed(service, scene) == 5)
     assert service.deaths(scene) == 0  # no frame is to blame
     assert node_of(service, nodes, scene) != lost
     assert [node.alive for node in cluster(service).nodes].count(False) == 1
@@ -155,17 +147,18 @@ def test_a_scene_goes_on_when_its_node_is_lost(service: Service, nodes: Nodes, s
 def test_what_a_stopped_node_writes_later_is_not_read(service: Service, nodes: Nodes, scene: str) -> None:
     """Its worker is at a frame that takes two seconds; it goes on once another worker has committed that."""
     sent(service, scene, range(2))
-    until(lambda: committed(service, scene) == 2)
-    node = node_of(service, nodes, scene)
+    wait_for(lambda: committed(service, scene) == 2)
+    node, pid = node_of(service, nodes, scene), service.worker_pid(scene)
     assert put_framed(service.http, scene, 2, pictures(fakes.SLOW)).status_code == 202
-    until(lambda: service.status(scene).state == "updating")
+    wait_for(lambda: service.status(scene).state == "updating")
     nodes.stop(node)
     sent(service, scene, range(3, 5))
-    until(lambda: committed(service, scene) == 5)
-    stale = min(epochs(states(service, scene)).values(), key=lambda path: int(path.suffix[1:]))
+    wait_for(lambda: committed(service, scene) == 5)
+    stale: Path = min(epochs(states(service, scene)).values(), key=lambda path: int(path.suffix[1:]))
+    written = len(list(stale.glob("frame_*.npz")))
     mine = {path.name: path.read_bytes() for path in states(service, scene).glob("frame_*.npz")}
     nodes.resume(node)
-    time.sleep(fakes.SLOW_S + 1)
+    wait_for(lambda: not Path(f"/proc/{pid}").exists() or len(list(stale.glob("frame_*.npz"))) > written)
     assert stale != states(service, scene).resolve()
     assert {path.name: path.read_bytes() for path in states(service, scene).glob("frame_*.npz")} == mine
     assert committed(service, scene) == 5
@@ -181,10 +174,8 @@ def test_a_scene_without_room_waits_and_says_why(service: Service, nodes: Nodes)
         def waiting() -> list[str]:
             return [one.scene for one in cluster(service).waiting if one.role == "worker"]
 
-        until(waiting)
-        time.sleep(1)
-        (late, *_) = waiting()
-        until(lambda: service.status(late).error)
+        wait_for(lambda: any(service.status(id).error for id in waiting()))
+        late = next(id for id in waiting() if service.status(id).error)
         said = service.status(late)
         assert said.degraded
         assert "its worker is not placed on a node yet; it needs 1 CPU and" in str(said.error)
@@ -192,7 +183,7 @@ def test_a_scene_without_room_waits_and_says_why(service: Service, nodes: Nodes)
         for id in ids:
             if id not in waiting():
                 service.http.delete(f"/v1/scenes/{id}")
-        until(lambda: committed(service, late) == 1)
+        wait_for(lambda: committed(service, late) == 1)
     finally:
         for id in ids:
             service.http.delete(f"/v1/scenes/{id}")
@@ -200,24 +191,24 @@ def test_a_scene_without_room_waits_and_says_why(service: Service, nodes: Nodes)
 
 def test_scenes_are_found_again_after_the_service_was_killed(service: Service, scene: str) -> None:
     sent(service, scene, range(3))
-    until(lambda: committed(service, scene) == 3)
+    wait_for(lambda: committed(service, scene) == 3)
     service.kill()
     service.start()
-    until(lambda: service.http.get(f"/v1/scenes/{scene}").status_code == 200)
+    wait_for(lambda: service.http.get(f"/v1/scenes/{scene}").status_code == 200)
     sent(service, scene, range(3, 4))
-    until(lambda: committed(service, scene) == 4)
+    wait_for(lambda: committed(service, scene) == 4)
     assert epoch_read(states(service, scene)) == 1
 
 
 def test_a_scene_waits_for_a_node_with_its_label_and_runs_there(service: Service, nodes: Nodes) -> None:
     id = create(service.http, nodes={"rig": "stage-a"})
     sent(service, id, range(1))
-    until(lambda: service.status(id).error)
+    wait_for(lambda: service.status(id).error)
     said = service.status(id)
     assert said.nodes == {"rig": "stage-a"}
     assert str(said.error).endswith("GB of memory on a node with rig=stage-a")
     added = nodes.add({"rig": "stage-a"})
-    until(lambda: committed(service, id) == 1)
+    wait_for(lambda: committed(service, id) == 1)
     assert service.http.post(f"/v1/scenes/{id}/render", json={"camera": "c0"}).status_code == 200
     (here,) = [node for node in cluster(service).nodes if node.labels]
     assert (here.labels, here.scenes) == ({"rig": "stage-a"}, [id])
@@ -232,17 +223,17 @@ def test_another_service_of_the_cluster_passes_on_what_is_not_its_own(
     other.start()
     try:
         sent(other, scene, range(2))
-        until(lambda: committed(other, scene) == committed(service, scene) == 2)
+        wait_for(lambda: committed(other, scene) == committed(service, scene) == 2)
         view = other.http.post(f"/v1/scenes/{scene}/render", json={"camera": "c0", "frame": 1})
         assert (view.status_code, view.headers["content-type"]) == (200, "image/png"), view.text
         late = create(other.http)
-        until(lambda: late in [one["id"] for one in service.http.get("/v1/scenes").json()["scenes"]])
+        wait_for(lambda: late in [one["id"] for one in service.http.get("/v1/scenes").json()["scenes"]])
         assert service.http.get(f"/v1/scenes/{late}").status_code == 200
     finally:
         other.stop()
     gone = service.http.get(f"/v1/scenes/{late}")
     assert (gone.status_code, gone.headers["retry-after"]) == (503, "2"), gone.text
-    until(lambda: "x-unreachable" not in service.http.get("/v1/scenes").headers)  # Ray has noticed
+    wait_for(lambda: "x-unreachable" not in service.http.get("/v1/scenes").headers)  # Ray has noticed
     assert service.http.get(f"/v1/scenes/{scene}").status_code == 200
 
 
@@ -253,19 +244,19 @@ def test_a_scene_goes_on_when_the_node_of_its_service_is_lost(service: Service, 
     try:
         late = create(other.http)
         sent(service, scene, range(2))
-        until(lambda: committed(service, scene) == 2)
+        wait_for(lambda: committed(service, scene) == 2)
         nodes.kill_node_of_head()
-        until(lambda: service.status(scene).worker_deaths >= 1)  # Ray takes seconds to find it lost
+        wait_for(lambda: service.status(scene).worker_deaths >= 1)  # Ray takes seconds to find it lost
         sent(service, scene, range(2, 5))
-        until(lambda: committed(service, scene) == 5)
+        wait_for(lambda: committed(service, scene) == 5)
         fresh = create(service.http)
         sent(service, fresh, range(1))
-        until(lambda: committed(service, fresh) == 1)
+        wait_for(lambda: committed(service, fresh) == 1)
         service.http.delete(f"/v1/scenes/{fresh}")
         assert service.deaths(scene) == 0  # no frame is to blame
         view = service.http.post(f"/v1/scenes/{scene}/render", json={"camera": "c0", "frame": 4})
         assert view.status_code == 200, view.text
-        until(lambda: service.http.get(f"/v1/scenes/{late}").status_code == 200)  # they find one another again
+        wait_for(lambda: service.http.get(f"/v1/scenes/{late}").status_code == 200)  # they find one another again
         other.http.delete(f"/v1/scenes/{late}")
     finally:
         other.stop()

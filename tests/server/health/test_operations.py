@@ -21,6 +21,8 @@ from waiting import HANG_S
 from client.sdk import Client
 from client.wire import RigModel
 
+pytestmark = pytest.mark.service
+
 ROOT = Path(__file__).parents[3]
 TOKEN = "a-token-of-thirty-two-characters"
 

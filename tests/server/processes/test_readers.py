@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from running import HEIGHT, WIDTH, Running, fake_settings, make_rig, pictures, problem
-from waiting import HANG_S
+from waiting import HANG_S, wait_for
 
 from client.sdk import Client
 from client.wire import CameraModel, part_colour
@@ -60,13 +60,6 @@ def still(impatient):
         yield made
 
 
-def until(condition):
-    end = time.monotonic() + HANG_S
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-
-
 def in_the_background(function):
     result = concurrent.futures.Future()
 
@@ -81,7 +74,7 @@ def in_the_background(function):
 def test_views_do_not_wait_for_a_query_that_never_ends(scene):
     id, readers, http = scene
     hanging = in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}"))
-    until(lambda: readers.bulk._at_work is not None)
+    wait_for(lambda: readers.bulk._at_work is not None)
     for frame in (0, 1):
         assert http.get(f"/v1/scenes/{id}/render?frame={frame}").status_code == 200
     assert not hanging.done()
@@ -100,7 +93,7 @@ def test_one_who_hangs_up_takes_the_question_back(scene):
     id, readers, http = scene
     with pytest.raises(httpx.ReadTimeout):
         http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}", timeout=1.0)
-    until(lambda: readers.bulk._at_work is None)
+    wait_for(lambda: readers.bulk._at_work is None)
     assert http.get(f"/v1/scenes/{id}/tracks?ids=1").status_code == 200
 
 
@@ -108,11 +101,11 @@ def test_one_who_hangs_up_takes_the_question_back(scene):
 def test_a_question_that_waits_and_is_given_up_is_never_begun(scene, question):
     id, readers, http = scene
     hanging = in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}"))
-    until(lambda: readers.bulk._at_work is not None)
+    wait_for(lambda: readers.bulk._at_work is not None)
     asked = readers.bulk._asked
     with pytest.raises(httpx.ReadTimeout):
         http.get(f"/v1/scenes/{id}/{question}", timeout=0.5)
-    until(lambda: not readers.bulk._waiting)
+    wait_for(lambda: not readers.bulk._waiting)
     assert readers.bulk._asked == asked + 1
     assert not hanging.done()
 
@@ -145,9 +138,9 @@ def test_too_many_questions_are_refused(scene, monkeypatch):
     id, readers, http = scene
     monkeypatch.setattr(query_queue, "MOST_WAITING", 1)
     hanging = in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}"))
-    until(lambda: readers.bulk._at_work is not None)
+    wait_for(lambda: readers.bulk._at_work is not None)
     in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids=0"))
-    until(lambda: readers.bulk._waiting)
+    wait_for(lambda: readers.bulk._waiting)
     refused = http.get(f"/v1/scenes/{id}/parts")
     assert problem(refused, 503)["detail"] == "1 question of this scene waiting for an answer already"
     assert refused.headers["retry-after"] == "1"
@@ -161,7 +154,7 @@ def test_deleting_a_scene_answers_whoever_waits(service):
         sdk.wait(id, 0)
         readers = service.app.state.scenes[id].readers
         hanging = in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}"))
-        until(lambda: readers.bulk._at_work is not None)
+        wait_for(lambda: readers.bulk._at_work is not None)
         processes = [readers.views.process._process, readers.bulk.process._process]
         sdk.delete_scene(id)
         assert "ended" in problem(hanging.result(HANG_S), 503)["detail"]
@@ -191,10 +184,10 @@ def test_views_of_parts_never_wait_for_parts_but_the_first_time(scene):
         sdk.put_frame(id, 2, pictures())
         sdk.wait(id, 2)
     in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}", timeout=2.0))
-    until(lambda: readers.bulk._at_work is not None)
+    wait_for(lambda: readers.bulk._at_work is not None)
     seen = http.get(address)
     assert (seen.headers["x-frame"], seen.headers["x-parts-frame"]) == ("2", "1")
-    until(lambda: http.get(address).headers["x-parts-frame"] == "2")
+    wait_for(lambda: http.get(address).headers["x-parts-frame"] == "2")
 
 
 def mine():
