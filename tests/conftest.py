@@ -9,15 +9,21 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 WITHOUT_KERNELS = (
     "tests/core/captures", "tests/client/importers", "tests/core/metrics", "tests/docker", "tests/server/connections",
+    "tests/core/torch_backend/test_losses.py", "tests/core/torch_backend/test_deformation.py",
     "tests/test_docs.py", "tests/test_imports.py", "tests/test_wheel.py",
 )  # fmt: skip
 """Tests that run no kernel, in no process: they go on while another process compiles."""
 LONGEST = (
+    "test_ray_placement.py",
+    "test_hard_frames.py",
     "test_faults.py",
     "test_damage.py",
+    "test_reproducible.py",
+    "test_operations.py",
+    "test_client_demo.py",
+    "test_soak.py",
     "test_gradients.py",
     "test_frames.py",
-    "test_hard_frames.py",
     "test_light.py",
 )
 """Files that take longest: begun last, they would have the other processes wait for them."""
@@ -33,17 +39,15 @@ def kernels(request: pytest.FixtureRequest) -> None:
 
 
 SERVICE_FIXTURES = {"service", "app"}
-SERVICE_STARTERS = {"Running", "serving", "serving_with", "stub"}
+SERVICE_STARTERS = {"Running", "Service", "serving", "serving_with", "stub"}
 """A test that has one of those fixtures, or whose file imports one of those helpers, gets the mark `service`."""
-MARKS_OF_FOLDERS = {
-    "tests/browser": "browser",
-    "tests/core/kernels": "second_processor",
-    "tests/core/properties": "second_processor",
-    "tests/core/rasterize": "second_processor",
-    "tests/core/torch_backend": "second_processor",
-    "tests/studies/hard_cases": "second_processor",
-    "tests/studies": "slow",
-}
+SLOW = "tests/studies/"
+BROWSER = "tests/browser/"
+SECOND_PROCESSOR = (
+    "tests/core/kernels/", "tests/core/properties/", "tests/core/rasterize/", "tests/core/torch_backend/",
+    "tests/studies/hard_cases/",
+)  # fmt: skip
+"""The same folders are named in .ci/run."""
 
 
 def path_of(item: pytest.Item) -> str:
@@ -51,11 +55,15 @@ def path_of(item: pytest.Item) -> str:
 
 
 def add_marks(item: pytest.Item) -> None:
-    """Adds the marks that folders, fixtures and helpers imply; a file adds others itself, with `pytestmark`."""
+    """Adds the marks that folders, fixtures and helpers imply; files and tests have further ones of their own."""
     assert isinstance(item, pytest.Function)
-    for folder, mark in MARKS_OF_FOLDERS.items():
-        if path_of(item).startswith(f"{folder}/"):
-            item.add_marker(mark)
+    path = path_of(item)
+    if path.startswith(SLOW):
+        item.add_marker("slow")
+    if path.startswith(BROWSER):
+        item.add_marker("browser")
+    if path.startswith(SECOND_PROCESSOR) and not path.startswith(WITHOUT_KERNELS):
+        item.add_marker("second_processor")
     if SERVICE_FIXTURES & set(item.fixturenames) or SERVICE_STARTERS & vars(item.module).keys():
         item.add_marker("service")
 
@@ -67,8 +75,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         add_marks(item)
 
     def turn(item: pytest.Item) -> int:
-        path = path_of(item)
-        return 0 if path.startswith("tests/server/connections") else 1 if item.path.name in LONGEST else 2
+        if path_of(item).startswith("tests/server/connections"):
+            return 0
+        return 1 + (LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
 
     items.sort(key=turn)  # stable: files stay together
 
