@@ -19,7 +19,7 @@ from client.wire import FRAME_MEDIA_TYPE, FrameReportModel, RigModel, SceneStatu
 from scas4d_core.cameras import Rig
 from server.storage.layout import DataFolder
 
-START_S, PATIENCE_S = 120.0, 900.0
+START_S, PATIENCE_S = 600.0, 900.0
 EVERY_S = 0.05
 
 
