@@ -21,7 +21,7 @@ from scas4d_core.cameras import Rig
 from scas4d_core.captures import InitialPoints
 from server.storage.layout import DataFolder
 
-START_S, PATIENCE_S = 120.0, 900.0
+START_S, PATIENCE_S = 600.0, 900.0
 EVERY_S = 0.05
 
 

@@ -9,8 +9,11 @@ import sys
 from pathlib import Path
 
 import pytest
+from waiting import HANG_S
 
 from client.cli.extras import EXPORTS, SERVER, remedy
+
+pytestmark = pytest.mark.slow
 
 FAKES = str(Path(__file__).parents[1] / "helpers")
 ALONE = f"""
@@ -31,7 +34,7 @@ def scas4d(*arguments, before=(), **environment):
         [sys.executable, "-m", "client.cli.main", *map(str, arguments)],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=HANG_S,
         env={**os.environ, "PYTHONPATH": path, "COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb", **environment},
     )
 

@@ -21,6 +21,8 @@ from scas4d_core.query.ply import read_ply
 from scas4d_core.storage.frame_aside import FrameAside, ScratchFile
 from scas4d_core.storage.history import History
 
+pytestmark = pytest.mark.slow
+
 CHANGES = {"static": {"iterations": 2}, "update": {"iterations": 2}}
 
 
