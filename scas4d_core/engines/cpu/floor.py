@@ -20,6 +20,6 @@ def floor_term(plane: Plane, means: Array, rows: NDArray[np.int64], weight: floa
         return 0.0
     normal = np.array(plane[:3], np.float32)
     depth = means[rows] @ normal + np.float32(plane[3])
-    below = rows[depth > 0]
-    g_means[below] += np.float32(weight / len(rows)) * normal
-    return float(weight * np.maximum(depth, 0).mean())
+    below = depth > 0  # not of a Gaussian that is not finite
+    g_means[rows[below]] += np.float32(weight / len(rows)) * normal
+    return float(weight * depth[below].sum(dtype=np.float64) / len(rows))

@@ -16,7 +16,7 @@ from scas4d_core.engines.gains import CameraGains
 from scas4d_core.engines.plan import MAX_SCALE, Structure, UpdatePlan
 from scas4d_core.engines.torch import losses
 from scas4d_core.engines.torch.gloss import RATES, SAME_SIDE, SMOOTH_OVER, cell_shares, gloss_rate
-from scas4d_core.engines.torch.parameters import GlossParameters, Parameters, leaf
+from scas4d_core.engines.torch.parameters import GlossParameters, Parameters, deformation_of, leaf
 from scas4d_core.engines.torch.rasterizer import CameraParams, render
 from scas4d_core.engines.torch.renderer import TorchRenderer
 from scas4d_core.engines.torch.scene import Moved, Scene
@@ -54,14 +54,8 @@ class TorchEngine:
     def load_state(self, previous: Gaussians) -> None:
         """See ``UpdateEngine.load_state``."""
         self._scene = scene = Scene(self._plan, self._structure, previous)
-        still = Tables.still(self._structure.hierarchy)
-        self._parameters = Parameters(
-            [],
-            None,
-            scene.colours[scene.rows].clone(),
-            scene.colours[scene.standing].clone(),  # type: ignore[arg-type]
-        )
-        self._parameters.set_tables(still)
+        moving, standing = scene.colours[scene.rows].clone(), scene.colours[scene.standing].clone()
+        self._parameters = Parameters(*deformation_of(Tables.still(self._structure.hierarchy)), moving, standing)
         self._gains: CameraGains | None = None
         self._smoothing: tuple[Tensor, Tensor] | None = None
         self._log, self._gradients = IterationLog(), dict[str, Array]()
