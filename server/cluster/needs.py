@@ -8,8 +8,8 @@ from typing import Any
 
 from client.wire import RigModel
 from server.health.estimate import estimate
+from server.messages import SceneSpec
 from server.processes import renderer, worker
-from server.processes.messages import SceneSpec
 from server.processes.placement import Entry
 from server.settings import ServerSettings
 

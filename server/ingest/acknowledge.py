@@ -10,7 +10,7 @@ from typing import Any, Literal, TypeVar
 
 from client.wire import FrameHead, FrameReceipt, FrameState, SceneState
 from scas4d_core.cameras import Rig
-from server.health import metrics
+from server import counters
 from server.problems import Problem, counted
 from server.storage.events import FrameAccepted, FramesSkipped, Hashes
 from server.storage.frame_table import LOST
@@ -166,7 +166,7 @@ class Ingest:
             receipt = await self.acknowledge(event)
             self.log.pictures.add(received.file, received.size)
             received.kept = True
-            metrics.INGEST_BYTES.inc(received.size)
+            counters.INGEST_BYTES.inc(received.size)
         self.accepted()
         return receipt
 
@@ -180,7 +180,7 @@ class Ingest:
         await self.log.append(*skipped, event)
         for index in (index for one in skipped for index in one.frames):
             self.ended(index)
-        metrics.FRAMES.labels("acknowledged").inc()
+        counters.FRAMES.labels("acknowledged").inc()
         if self.ledger.frames[event.index].finished:  # it comes before the first frame
             self.ended(event.index)
         receipt = self.ledger.frames[event.index].receipt

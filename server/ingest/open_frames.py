@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from client.wire import FileKind, FrameHead, FrameReceipt, FrameReportModel, FrameState, PartReceipt
-from server.health import metrics
+from server import counters
 from server.ingest.acknowledge import Ingest, Received, uncancelled
 from server.problems import Problem, counted
 from server.storage.events import FrameAccepted, FrameMissing, JournalEvent, OpenFrame, PartAccepted
@@ -116,7 +116,7 @@ class OpenFrames:
                 )
                 self._log.pictures.add(received.file, received.size)
                 received.kept = True
-                metrics.INGEST_BYTES.inc(received.size)
+                counters.INGEST_BYTES.inc(received.size)
                 self._set_deadline(index)
         await self._close_due()
         known = await self._parts_of(index) if index < ledger.next_frame else ledger.open[index]

@@ -8,7 +8,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from scas4d_core.settings import Settings
-from server.processes.messages import Progressed
+from server.messages import Progressed
 
 STAGE = "compiling kernels"
 """The stage of a frame's progress, while its worker waits for them."""

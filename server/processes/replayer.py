@@ -9,7 +9,7 @@ from typing import Any
 
 from scas4d_core.errors import message_of
 from scas4d_core.storage.history import History
-from server.processes.messages import Damaged, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated
+from server.messages import Damaged, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated
 from server.processes.placement import begin_aside, end_aside, use_one_thread
 from server.processes.worker import decode, read
 

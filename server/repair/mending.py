@@ -17,8 +17,8 @@ from typing import Any
 from client.wire import FrameState
 from scas4d_core.errors import without_paths
 from scas4d_core.storage.frame_files import checkpoint_of, frame_file, frame_of
-from server.health import metrics
-from server.processes.messages import FrameReady, Mend, Mended, MendOutcome, Remake
+from server import counters
+from server.messages import FrameReady, Mend, Mended, MendOutcome, Remake
 from server.storage.events import JournalEvent, StatesDeleted
 from server.storage.ledger import Ledger
 
@@ -66,7 +66,7 @@ class DamageLog:
         sentence = without_paths(sentence)
         if lasting and sentence in self._counts:
             return
-        metrics.DAMAGE.labels(kind.value).inc()
+        counters.DAMAGE.labels(kind.value).inc()
         self._keep(sentence)
 
     def _keep(self, sentence: str) -> None:

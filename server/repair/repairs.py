@@ -21,7 +21,7 @@ from scas4d_core.storage.frame_files import (
     frame_of,
 )
 from scas4d_core.storage.history import NEWEST_KEPT, History
-from server.processes.messages import Mend, Mended, MendOutcome, Remake, SceneSpec
+from server.messages import Mend, Mended, MendOutcome, Remake, SceneSpec
 from server.storage.disk import no_room
 
 if TYPE_CHECKING:

@@ -29,7 +29,7 @@ from scas4d_core.storage.frame_files import (
 )
 from scas4d_core.storage.history import FRAMES_KEPT
 from scas4d_core.storage.npz import verified
-from server.health import metrics
+from server import counters
 from server.repair.mending import DamageKind, DamageLog
 from server.storage.definition import Definition, check_definition, write_definition
 from server.storage.frame_store import checked
@@ -107,7 +107,7 @@ class Scrub:
         """Reads a file to its end; returns its fault, or None, or `GONE`."""
         try:
             while (size := await asyncio.to_thread(next, pieces, None)) is not None:
-                metrics.SCRUBBED.inc(size)
+                counters.SCRUBBED.inc(size)
                 rate = self._bytes_per_second * (AT_WORK if self._at_work() else 1.0)
                 await asyncio.sleep(weight * size / rate)
         except (OSError, ValueError) as error:

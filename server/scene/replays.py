@@ -7,20 +7,12 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from client.wire import PointKind, ReplayRequest, ReplayState, ReplayStatus, TradeoffPoint
+from server.background import Background
+from server.messages import Damaged, FrameReady, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated, SceneSpec
 from server.problems import Problem, counted
 from server.processes import replayer
-from server.processes.messages import (
-    Damaged,
-    FrameReady,
-    ReplayEnded,
-    ReplayPoint,
-    ReplaySpec,
-    ReplayUpdated,
-    SceneSpec,
-)
 from server.processes.placement import AnyProcess, Ended, Placement
 from server.scene.status import effective_budget
-from server.scene.supervision import Background
 from server.storage.ledger import Ledger
 
 KEPT = 32

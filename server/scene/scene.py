@@ -14,19 +14,19 @@ from scas4d_core.cameras import Camera
 from scas4d_core.errors import message_of
 from scas4d_core.first_frame.calibration.record import in_use
 from scas4d_core.rig_checks import RigError, check_start
+from server.background import Background
+from server.hub import FrameFinished, Hub, SceneChanged
 from server.ingest.acknowledge import Ingest, IngestRules, uncancelled
 from server.ingest.open_frames import OpenFrames
+from server.messages import SceneSpec
 from server.problems import Problem, counted, of_rig
-from server.processes.messages import SceneSpec
 from server.processes.placement import STOP_SECONDS, Placement
 from server.processes.readers import Readers
 from server.repair.mending import DamageKind, DamageLog
 from server.repair.scrub import Scrub
 from server.scene.found import FoundScene
 from server.scene.replays import Replays
-from server.scene.status import FrameReports, SceneFacts, camera_of, effective_budget
-from server.scene.supervision import Background
-from server.scene.updates import Updates
+from server.scene.status import SceneFacts, camera_of, effective_budget
 from server.settings import ServerSettings
 from server.storage.events import BudgetChanged, JournalEvent, PauseChanged, SceneCreated, SceneEdited
 from server.storage.frame_store import FrameLogIndex
@@ -34,7 +34,8 @@ from server.storage.frame_table import FrameTable
 from server.storage.journal import Journal
 from server.storage.ledger import SceneLog
 from server.storage.snapshot import events_of
-from server.stream.hub import FrameFinished, Hub, SceneChanged
+from server.updates.reports import FrameReports
+from server.updates.updates import Updates
 
 log = logging.getLogger("scas4d.server")
 

@@ -13,7 +13,7 @@ import pytest
 
 from server.cluster import host, marks
 from server.cluster.host import Host, Manner
-from server.processes.messages import Stop
+from server.messages import Stop
 
 
 def echo(spec: Any, connection: Connection[Any, Any]) -> None:

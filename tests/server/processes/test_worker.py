@@ -14,8 +14,8 @@ from client.wire import Budget
 from scas4d_core.captures import Frame
 from scas4d_core.compilation.manifest import Group
 from scas4d_core.presets import preset
+from server.messages import Progressed, SceneSpec
 from server.processes.kernels import STAGE
-from server.processes.messages import Progressed, SceneSpec
 from server.processes.worker import Worker
 from server.storage.layout import SceneFolder
 

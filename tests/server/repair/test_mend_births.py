@@ -8,7 +8,7 @@ from histories import state
 
 from scas4d_core.storage.frame_files import born_file
 from scas4d_core.storage.history import History
-from server.processes.messages import Mend, MendOutcome
+from server.messages import Mend, MendOutcome
 from server.repair.repairs import mend, mend_at_start
 
 

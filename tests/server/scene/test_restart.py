@@ -259,8 +259,8 @@ def test_two_services_do_not_share_a_folder(tmp_path):
 def _start_second(folder):
     import asyncio
 
+    from server.hub import Hub
     from server.processes.placement import Placement
     from server.scene.scenes import Scenes
-    from server.stream.hub import Hub
 
     asyncio.run(Scenes(fake_settings(folder), Placement(), Hub(1)).open())

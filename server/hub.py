@@ -10,7 +10,7 @@ from typing import Protocol, TypeVar
 
 from client.wire import FrameReportModel, SceneStatus
 from server.problems import Problem
-from server.stream.shared_queries import AskReaders, SharedQueries
+from server.processes.shared_queries import AskReaders, SharedQueries
 
 log = logging.getLogger("scas4d.server")
 

@@ -9,9 +9,10 @@ from dataclasses import replace
 from typing import Any
 
 from client.wire import FrameState, IngestSettings, ProgressModel, Retention
-from server.health import metrics
-from server.processes.kernels import STAGE
-from server.processes.messages import (
+from server import counters
+from server.background import Background
+from server.hub import Event, FrameFinished, SceneChanged
+from server.messages import (
     Broken,
     FrameCommitted,
     FrameFailed,
@@ -25,14 +26,15 @@ from server.processes.messages import (
     StatesRetained,
     WaitsForNode,
 )
+from server.processes.kernels import STAGE
 from server.processes.placement import Ended, Placement
 from server.processes.readers import Readers
 from server.repair.mending import DamageKind, DamageLog, Mending
-from server.scene.status import FrameReports, last_trouble, of_first_report, trouble_of
-from server.scene.supervision import Background, WorkClock, WorkerProcess, given_up
 from server.storage.events import FrameSetAside, PicturesDeleted, StatesDeleted, WorkerDied
 from server.storage.ledger import SceneLog
-from server.stream.hub import Event, FrameFinished, SceneChanged
+from server.updates.reports import FrameReports, last_trouble, of_first_report, trouble_of
+from server.updates.work_clock import WorkClock
+from server.updates.worker_process import WorkerProcess, given_up
 
 log = logging.getLogger("scas4d.server")
 
@@ -104,15 +106,15 @@ class Updates:
         """Counts and publishes an event; to be called at every change of the scene's status or of a frame."""
         if isinstance(event, FrameFinished):
             report = event.report
-            metrics.FRAMES.labels(report.state.value).inc()
+            counters.FRAMES.labels(report.state.value).inc()
             if report.state == FrameState.COMMITTED:
-                metrics.LEFT_OUT.inc(len(report.dropped_cameras))
+                counters.LEFT_OUT.inc(len(report.dropped_cameras))
                 for alarm in report.alarms:
-                    metrics.ALARMS.labels(alarm.what.value).inc()
+                    counters.ALARMS.labels(alarm.what.value).inc()
                 if report.outcome is not None and report.outcome.degraded:
-                    metrics.DEGRADED.labels("held" if report.outcome.held else "in_part").inc()
+                    counters.DEGRADED.labels("held" if report.outcome.held else "in_part").inc()
             for stage, seconds in report.seconds.items():
-                metrics.UPDATE_SECONDS.labels(stage).observe(seconds)
+                counters.UPDATE_SECONDS.labels(stage).observe(seconds)
         self._publish(event)
 
     @property
@@ -323,7 +325,7 @@ class Updates:
         self.clock.end(committed=False)
         if self._ledger.fatal is not None:
             return
-        metrics.RESTARTS.labels("worker").inc()
+        counters.RESTARTS.labels("worker").inc()
         own, delay = self.worker.deaths.died(reason)
         self.trouble = f"the worker is gone: {reason}; it is started again in {delay:g} s"
         log.error("scene %s: %s", self._ledger.scene, self.trouble)

@@ -8,17 +8,11 @@ import pytest
 from running import make_rig
 
 from scas4d_core.presets import preset
-from server.processes.messages import SceneSpec
+from server.messages import SceneSpec
 from server.processes.placement import Ended
-from server.scene.supervision import (
-    FIRST_GUESS_S,
-    OVERDUE,
-    SHORTEST_S,
-    UPDATES_KEPT,
-    WorkClock,
-    WorkerProcess,
-)
 from server.storage.layout import SceneFolder
+from server.updates.work_clock import FIRST_GUESS_S, OVERDUE, SHORTEST_S, UPDATES_KEPT, WorkClock
+from server.updates.worker_process import WorkerProcess
 
 
 class Hand:
