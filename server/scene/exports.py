@@ -249,7 +249,7 @@ class Exports:
             case Damaged():
                 scene = self._scenes.by_id.get(export.scene)
                 if scene is not None and scene.has_place:  # of one that sleeps the next pass over it finds them
-                    scene.updates.mending.noticed(message.files)
+                    scene.mending.noticed(message.files)
             case ExportEnded():
                 end(message.fault)
 

@@ -20,7 +20,8 @@ from server.storage.journal import Journal
 from server.storage.layout import SceneFolder
 from server.storage.points import points_positions, points_sha256
 from server.storage.recovery import Recovered, recover
-from server.updates.reports import last_trouble, of_first_report
+from server.updates.reports import of_first_report
+from server.updates.trouble import last_trouble
 
 
 @dataclass(frozen=True)

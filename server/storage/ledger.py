@@ -98,6 +98,11 @@ class Ledger:
         """Frames acknowledged and not finished."""
         return self.counts[FrameState.QUEUED] + self.counts[FrameState.UPDATING]
 
+    @property
+    def updating(self) -> bool:
+        """True while the worker has a frame."""
+        return self.counts[FrameState.UPDATING] > 0
+
     def apply(self, event: JournalEvent) -> None:
         """Applies one event. Events may come twice, and those before them may be lost."""
         match event:

@@ -1,4 +1,4 @@
-"""Reports of a scene's frames, and what in them matters to the scene: trouble, and the report of the first frame."""
+"""Reports of a scene's frames; those that are not in memory are read from disk."""
 
 from __future__ import annotations
 
@@ -11,25 +11,6 @@ from typing import Any
 from client.wire import FrameReportModel, FrameState
 from scas4d_core.storage.history import History, HistoryError
 from server.storage.ledger import Ledger
-
-
-def trouble_of(report: FrameReportModel) -> str | None:
-    """Says why a scene is degraded whose newest finished frame has this report; None: it is not."""
-    if report.state == FrameState.SET_ASIDE:
-        return f"frame {report.index} was set aside: {report.error}"
-    if report.outcome is not None and report.outcome.degraded:
-        verb = "" if report.outcome.held else "committed in part: "
-        return f"frame {report.index} was {verb}{report.degraded}"
-    if report.dropped_cameras:
-        left_out = "; ".join(f"{name}: {reason}" for name, reason in report.dropped_cameras.items())
-        return f"frame {report.index} was committed without camera {left_out}"
-    return None
-
-
-def last_trouble(ledger: Ledger) -> str | None:
-    """Says what went wrong with the newest frame that was tried, or None."""
-    last = ledger.last_tried()
-    return None if last is None else trouble_of(ledger.frames[last].report)
 
 
 def of_first_report(record: Mapping[str, Any]) -> dict[str, Any]:

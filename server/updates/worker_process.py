@@ -93,8 +93,7 @@ class WorkerProcess:
 
     Args:
         spec: of the scene; another one holds from the next start on.
-        received: called with every message of the process.
-        ended: called when the process ended without being asked to; `start_in` starts the next.
+        placement: starts the process.
 
     Attributes:
         ready: the process has said that it has taken the scene up; to be set by who receives that message.
@@ -102,20 +101,14 @@ class WorkerProcess:
         deaths: how often a process died, and whether by its own doing.
     """
 
-    def __init__(
-        self,
-        spec: SceneSpec,
-        placement: Placement,
-        received: Callable[[Any], None],
-        ended: Callable[[Ended], None],
-    ) -> None:
+    def __init__(self, spec: SceneSpec, placement: Placement) -> None:
         self.spec = spec
         self.ready = False
         self.life: object | None = None
         self.deaths = WorkerDeaths()
         self._placement = placement
-        self._received = received
-        self._ended = ended
+        self._received: Callable[[Any], None]
+        self._ended: Callable[[Ended], None]
         self._process: AnyProcess | None = None
         self._next: asyncio.TimerHandle | None = None
         self._closed = False
@@ -124,6 +117,15 @@ class WorkerProcess:
         self._epoch: int | None = None
         self._fencing: asyncio.Task[None] | None = None
         """Begins an epoch for the next process."""
+
+    def listen(self, received: Callable[[Any], None], ended: Callable[[Ended], None]) -> None:
+        """Sets the receiver of messages; to be called once, before the first start.
+
+        Args:
+            received: called with every message of the process.
+            ended: called when the process ended without being asked to; `start_in` starts the next.
+        """
+        self._received, self._ended = received, ended
 
     @property
     def starts_again(self) -> bool:

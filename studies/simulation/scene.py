@@ -57,7 +57,8 @@ class SimulatedScene:
         self._dead = False
         self._frames.acknowledged.setdefault(plan.name, 0)
         self._recover()
-        self.worker = WorkerProcess(plan.spec, placement, self._from_worker, self._worker_ended)
+        self.worker = WorkerProcess(plan.spec, placement)
+        self.worker.listen(self._from_worker, self._worker_ended)
         self._times.want(plan.name, reason, plan.kind)
         self.worker.start()
         self._expect()

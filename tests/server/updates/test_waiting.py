@@ -125,7 +125,8 @@ def test_nothing_starts_a_worker_before_the_pause_after_its_end_is_over(tmp_path
     async def deaths():
         there = Processes()
         spec = SceneSpec(SceneFolder(tmp_path), make_rig(), preset("scas4d"))
-        process = WorkerProcess(spec, there, lambda message: None, lambda why: None)
+        process = WorkerProcess(spec, there)
+        process.listen(lambda message: None, lambda why: None)
         process.start()
         for seconds in (0.05, 0.15):
             there.ends[-1](Ended(-9))
