@@ -164,8 +164,9 @@ def _deletes_states(definition: Mapping[str, Any], ledger: Ledger) -> bool:
     """True for a scene with a rule that deletes old states."""
     if ledger.edited.keep_states is not None:
         return any(value is not None for _, value in ledger.edited.keep_states)
-    rule = definition.get("request", {}).get("ingest", {}).get("keep_states") or {}
-    return any(value is not None for value in rule.values())
+    if not definition:  # of a new scene
+        return False
+    return any(value is not None for value in definition["request"]["ingest"]["keep_states"].values())
 
 
 def _remade(ledger: Ledger, states: _States, broken: bool, deletes: bool) -> dict[int, str]:
