@@ -47,6 +47,9 @@ class Scene:
     Frames are numbered from 0 without gaps; a frame is acknowledged, waits in a bounded queue, and ends committed, set
     aside, missing or skipped. The ledger has all that is known of them; acknowledged changes are journalled first.
 
+    The way of a frame: `Ingest.acknowledge` journals it, `Updates.begin` sends it to the worker, `Updates._commit`
+    records that it is committed, and `Publisher.finished` publishes its report.
+
     Args:
         found: the content of its folder, of a new scene too.
         server: settings of the service. placement: starts its processes. hub: publishes its events.
@@ -87,6 +90,7 @@ class Scene:
             request.nodes,
         )
 
+        # Events of the scene, and its log.
         self._publisher = Publisher(hub, self.id)
         self._trouble = Trouble(self._publisher, last_trouble(self.ledger))
         self._background = Background(self._failed)
@@ -98,6 +102,7 @@ class Scene:
             self._trouble.report,
         )
 
+        # Updates. Readers report damaged files to `mending`, which asks the worker to write them again.
         worker = WorkerProcess(self.spec, placement)
         self.mending = Mending(self.log, self._damage, self._background, to_worker=worker.send, remake=content.remake)
         self.readers = Readers(self.spec, placement, self.mending.noticed)
@@ -115,6 +120,8 @@ class Scene:
             keep_frames=kept.keep_frames,
             first=found.first,
         )
+
+        # Frames that come in.
         self.ingest = Ingest(self.log, self.rules, self.updates, self._publisher, can_begin=self._check_start)
         self.open_frames = OpenFrames(self.ingest, self._background)
         self.updates.when_room_is_made(self.open_frames.close_due)
