@@ -1,6 +1,6 @@
 """Counters and histograms of this process, for Prometheus: each is raised where the event happens.
 
-They import nothing of the service, so that every part of it can count. `server.health.metrics` has the gauges.
+This file imports nothing of the service, so that every part can count. `server.health.metrics` has the gauges.
 """
 
 from __future__ import annotations
