@@ -22,6 +22,7 @@ from server.http import handlers
 from server.http.authentication import AuthMiddleware
 from server.http.middleware import AccessLog, BodyLimit, HeadAsGet, compressed
 from server.http.tickets import Tickets
+from server.hub import Hub
 from server.problems import Problem
 from server.processes.placement import Placement
 from server.routes import (
@@ -54,7 +55,6 @@ from server.scene.scenes import Scenes
 from server.settings import ServerSettings
 from server.siblings.passing import PassOn
 from server.siblings.siblings import Siblings
-from server.stream.hub import Hub
 
 
 def create_app(settings: ServerSettings | None = None, placement: Placement | None = None) -> FastAPI:

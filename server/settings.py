@@ -5,7 +5,6 @@ The first of these that names a setting decides. docs/operations.md has the tabl
 
 from __future__ import annotations
 
-import importlib
 import ipaddress
 import os
 import re
@@ -32,27 +31,6 @@ URL = "SCAS4D_URL"
 
 TOKEN = re.compile(r"[A-Za-z0-9._~+/=-]{16,512}")
 """Tokens that fit behind `Authorization: Bearer` (RFC 6750) and are too long to be guessed."""
-
-FORMER = {
-    "engine": "server.settings:FORMER_ENGINE",
-    "ticket_seconds": "server.http.tickets:TICKET_SECONDS",
-    "max_tickets": "server.http.tickets:MOST_TICKETS",
-    "header_lines": "server.connections.guard:HEADER_LINES",
-    "max_ingest_sockets": "server.ingest.acknowledge:MOST_SOCKETS",
-    "max_points": "server.routes.points:MOST_POINTS",
-    "max_render_pixels": "server.routes.render:MOST_PIXELS",
-    "max_track_points": "server.routes.tracks:MOST_POINTS",
-    "max_track_json_points": "server.routes.tracks:MOST_JSON_POINTS",
-    "max_track_views": "server.routes.tracks:MOST_VIEWS",
-    "max_subscriptions": "server.stream.subscriber:MOST_SUBSCRIPTIONS",
-    "max_stream_message_kb": "server.stream.subscriber:MESSAGE_KB",
-    "stream_questions": "server.stream.shared_queries:QUERIES_AT_ONCE",
-    "waiting_questions": "server.processes.query_queue:MOST_WAITING",
-    "answer_seconds": "server.processes.query_queue:ANSWER_SECONDS",
-    "stop_seconds": "server.processes.placement:STOP_SECONDS",
-}
-"""Settings of earlier versions, and the constants that they became, as module:name."""
-FORMER_ENGINE = "server.engine:core_engine"
 
 Names = Annotated[tuple[str, ...], NoDecode]
 """Several names; in the environment with commas between."""
@@ -292,7 +270,6 @@ class ServerSettings(BaseSettings):
             written = {} if file is None else TomlConfigSettingsSource(cls, toml_file=Path(file))()
         except ValueError as error:  # tomllib's says line and column
             raise SettingsError(f"{CONFIG}: {file} is no TOML ({error})") from None
-        _refuse_former(environment, written)
         merged = {**written, **read, **{n: v for n, v in given.items() if v is not None}}
         try:
             return cls.model_validate(merged)
@@ -307,36 +284,9 @@ class ServerSettings(BaseSettings):
             raise SettingsError((f"setting {name}{value}: " if name else "") + fault + known) from None
 
 
-def _refuse_former(environment: Mapping[str, str], written: dict[str, Any]) -> None:
-    """Takes settings of earlier versions out of `written`, the settings of the file.
-
-    Raises:
-        SettingsError: one of them, there or in the environment, differs from the constant that it became.
-    """
-    of_environment = {name.upper(): value for name, value in environment.items()}
-    for name, place in FORMER.items():
-        variable = PREFIX + name.upper()
-        given = {variable: of_environment.get(variable), name: written.pop(name, None)}
-        for known_as, value in given.items():
-            if value is None:
-                continue
-            module, _, constant = place.partition(":")
-            fixed = getattr(importlib.import_module(module), constant)
-            try:
-                same = value == fixed if isinstance(fixed, str) else float(value) == fixed
-            except (TypeError, ValueError):
-                same = False
-            if not same:
-                place = "" if name == "engine" else f", or change {constant} in {module.replace('.', '/')}.py"
-                raise SettingsError(
-                    f"setting {known_as} is {value!r}, and is no setting any more: it is always {fixed!r}; leave it "
-                    f"out{place}"
-                )
-
-
 def unknown(environment: Mapping[str, str]) -> list[str]:
     """Returns names that look like settings and are none: misspelt, most likely."""
-    known = {f"{PREFIX}{name.upper()}" for name in (*ServerSettings.model_fields, *FORMER)} | {CONFIG, URL}
+    known = {f"{PREFIX}{name.upper()}" for name in ServerSettings.model_fields} | {CONFIG, URL}
     return sorted(name for name in environment if name.upper().startswith(PREFIX) and name.upper() not in known)
 
 

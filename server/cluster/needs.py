@@ -8,8 +8,8 @@ from typing import Any
 
 from client.wire import RigModel
 from server.health.estimate import estimate
+from server.messages import SceneSpec
 from server.processes import renderer, worker
-from server.processes.messages import SceneSpec
 from server.processes.placement import Entry
 from server.settings import ServerSettings
 
@@ -24,32 +24,30 @@ class Needs:
     """Of one process.
 
     Attributes:
-        role: what it does, in a word. scene: whose. cpus, gpus: parts of them. memory: bytes. labels: of the node.
+        role: what it does, in a word. scene: whose. cpus: parts of them. memory: bytes. labels: of the node.
     """
 
     role: str
     scene: str
     cpus: float
-    gpus: float
     memory: int
     labels: Mapping[str, str] = field(default_factory=dict)
 
     def words(self) -> str:
         """In words.
 
-        >>> Needs("worker", "a", 1, 0, 700_000_000).words()
+        >>> Needs("worker", "a", 1, 700_000_000).words()
         '1 CPU and 0.7 GB of memory'
-        >>> Needs("worker", "a", 1, 0, 700_000_000, {"rig": "stage-a"}).words()
+        >>> Needs("worker", "a", 1, 700_000_000, {"rig": "stage-a"}).words()
         '1 CPU and 0.7 GB of memory on a node with rig=stage-a'
         """
-        gpus = f", {self.gpus:g} GPU" if self.gpus else ""
         labels = ", ".join(f"{name}={value}" for name, value in self.labels.items())
         node = f" on a node with {labels}" if labels else ""
-        return f"{self.cpus:g} CPU{gpus} and {self.memory / 1e9:.1f} GB of memory{node}"
+        return f"{self.cpus:g} CPU and {self.memory / 1e9:.1f} GB of memory{node}"
 
     def options(self) -> dict[str, Any]:
         """As options of a Ray actor."""
-        room = {"num_cpus": self.cpus, "num_gpus": self.gpus, "memory": self.memory}
+        room = {"num_cpus": self.cpus, "memory": self.memory}
         return room | ({"label_selector": dict(self.labels)} if self.labels else {})
 
 
@@ -61,9 +59,8 @@ def needs_of(entry: Entry, spec: Any, server: ServerSettings) -> Needs | None:
     found = estimate(RigModel.of(scene.rig), scene.settings, server)
     name, labels = scene.folder.name, scene.nodes
     if entry is worker.main:
-        gpu = 1.0 if scene.settings.device == "cuda" else 0.0
-        return Needs("worker", name, 1.0, gpu, round(1e6 * found.worker_mb), labels)
+        return Needs("worker", name, 1.0, round(1e6 * found.worker_mb), labels)
     memory = round(1e6 * found.readers_mb / 2)
     if entry in (renderer.views, renderer.bulk):
-        return Needs(entry.__name__, name, READER_CPUS, 0.0, memory, labels)
-    return Needs(entry.__module__.rpartition(".")[2], name, ASIDE_CPUS, 0.0, memory, labels)
+        return Needs(entry.__name__, name, READER_CPUS, memory, labels)
+    return Needs(entry.__module__.rpartition(".")[2], name, ASIDE_CPUS, memory, labels)

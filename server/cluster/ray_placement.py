@@ -25,8 +25,8 @@ from server.cluster.needs import Needs, needs_of
 from server.cluster.nodes import Place, all_nodes, cluster_of, is_lost
 from server.cluster.services import announced, others
 from server.cluster.watch import NodeWatch
+from server.messages import WaitsForNode
 from server.processes import worker
-from server.processes.messages import WaitsForNode
 from server.processes.placement import STOP_SECONDS, AnyProcess, Ended, Entry, Placement
 from server.settings import ServerSettings
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from server.connections.process import unread_bytes
 from server.connections.record import KINDS, PROGRESS_BYTES, Handler, OpenConnection, Peer, Phase
 from server.connections.refusals import Refusal
-from server.health.metrics import CONNECTIONS_REFUSED
+from server.counters import CONNECTIONS_REFUSED
 from server.settings import ServerSettings
 
 HEADER_LINES = 100
@@ -39,6 +39,9 @@ SUMMARY_S = 10.0
 """Between two lines of the log about refused connections: a line each would be another flood."""
 
 log = logging.getLogger("scas4d.server")
+
+for refusal in Refusal:  # those that never happened count too: as 0
+    CONNECTIONS_REFUSED.labels(refusal.value)
 
 
 @dataclass(frozen=True)

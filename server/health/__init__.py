@@ -1,1 +1,1 @@
-"""The state of the service for operators: readiness, devices, estimates, metrics, logs."""
+"""The state of the service for operators: readiness, estimates, gauges, logs."""

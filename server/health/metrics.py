@@ -1,4 +1,4 @@
-"""Metrics for Prometheus. Counters are raised where the event happens; gauges are read on request."""
+"""Gauges for Prometheus, read on request. `server.counters` has what is counted when it happens."""
 
 from __future__ import annotations
 
@@ -6,92 +6,10 @@ import shutil
 from collections import Counter as Counts
 from collections.abc import Iterator, Mapping, Sequence
 
-from prometheus_client import CollectorRegistry, Counter, Histogram
 from prometheus_client.core import GaugeMetricFamily, Metric
 
 from client.wire import Cluster, SceneState, SceneStatus
-from scas4d_core.frame_outcome import AlarmKind
-from server.connections.refusals import Refusal
 from server.settings import ServerSettings
-from server.stream.hub import Hub
-
-SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2, 4, 8, 16, 32, 64, 128, 256)
-
-registry = CollectorRegistry()
-"""Metrics of this process, without the interpreter's own."""
-
-FRAMES = Counter(
-    "scas4d_frames",
-    "Frames by what became of them: acknowledged, committed, set_aside, skipped, missing.",
-    ["state"],
-    registry=registry,
-)
-INGEST_BYTES = Counter("scas4d_ingest_bytes", "Encoded pictures and masks of acknowledged frames.", registry=registry)
-DEGRADED = Counter(
-    "scas4d_degraded_frames",
-    "Committed frames whose state is not theirs: held (the state before stands) or in part.",
-    ["how"],
-    registry=registry,
-)
-LEFT_OUT = Counter(
-    "scas4d_cameras_left_out",
-    "Cameras of committed frames that were not learnt from: nothing came, or it did not fit.",
-    registry=registry,
-)
-ALARMS = Counter(
-    "scas4d_alarms",
-    "Alarms of committed frames, by what they are about.",
-    ["what"],
-    registry=registry,
-)
-for what in AlarmKind:
-    ALARMS.labels(what.value)
-UPDATE_SECONDS = Histogram(
-    "scas4d_update_seconds", "A committed frame, by stage.", ["stage"], buckets=SECONDS, registry=registry
-)
-ANSWER_SECONDS = Histogram(
-    "scas4d_answer_seconds",
-    "From the question to the answer of a scene's reader, by kind (render, tracks, parts, gaussians, ply) and outcome.",
-    ["kind", "outcome"],
-    buckets=SECONDS,
-    registry=registry,
-)
-STREAM_MISSED = Counter(
-    "scas4d_stream_missed",
-    "Messages that slow subscribers missed because a newer one took their place.",
-    registry=registry,
-)
-RESTARTS = Counter(
-    "scas4d_process_restarts",
-    "Processes of scenes that ended by themselves and were replaced.",
-    ["process"],
-    registry=registry,
-)
-DAMAGE = Counter(
-    "scas4d_damage",
-    "Damage found on disk while the service ran: state, checkpoint, fixed, journal, frame, definition, points.",
-    ["kind"],
-    registry=registry,
-)
-SCRUBBED = Counter(
-    "scas4d_scrubbed_bytes", "Read again in the background and compared with their checksums.", registry=registry
-)
-for kind in ("state", "checkpoint", "fixed", "journal", "frame", "definition", "points"):
-    DAMAGE.labels(kind)
-CONNECTIONS_REFUSED = Counter(
-    "scas4d_connections_refused",
-    "Connections and requests that were ended before the application was asked, by reason.",
-    ["reason"],
-    registry=registry,
-)
-for refusal in Refusal:
-    CONNECTIONS_REFUSED.labels(refusal.value)
-for state in ("acknowledged", "committed", "set_aside", "skipped", "missing"):
-    FRAMES.labels(state)
-for how in ("held", "in_part"):
-    DEGRADED.labels(how)
-for process in ("worker", "reader"):
-    RESTARTS.labels(process)
 
 
 class State:
@@ -101,14 +19,14 @@ class State:
         self,
         settings: ServerSettings,
         scenes: Sequence[SceneStatus],
-        hub: Hub,
+        subscribers: int,
         ready_after: float | None,
         connections: Mapping[str, int],
         cluster: Cluster | None = None,
     ) -> None:
         self.settings = settings
         self.scenes = scenes
-        self.hub = hub
+        self.subscribers = subscribers
         self.ready_after = ready_after
         self.connections = connections
         self.cluster = cluster
@@ -137,7 +55,7 @@ class State:
             for status in awake:
                 gauge.add_metric([status.id], getattr(status, field) or 0)
             yield gauge
-        yield GaugeMetricFamily("scas4d_subscribers", "WebSockets that listen to scenes.", value=self.hub.count())
+        yield GaugeMetricFamily("scas4d_subscribers", "WebSockets that listen to scenes.", value=self.subscribers)
         by_kind = GaugeMetricFamily("scas4d_connections", "Open connections by what they are at.", labels=["kind"])
         for kind, count in self.connections.items():
             by_kind.add_metric([kind], count)

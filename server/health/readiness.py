@@ -16,8 +16,8 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from scas4d_core.errors import message_of
+from server.messages import Stop
 from server.problems import Problem
-from server.processes.messages import Stop
 from server.processes.placement import AnyProcess, Placement, end_with_parent
 from server.settings import ServerSettings
 

@@ -8,13 +8,16 @@ from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
-from client.wire import FrameHead, FrameReceipt, FrameState, SceneState
+from client.wire import FrameHead, FrameReceipt, FrameState, SceneCreate, SceneState
 from scas4d_core.cameras import Rig
-from server.health import metrics
+from server import counters
+from server.hub import Publisher
 from server.problems import Problem, counted
+from server.settings import ServerSettings
 from server.storage.events import FrameAccepted, FramesSkipped, Hashes
 from server.storage.frame_table import LOST
 from server.storage.ledger import SceneLog, frame_identity
+from server.updates.updates import Updates
 
 T = TypeVar("T")
 
@@ -54,34 +57,45 @@ class IngestRules:
     minimum_cameras: int
     part_seconds: float | None
 
+    @classmethod
+    def of(cls, request: SceneCreate, settings: ServerSettings) -> IngestRules:
+        """Takes the rules from the request of a scene, and what it leaves open from the settings of the service."""
+        rig, ingest = request.rig.rig(), request.ingest
+        least = ingest.minimum_cameras
+        return cls(
+            rig,
+            request.frames_per_second,
+            queue_frames=ingest.queue_frames or settings.queue_frames,
+            when_full=ingest.when_full,
+            minimum_cameras=-(-len(rig) // 2) if least is None else min(least, len(rig)),
+            part_seconds=ingest.part_seconds,
+        )
+
 
 class Ingest:
     """Admits and acknowledges the frames of one scene, one at a time; uploads arrive side by side.
 
     Args:
-        log: of the scene. rules: of the scene.
+        log, rules, publisher: of the scene.
+        updates: of the scene; they begin with the frames that are accepted here.
         can_begin: called before the first frame is accepted; raises Problem where the scene cannot begin.
-        remaining: predicts the seconds until the frame at work ends.
-        accepted: called when the queue has changed. ended: called for each frame that ends without the worker.
     """
 
     def __init__(
         self,
         log: SceneLog,
         rules: IngestRules,
+        updates: Updates,
+        publisher: Publisher,
         *,
         can_begin: Callable[[], None],
-        remaining: Callable[[], float],
-        accepted: Callable[[], None],
-        ended: Callable[[int], None],
     ) -> None:
         self.log = log
         self.ledger = log.ledger
         self.rules = rules
-        self.accepted = accepted
-        self.ended = ended
+        self.updates = updates
+        self._publisher = publisher
         self._can_begin = can_begin
-        self._remaining = remaining
         self._sockets = 0
         self._coming: dict[int, asyncio.Event] = {}
         """Whole frames that are being received, and the event of their end: the next may arrive meanwhile."""
@@ -166,8 +180,8 @@ class Ingest:
             receipt = await self.acknowledge(event)
             self.log.pictures.add(received.file, received.size)
             received.kept = True
-            metrics.INGEST_BYTES.inc(received.size)
-        self.accepted()
+            counters.INGEST_BYTES.inc(received.size)
+        self.updates.begin()
         return receipt
 
     async def acknowledge(self, event: FrameAccepted) -> FrameReceipt:
@@ -180,12 +194,16 @@ class Ingest:
         await self.log.append(*skipped, event)
         for index in (index for one in skipped for index in one.frames):
             self.ended(index)
-        metrics.FRAMES.labels("acknowledged").inc()
+        counters.FRAMES.labels("acknowledged").inc()
         if self.ledger.frames[event.index].finished:  # it comes before the first frame
             self.ended(event.index)
         receipt = self.ledger.frames[event.index].receipt
         assert receipt is not None
         return receipt
+
+    def ended(self, index: int) -> None:
+        """Publishes that a frame has ended without the worker: it was skipped, is missing, or comes too early."""
+        self._publisher.finished(self.ledger.frames[index].report)
 
     # Rules: they change nothing.
 
@@ -277,7 +295,7 @@ class Ingest:
         if ledger.paused:
             seconds, remedy = PAUSED_S, f"let the scene go on: POST /v1/scenes/{ledger.scene}/resume"
         else:
-            seconds = min(self._remaining(), LONGEST_S)
+            seconds = min(self.updates.clock.remaining(), LONGEST_S)
             remedy = f"send the same frame again in {counted(math.ceil(seconds), 'second')}"
         return Problem(
             429,

@@ -6,12 +6,12 @@ A frame that never came is declared missing here too.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from client.wire import FileKind, FrameHead, FrameReceipt, FrameReportModel, FrameState, PartReceipt
-from server.health import metrics
+from server import counters
+from server.background import Background
 from server.ingest.acknowledge import Ingest, Received, uncancelled
 from server.problems import Problem, counted
 from server.storage.events import FrameAccepted, FrameMissing, JournalEvent, OpenFrame, PartAccepted
@@ -27,10 +27,10 @@ class OpenFrames:
     """The open frames of one scene.
 
     Args:
-        ingest: of the scene. background: runs a coroutine in the background, until the scene ends.
+        ingest, background: of the scene.
     """
 
-    def __init__(self, ingest: Ingest, background: Callable[[Coroutine[Any, Any, None]], None]) -> None:
+    def __init__(self, ingest: Ingest, background: Background) -> None:
         self.ingest = ingest
         self._log = ingest.log
         self._ledger = ingest.ledger
@@ -116,7 +116,7 @@ class OpenFrames:
                 )
                 self._log.pictures.add(received.file, received.size)
                 received.kept = True
-                metrics.INGEST_BYTES.inc(received.size)
+                counters.INGEST_BYTES.inc(received.size)
                 self._set_deadline(index)
         await self._close_due()
         known = await self._parts_of(index) if index < ledger.next_frame else ledger.open[index]
@@ -155,7 +155,7 @@ class OpenFrames:
 
     def _is_overdue(self, index: int) -> None:
         self._overdue.add(index)
-        self._background(self.close_due())
+        self._background.run(self.close_due())
 
     async def close_due(self) -> None:
         """Closes frames, in order, whose cameras are all in or whose deadline is over, while there is room for them."""
@@ -172,7 +172,7 @@ class OpenFrames:
                     await self._close(frame, "complete" if complete else "deadline")
                 except Problem:  # the disk is full: the next occasion tries again
                     break
-        self.ingest.accepted()
+        self.ingest.updates.begin()
 
     async def close(self, index: int) -> FrameReceipt:
         """Closes a frame on request, with the cameras that are in. A closed frame gets its receipt again.
@@ -223,7 +223,7 @@ class OpenFrames:
             if not self.ingest.has_room():
                 raise self.ingest.full(index)
             receipt = await self._close(frame, "request")
-        self.ingest.accepted()
+        self.ingest.updates.begin()
         return receipt
 
     async def _close(self, frame: OpenFrame, by: Literal["complete", "request", "deadline"]) -> FrameReceipt:

@@ -1,1 +1,1 @@
-"""The processes of a scene: worker, readers, replayer, and the messages between them and the service."""
+"""The processes of a scene: worker, readers, replayer, exporter; how they are started, and queries to the readers."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scas4d_core.compact import CompactWriter, FileError, Head
 from scas4d_core.first_frame.calibration.record import in_use
 from scas4d_core.storage.history import History
-from server.processes.messages import SceneSpec
+from server.messages import SceneSpec
 from server.processes.part_labels import fitted
 
 

@@ -10,8 +10,8 @@ from client.wire import IngestSettings
 from scas4d_core.compact import Bounds, Head
 from scas4d_core.storage.compaction import Compaction
 from scas4d_core.storage.history import History
+from server.messages import SceneSpec
 from server.processes.compact_answers import compact_head
-from server.processes.messages import SceneSpec
 from server.storage.disk import no_room
 
 BEHIND = 8

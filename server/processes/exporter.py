@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scas4d_core.errors import InputError, message_of, without_paths
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.storage.history import DamagedFrameError, History, HistoryError
+from server.messages import Damaged, ExportEnded, ExportProgressed, ExportSpec
 from server.processes.compact_answers import compact_head
-from server.processes.messages import Damaged, ExportEnded, ExportProgressed, ExportSpec
 from server.processes.placement import begin_aside, end_aside, use_one_thread
 from server.storage.disk import free_bytes, no_room
 

@@ -8,7 +8,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from scas4d_core.settings import Settings
-from server.processes.messages import Progressed
+from server.messages import Progressed
 
 STAGE = "compiling kernels"
 """The stage of a frame's progress, while its worker waits for them."""
@@ -27,8 +27,6 @@ def wait_for_first(settings: Settings, points: bool, connection: Connection[Any,
     """
     from scas4d_core import warm_up  # in this process only: the service stays light
 
-    if settings.device != "cpu":
-        return 0.0
     first, updates = warm_up.first_frame_groups(points=points), warm_up.update_groups(settings.update.covariance)
     return _waited(first, connection, then=updates)
 
@@ -41,8 +39,6 @@ def wait_for_updates(settings: Settings, connection: Connection[Any, Any] | None
     """
     from scas4d_core import warm_up
 
-    if settings.device != "cpu":
-        return 0.0
     groups = (*warm_up.first_frame_groups(points=True), *warm_up.update_groups(settings.update.covariance))
     return _waited(groups, connection)
 

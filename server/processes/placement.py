@@ -19,7 +19,7 @@ from multiprocessing.connection import Connection
 from typing import Any, NoReturn, Protocol
 
 from client.wire import Cluster
-from server.processes.messages import Stop
+from server.messages import Stop
 
 Entry = Callable[..., None]
 """Called in the process as entry(spec, connection); `connection` has recv and send of a multiprocessing Connection."""

@@ -12,9 +12,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 
-from server.health import metrics
+from server import counters
+from server.messages import Damaged, SceneSpec
 from server.problems import Problem, counted
-from server.processes.messages import Damaged, SceneSpec
 from server.processes.placement import AnyProcess, Ended, Entry, Placement
 from server.processes.queries import Answer, AskedQuery, Query, Refused
 
@@ -186,7 +186,7 @@ class QueryQueue:
     def _process_ended(self, life: object, reason: Ended) -> None:
         if life is not self._life or self._closed:
             return
-        metrics.RESTARTS.labels("reader").inc()
+        counters.RESTARTS.labels("reader").inc()
         turn, self.process, self._at_work = self._at_work, None, None
         pause = min(LONGEST_PAUSE_S, FIRST_PAUSE_S * 2**self._failures)
         self._failures += 1

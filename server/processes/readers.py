@@ -16,10 +16,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from server.health import metrics
+from server import counters
+from server.messages import SceneSpec
 from server.problems import SERVICE_FAULT, Problem
 from server.processes import renderer, track_answers
-from server.processes.messages import SceneSpec
 from server.processes.placement import STOP_SECONDS, Placement
 from server.processes.queries import (
     Answer,
@@ -97,7 +97,7 @@ class Readers:
             outcome = "cancelled"  # by who asked: no fault
             raise
         finally:
-            metrics.ANSWER_SECONDS.labels(query.kind, outcome).observe(time.perf_counter() - began)
+            counters.ANSWER_SECONDS.labels(query.kind, outcome).observe(time.perf_counter() - began)
 
     async def _answer(self, query: Query) -> Answer:
         if isinstance(query, TracksQuery):

@@ -26,9 +26,9 @@ from scas4d_core.engines.limits import rig_limits
 from scas4d_core.errors import InputError, message_of, without_paths
 from scas4d_core.storage.frame_files import frame_file
 from scas4d_core.storage.history import DamagedFrameError, History, UnreadableFrameError
+from server.messages import Damaged, SceneSpec, Stop
 from server.processes import track_answers
 from server.processes.compact_answers import compact_head, write_compact
-from server.processes.messages import Damaged, SceneSpec, Stop
 from server.processes.part_labels import PartLabels, fitted
 from server.processes.placement import use_one_thread
 from server.processes.queries import (

@@ -9,7 +9,7 @@ from typing import Any
 
 from scas4d_core.errors import message_of
 from scas4d_core.storage.history import History
-from server.processes.messages import Damaged, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated
+from server.messages import Damaged, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated
 from server.processes.placement import begin_aside, end_aside, use_one_thread
 from server.processes.worker import decode, read
 
@@ -47,8 +47,7 @@ def _replay(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
     from scas4d_core.replay import replay  # in this process only: the one that imports this module stays light
     from scas4d_core.warm_up import warm_up_elsewhere
 
-    if scene.settings.device == "cpu":
-        warm_up_elsewhere()
+    warm_up_elsewhere()
 
     use_one_thread()
     for iterations in spec.iterations:

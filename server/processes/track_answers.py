@@ -19,7 +19,7 @@ from client.wire import tracks_model
 from scas4d_core.cameras import Camera
 from scas4d_core.query.tapvid3d import tapvid3d
 from scas4d_core.storage.history import History
-from server.processes.messages import SceneSpec
+from server.messages import SceneSpec
 from server.processes.queries import TracksQuery
 
 if TYPE_CHECKING:

@@ -23,9 +23,7 @@ from scas4d_core.captures.images import ImageError, decode_image, decode_mask
 from scas4d_core.errors import message_of
 from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.storage.npz import read_npz
-from server.processes.compacting import Compacting
-from server.processes.kernels import wait_for_first, wait_for_updates
-from server.processes.messages import (
+from server.messages import (
     Broken,
     FrameCommitted,
     FrameFailed,
@@ -40,6 +38,8 @@ from server.processes.messages import (
     StatesRetained,
     Stop,
 )
+from server.processes.compacting import Compacting
+from server.processes.kernels import wait_for_first, wait_for_updates
 from server.processes.placement import end_with_parent
 from server.repair import repairs
 from server.repair.repairs import mend_at_start

@@ -17,10 +17,11 @@ from typing import Any
 from client.wire import FrameState
 from scas4d_core.errors import without_paths
 from scas4d_core.storage.frame_files import checkpoint_of, frame_file, frame_of
-from server.health import metrics
-from server.processes.messages import FrameReady, Mend, Mended, MendOutcome, Remake
-from server.storage.events import JournalEvent, StatesDeleted
-from server.storage.ledger import Ledger
+from server import counters
+from server.background import Background
+from server.messages import FrameReady, Mend, Mended, MendOutcome, Remake
+from server.storage.events import StatesDeleted
+from server.storage.ledger import SceneLog
 
 SENTENCES_KEPT = 100
 """Sentences about damage that are kept: the newest."""
@@ -66,7 +67,7 @@ class DamageLog:
         sentence = without_paths(sentence)
         if lasting and sentence in self._counts:
             return
-        metrics.DAMAGE.labels(kind.value).inc()
+        counters.DAMAGE.labels(kind.value).inc()
         self._keep(sentence)
 
     def _keep(self, sentence: str) -> None:
@@ -86,10 +87,8 @@ class Mending:
     """Mends the damage of one scene. On the event loop.
 
     Args:
-        ledger, damage: of the scene.
+        log, damage, background: of the scene.
         to_worker: posts a message; returns False where no worker can receive one.
-        changed: called with frames whose states were written or lost; a frame may begin, too.
-        journal: journals an event that is applied already, in the background.
         remake: frames whose states were found damaged at the start, with the reason.
 
     Attributes:
@@ -99,19 +98,18 @@ class Mending:
 
     def __init__(
         self,
-        ledger: Ledger,
+        log: SceneLog,
         damage: DamageLog,
+        background: Background,
         *,
         to_worker: Callable[[Any], bool],
-        changed: Callable[[tuple[int, ...]], None],
-        journal: Callable[[JournalEvent], None],
         remake: Mapping[int, str],
     ) -> None:
-        self._ledger = ledger
+        self._log = log
+        self._ledger = log.ledger
         self._damage = damage
+        self._background = background
         self._to_worker = to_worker
-        self._changed = changed
-        self._journal = journal
         self._asked: dict[str, str] = {}
         self.waiting: dict[int, str] = {}
         self._deaths: dict[int, int] = {}
@@ -164,10 +162,14 @@ class Mending:
         if message := tuple(names):
             self._to_worker(Mend(message, times, known))
 
-    def begin(self) -> None:
-        """Gives an idle worker the next state to make again, if one waits."""
-        if asyncio.get_running_loop().time() < self._full_until:
-            return
+    def begin(self) -> float:
+        """Gives an idle worker the next state to make again, if one waits.
+
+        Returns:
+            The seconds until this is to be called again, where the disk was full; else 0.
+        """
+        if (left := self._full_until - asyncio.get_running_loop().time()) > 0:
+            return left
         for index in sorted(self.waiting):
             base = self._base(index)
             if base is None:
@@ -181,10 +183,11 @@ class Mending:
             frame = FrameReady(index, receipt.time, entry.files, receipt.identity, self._ledger.budget_of(index))
             if self._to_worker(Remake(frame, base)):
                 self.at_work = index
-            return
+            break
+        return 0.0
 
-    def mended(self, message: Mended) -> None:
-        """Acts on the worker's answer about a file or a state."""
+    def mended(self, message: Mended) -> tuple[int, ...]:
+        """Acts on the worker's answer about a file or a state; returns the frames that readers have to read again."""
         index = frame_of(message.name)
         reason = self._asked.pop(message.name, message.reason)
         if index is not None and index == self.at_work and message.outcome in OF_REMAKE:
@@ -219,19 +222,22 @@ class Mending:
             case MendOutcome.NO_ROOM:
                 if index is None or index not in self.waiting:
                     self._asked[message.name] = reason
-                    self._later(message.name, lambda: self._ask({message.name} & self._asked.keys()))
+                    self._ask_later(message.name)
                 else:
                     self._full_until = asyncio.get_running_loop().time() + AGAIN_S
-                    self._later(message.name, lambda: self._changed(()))
             case MendOutcome.GONE | MendOutcome.LATER:
                 pass
-        self._changed(() if index is None else (index,))
+        return () if index is None else (index,)
 
-    def _later(self, name: str, call: Callable[[], None]) -> None:
-        """Tries again after a while; there is one timer a file, however often it is asked about."""
+    def _ask_later(self, name: str) -> None:
+        """Asks about a file again after a while; there is one timer a file, however often it is asked about."""
         if (timer := self._timers.pop(name, None)) is not None:
             timer.cancel()
-        self._timers[name] = asyncio.get_running_loop().call_later(AGAIN_S, call)
+        self._timers[name] = asyncio.get_running_loop().call_later(AGAIN_S, self._ask_again, name)
+
+    def _ask_again(self, name: str) -> None:
+        if name in self._asked:
+            self._ask({name})
 
     def retired(self, frames: Iterable[int]) -> None:
         """Forgets states that retention has deleted."""
@@ -273,7 +279,7 @@ class Mending:
         event = StatesDeleted(frames=(index,), reason=sentence)
         self._ledger.apply(event)
         self._damage.say(DamageKind.STATE, f"{sentence} ({reason})")
-        self._journal(event)
+        self._background.run(self._log.write(event))
 
     def _say(self, name: str, sentence: str, *, lasting: bool = False) -> None:
         kind = DamageKind.FIXED

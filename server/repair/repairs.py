@@ -21,7 +21,7 @@ from scas4d_core.storage.frame_files import (
     frame_of,
 )
 from scas4d_core.storage.history import NEWEST_KEPT, History
-from server.processes.messages import Mend, Mended, MendOutcome, Remake, SceneSpec
+from server.messages import Mend, Mended, MendOutcome, Remake, SceneSpec
 from server.storage.disk import no_room
 
 if TYPE_CHECKING:
@@ -34,19 +34,13 @@ log = logging.getLogger("scas4d.worker")
 
 def mend_at_start(history: History) -> list[str]:
     """What every frame needs, and its copies, written again where they are damaged; a sentence for each."""
-    folder = history.directory
-    absent = {name for name in (FIXED_COPY, FIRST_COPY) if folder is not None and not (folder / name).exists()}
     try:
         mended = history.mend_fixed()
     except OSError as error:  # states can be read all the same: a disk that takes nothing must not keep them away
         log.warning("what every frame needs cannot be mended: %s", error)
         return []
     history.take_faults()  # of files that were just written again, or that `History.damaged` names
-    return [
-        f"{reason}; it was written again from its copy"
-        for name, reason in mended.items()
-        if name not in absent  # an earlier version wrote no copies
-    ]
+    return [f"{reason}; it was written again from its copy" for reason in mended.values()]
 
 
 def mend(history: History, reconstruction: Reconstruction | None, message: Mend) -> Iterator[Mended]:

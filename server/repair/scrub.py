@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -29,8 +29,8 @@ from scas4d_core.storage.frame_files import (
 )
 from scas4d_core.storage.history import FRAMES_KEPT
 from scas4d_core.storage.npz import verified
-from server.health import metrics
-from server.repair.mending import DamageKind, DamageLog
+from server import counters
+from server.repair.mending import DamageKind, DamageLog, Mending
 from server.storage.definition import Definition, check_definition, write_definition
 from server.storage.frame_store import checked
 from server.storage.journal import checked_journal
@@ -54,9 +54,7 @@ class Scrub:
     """Scrubs one scene, pass after pass.
 
     Args:
-        definition, folder, log, damage: of the scene.
-        noticed: called with damaged files of the states' folder, by name with the reason.
-        at_work: returns whether a frame is at work.
+        definition, folder, log, damage, mending: of the scene.
         mb_per_second: of reading; 0: never. pause_seconds: before each pass.
     """
 
@@ -66,9 +64,8 @@ class Scrub:
         folder: SceneFolder,
         log: SceneLog,
         damage: DamageLog,
+        mending: Mending,
         *,
-        noticed: Callable[[Mapping[str, str]], None],
-        at_work: Callable[[], bool],
         mb_per_second: float,
         pause_seconds: float,
     ) -> None:
@@ -77,8 +74,7 @@ class Scrub:
         self._ledger = log.ledger
         self._journal = log.journal
         self._damage = damage
-        self._noticed = noticed
-        self._at_work = at_work
+        self._mending = mending
         self._bytes_per_second = 1e6 * mb_per_second
         self._pause = pause_seconds
 
@@ -107,8 +103,8 @@ class Scrub:
         """Reads a file to its end; returns its fault, or None, or `GONE`."""
         try:
             while (size := await asyncio.to_thread(next, pieces, None)) is not None:
-                metrics.SCRUBBED.inc(size)
-                rate = self._bytes_per_second * (AT_WORK if self._at_work() else 1.0)
+                counters.SCRUBBED.inc(size)
+                rate = self._bytes_per_second * (AT_WORK if self._ledger.updating else 1.0)
                 await asyncio.sleep(weight * size / rate)
         except (OSError, ValueError) as error:
             return GONE if isinstance(error, FileNotFoundError) else message_of(error)
@@ -145,8 +141,8 @@ class Scrub:
         for name in listed:
             await self._state(folder / name, lambda: False)
         newest = checkpoint_file(ledger.committed[-1])
-        if listed and not self._at_work() and not await asyncio.to_thread((folder / newest).exists):
-            self._noticed({newest: f"{newest} is gone"})
+        if listed and not self._ledger.updating and not await asyncio.to_thread((folder / newest).exists):
+            self._mending.noticed({newest: f"{newest} is gone"})
         await asyncio.to_thread(files.chunks.look)
         for index in reversed(committed):
             if index in files.chunks and not files.path(index).exists():
@@ -164,7 +160,7 @@ class Scrub:
         for index in chunk.times:
             fault = await asyncio.to_thread(files.chunks.fault, index)
             if fault is not None and index in self._ledger.committed and not files.path(index).exists():
-                self._noticed({files.path(index).name: fault})
+                self._mending.noticed({files.path(index).name: fault})
 
     def _expected(self, files: FrameFiles, index: int) -> bool:
         """True for a committed frame that has not gone to a chunk since it was listed."""
@@ -177,9 +173,9 @@ class Scrub:
         """Scrubs one file; `expected`: returns whether a missing file is damage."""
         fault = await self._read(verified(path))
         if fault == GONE and await asyncio.to_thread(expected):
-            self._noticed({path.name: f"{path.name} is gone"})
+            self._mending.noticed({path.name: f"{path.name} is gone"})
         elif fault is not None and fault != GONE:
-            self._noticed({path.name: fault})
+            self._mending.noticed({path.name: fault})
 
     async def _scrub_points(self) -> None:
         path = self._folder.points

@@ -8,8 +8,9 @@ from fastapi import APIRouter, Query, Request, Response
 
 from client.wire import GaussiansModel
 from server.processes.queries import GaussiansQuery
+from server.queries.tracks import check_ids
 from server.routes.access import TheScene, ask
-from server.routes.tracks import check_ids, ids_in
+from server.routes.tracks import ids_in
 
 router = APIRouter(prefix="/v1/scenes", tags=["gaussians"])
 

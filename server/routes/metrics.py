@@ -7,7 +7,8 @@ from fastapi.responses import PlainTextResponse, Response
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
 
-from server.health import metrics as counted
+from server.counters import registry
+from server.health.metrics import State
 from server.health.readiness import Readiness
 from server.routes.access import AllScenes, TheSettings
 
@@ -21,7 +22,7 @@ async def metrics(request: Request, scenes: AllScenes, settings: TheSettings) ->
     gauges = CollectorRegistry()
     state, guard = request.app.state, request.app.state.guard
     cluster = await scenes.placement.cluster()
-    found = counted.State(settings, scenes.statuses(), state.hub, readiness.after, guard.counts(), cluster)
+    found = State(settings, scenes.statuses(), state.hub.count(), readiness.after, guard.counts(), cluster)
     gauges.register(found)
-    text = generate_latest(counted.registry) + generate_latest(gauges)
+    text = generate_latest(registry) + generate_latest(gauges)
     return Response(text, media_type=CONTENT_TYPE_PLAIN_0_0_4)

@@ -35,7 +35,7 @@ async def put(
     asked = request or ReconstructionRequest()
     with setting_problems():
         settings = changed(scene.spec.settings, asked.settings)
-    await check_settings(scene.request, settings, server)
+    check_settings(scene.request, settings, server)
     begun = scene.ledger.reconstruction < n
     status = await scenes.begin_again(scene, Beginning(n, asked, settings, scene.rig))
     if begun:

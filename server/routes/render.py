@@ -10,13 +10,9 @@ from fastapi import APIRouter, Query, Request, Response
 from client import __version__
 from client.wire import MAX_PIXELS_A_SIDE, RenderFormat, RenderKind, RenderRequest
 from server.http.unchanging import disposition, is_known
-from server.problems import Problem, counted
-from server.processes.queries import RenderQuery
+from server.problems import Problem
+from server.queries.render import render_query
 from server.routes.access import TheScene, ask
-from server.scene.scene import Scene
-
-MOST_PIXELS = 8_000_000
-"""Pixels of one view: 4K, some seconds on one core. A larger one would keep others waiting."""
 
 router = APIRouter(prefix="/v1/scenes", tags=["views"])
 
@@ -27,16 +23,14 @@ PICTURES: dict[int | str, dict[str, Any]] = {
         "description": "The view; X-Frame says of which frame.",
     }
 }
-SEVERAL = (RenderFormat.NPZ, RenderFormat.FLOAT32)
 ENDINGS = {one: f".{'jpg' if one == RenderFormat.JPEG else one.value}" for one in RenderFormat}
 """Of files, by format."""
-LOSSY = (RenderFormat.JPEG, RenderFormat.WEBP)
 
 
 @router.post("/{id}/render", response_class=Response, responses=PICTURES)
 async def render(scene: TheScene, request: Request, view: RenderRequest) -> Response:
     """Renders a committed frame from any camera; this does not wait for an update at work."""
-    found = await ask(request, scene, query_of(scene, view))
+    found = await ask(request, scene, render_query(scene, view))
     return Response(found.body, media_type=found.media_type, headers={**found.headers, "Cache-Control": "no-store"})
 
 
@@ -64,7 +58,7 @@ async def render_by_name(
         background=None if background is None else _colour(background),
         parts=parts,
     )
-    query = query_of(scene, view)
+    query = render_query(scene, view)
     # The last frame is another one in a moment, and parts are found anew. A frame that was named stays what it is until
     # the reconstruction is begun anew, but for a damaged state that is made again, as good as before: the tag is a weak
     # one, and a view is not shown before it was asked whether it still is.
@@ -81,49 +75,6 @@ async def render_by_name(
     name = f"{scene.id[:8]}-{query.frame:06d}-{seen_by}-{query.kinds[0]}{ENDINGS[view.format]}"
     keep["Content-Disposition"] = disposition(name, inline=True)
     return Response(found.body, media_type=found.media_type, headers={**found.headers, **keep})
-
-
-def query_of(scene: Scene, request: RenderRequest) -> RenderQuery:
-    """Checks a request and returns it as the reader takes it; live views use it too."""
-    camera = scene.camera(request.camera) if isinstance(request.camera, str) else request.camera.camera()
-    if request.width is not None:
-        camera = camera.scaled(request.width / camera.width)
-    pixels = camera.width * camera.height
-    if pixels > MOST_PIXELS:
-        raise Problem(
-            422,
-            f"a view of {pixels} pixels",
-            field="camera" if request.width is None else "width",
-            value=f"{camera.width}x{camera.height}",
-            remedy=f"ask for at most {MOST_PIXELS} pixels",
-        )
-    kinds = tuple(dict.fromkeys(kind.value for kind in request.kinds))
-    if request.format not in SEVERAL and len(kinds) > 1:
-        raise Problem(
-            422,
-            f"{request.format} cannot hold {counted(len(kinds), 'kind')}",
-            field="kinds",
-            value=", ".join(kinds),
-            remedy="ask for one kind, or for npz or float32",
-        )
-    if request.format in LOSSY and kinds[0] in ("depth", "parts"):
-        raise Problem(
-            422,
-            f"{request.format} would change {kinds[0]}",
-            field="format",
-            value=request.format.value,
-            remedy="ask for png, npz or float32",
-        )
-    own = scene.spec.settings.scene.background
-    return RenderQuery(
-        camera,
-        scene.committed_frame(request.frame),
-        kinds,
-        request.format.value,
-        request.background or (None if own == "auto" else own),
-        parts=request.parts,
-        quality=request.quality,
-    )
 
 
 def _colour(text: str) -> tuple[float, float, float]:

@@ -12,7 +12,7 @@ from scas4d_core.cameras import CameraError
 from scas4d_core.presets import SettingError, preset
 from scas4d_core.rig_checks import RigError, check_scene
 from scas4d_core.settings import Settings
-from server.health import devices, estimate
+from server.health import estimate
 from server.http import validation
 from server.http.permissions import ALL, PERMISSION, Permission
 from server.problems import Problem, of_rig
@@ -69,11 +69,10 @@ def check_nodes(request: SceneCreate, placement: Placement) -> None:
         )
 
 
-async def check_settings(request: SceneCreate, settings: Settings, server: ServerSettings) -> None:
-    """Refuses settings that cannot work with the rig or on this machine."""
+def check_settings(request: SceneCreate, settings: Settings, server: ServerSettings) -> None:
+    """Refuses settings that cannot work with the rig."""
     check_rig(request, settings)
     estimate.check(request.rig, settings, server)
-    await devices.require(settings.device)
 
 
 @router.post("", status_code=201)
@@ -91,7 +90,7 @@ async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, r
                 remedy="send smaller pictures with the intrinsics to match, or raise SCAS4D_MAX_IMAGE_PIXELS",
             )
     check_nodes(request, scenes.placement)
-    await check_settings(request, settings, server)
+    check_settings(request, settings, server)
     scene = await scenes.create(request, settings)
     response.headers["Location"] = f"/v1/scenes/{scene.id}"
     return scene.status()

@@ -14,9 +14,9 @@ from client.wire.stream import STREAM_PROTOCOL, TOO_BIG
 from server import problems
 from server.connections.websocket import limit_messages
 from server.http.permissions import ALL, PERMISSION
+from server.hub import Hub
 from server.problems import Problem
 from server.scene.scenes import Scenes
-from server.stream.hub import Hub
 from server.stream.subscriber import Subscriber
 
 router = APIRouter(prefix="/v1/scenes")

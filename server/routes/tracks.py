@@ -3,33 +3,17 @@
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
-from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
-import numpy as np
 from fastapi import APIRouter, Query, Request, Response
 
-from client.wire import CameraModel, TracksModel, TracksRequest
-from scas4d_core.cameras import Camera
-from server.problems import Problem, counted
-from server.processes import track_answers
-from server.processes.queries import TracksQuery
-from server.routes import render
+from client.wire import TracksModel, TracksRequest
+from server.problems import Problem
+from server.queries.tracks import tracks_query
 from server.routes.access import TheScene, ask
 from server.scene.scene import Scene
 
 router = APIRouter(prefix="/v1/scenes", tags=["tracks"])
-
-MOST_POINTS = 1_000_000
-"""Points times frames of one query: a minute of the reader, which takes it in pieces, and 30 MB as npz."""
-MOST_JSON_POINTS = 100_000
-"""Points times frames of an answer as JSON, some 100 bytes each; npz takes more."""
-MOST_VIEWS = 4096
-"""Cameras times frames of a query in which visibility is asked for: a depth picture each, about a minute in all."""
-LARGEST_ID = 2**63 - 1
-FARTHEST = 1e15
-"""Coordinates beyond overflow where they are squared and scaled, and what comes out is no number."""
 
 Many = Annotated[list[str] | None, Query(max_length=1024)]
 ANSWERS: dict[int | str, dict[str, Any]] = {
@@ -76,143 +60,8 @@ async def tracks(
 
 async def answer(http: Request, scene: Scene, request: TracksRequest) -> Response:
     """Checks the request and asks the reader."""
-    found = await ask(http, scene, query_of(scene, request))
+    found = await ask(http, scene, tracks_query(scene, request))
     return Response(found.body, media_type=found.media_type)
-
-
-def query_of(scene: Scene, request: TracksRequest) -> TracksQuery:
-    """Checks a request and returns it as the reader takes it; live tracks use it too."""
-    kinds = {"ids": request.ids, "pixels": request.pixels, "points": request.points}
-    asked = [(name, value) for name, value in kinds.items() if value is not None]
-    if len(asked) != 1:
-        given = ", ".join(name for name, _ in asked) or "none"
-        raise Problem(
-            422, f"the query has {given}", field="ids", value=given, remedy="give exactly one of ids, pixels, points"
-        )
-    scene.committed_frame(None, "from")
-    start = scene.committed[0] if request.first is None else request.first
-    end = scene.committed[-1] if request.last is None else request.last
-    frames = tuple(scene.committed[bisect_left(scene.committed, start) : bisect_right(scene.committed, end)])
-    if not frames:
-        raise Problem(
-            422,
-            f"no committed frame from {start} to {end}",
-            field="from",
-            value=start,
-            remedy=f"ask within {scene.committed[0]} to {scene.committed[-1]}",
-        )
-    field, queries = asked[0]
-    if len(queries) * len(frames) > MOST_POINTS:
-        raise Problem(
-            422,
-            f"{counted(len(queries), 'point')} over {counted(len(frames), 'frame')}",
-            field=field,
-            value=len(queries) * len(frames),
-            remedy=f"ask for at most {MOST_POINTS} points times frames at once",
-        )
-    if request.format == "json" and len(queries) * len(frames) > MOST_JSON_POINTS:
-        raise Problem(
-            422,
-            f"{counted(len(queries), 'point')} over {counted(len(frames), 'frame')} as JSON",
-            field="format",
-            value="json",
-            remedy=f"ask for npz, or for at most {MOST_JSON_POINTS} points times frames",
-        )
-    check_ids(request.ids or ())
-    if request.pixels is not None and request.camera is None:
-        raise Problem(
-            422,
-            "pixels need a camera, and none is named",
-            field="camera",
-            value="nothing",
-            remedy=f"name one of {', '.join(scene.rig.names)}",
-        )
-    if request.points is not None and max(abs(value) for row in request.points for value in row) > FARTHEST:
-        raise Problem(
-            422,
-            "a point too far away to compute with",
-            field="points",
-            value=max((row for row in request.points), key=lambda row: max(map(abs, row))),
-            remedy=f"give coordinates up to {FARTHEST:g}, in the rig's units",
-        )
-    query = TracksQuery(
-        frames=frames,
-        at=scene.committed_frame(scene.committed[0] if request.at is None else request.at, "at"),
-        ids=None if request.ids is None else tuple(request.ids),
-        camera=None if request.camera is None else _camera(scene, request.camera),
-        pixels=None if request.pixels is None else np.array(request.pixels),
-        points=None if request.points is None else np.array(request.points),
-        project=_different([_camera(scene, camera) for camera in request.project]),
-        format=request.format,
-    )
-    _check_pixels(query)
-    cameras = track_answers.cameras_of(query)
-    if len(cameras) * len(frames) > MOST_VIEWS:
-        raise Problem(
-            422,
-            f"visibility in {counted(len(cameras), 'camera')} over {counted(len(frames), 'frame')}",
-            field="project" if request.project else "camera",
-            value=len(cameras) * len(frames),
-            remedy=f"ask for at most {MOST_VIEWS} cameras times frames: fewer frames or cameras at once",
-        )
-    return query
-
-
-def _check_pixels(query: TracksQuery) -> None:
-    """Refuses pixels outside the picture."""
-    if query.camera is None or query.pixels is None:
-        return
-    width, height = query.camera.width, query.camera.height
-    outside = np.flatnonzero(~((query.pixels >= 0) & (query.pixels < (width, height))).all(axis=1))
-    if outside.size:
-        value = query.pixels[outside[0]].tolist()
-        raise Problem(
-            422,
-            f"pixel {int(outside[0])} lies outside the picture of camera {query.camera.name!r}",
-            field="pixels",
-            value=value,
-            remedy=f"give 0 ≤ u < {width}, 0 ≤ v < {height}",
-        )
-
-
-def _different(cameras: list[Camera]) -> tuple[Camera, ...]:
-    """Checks that cameras of one name are the same: answers go by the name."""
-    by_name: dict[str, Camera] = {}
-    for camera in cameras:
-        known = by_name.setdefault(camera.name, camera)
-        if known is not camera and CameraModel.of(known) != CameraModel.of(camera):
-            raise Problem(
-                422,
-                f"two different cameras are named {camera.name!r}",
-                field="project",
-                value=camera.name,
-                remedy="name each differently: the answer goes by names",
-            )
-    return tuple(by_name.values())
-
-
-def _camera(scene: Scene, camera: CameraModel | str) -> Camera:
-    if isinstance(camera, str):
-        return scene.camera(camera)
-    # Visibility is found from a rendered depth: the limit of views holds.
-    if camera.width * camera.height > render.MOST_PIXELS:
-        size = f"{camera.width}x{camera.height}"
-        raise Problem(
-            422,
-            f"camera {camera.name!r} has a picture of {size}",
-            field="camera",
-            value=size,
-            remedy=f"give at most {render.MOST_PIXELS} pixels",
-        )
-    return camera.camera()
-
-
-def check_ids(ids: Iterable[int]) -> None:
-    """Refuses ids that no Gaussian can have."""
-    for id in ids:
-        if not 0 <= id <= LARGEST_ID:
-            remedy = "take ids out of an answer"
-            raise Problem(422, f"no Gaussian can have the id {id}", field="ids", value=id, remedy=remedy)
 
 
 def ids_in(text: str) -> list[int]:

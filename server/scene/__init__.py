@@ -1,1 +1,1 @@
-"""The life of a scene: its frames through the worker, status, supervision, retention, budgets."""
+"""The life of a scene: how its parts are put together, its status, replays, exports, sleep, a new beginning."""

@@ -16,6 +16,7 @@ from pydantic import ValidationError
 
 from client import __version__
 from client.wire import SceneStatus
+from server.storage.definition import FORMAT
 from server.storage.layout import EXPORT, SceneFolder
 
 
@@ -30,7 +31,7 @@ def write_card(folder: SceneFolder, status: SceneStatus) -> None:
     if status.damage:
         return
     status = status.model_copy(update={"worker_deaths": 0})
-    text = json.dumps({"version": __version__, "found": _fingerprint(folder), "status": status.model_dump(mode="json")})
+    text = json.dumps({"of": _of(folder), "status": status.model_dump(mode="json")})
     beside = folder.card.with_suffix(".part")
     with contextlib.suppress(OSError):
         beside.write_text(json.dumps({"blake3": blake3(text.encode()).hexdigest(), "card": text}))
@@ -44,12 +45,17 @@ def read_card(folder: SceneFolder) -> SceneStatus | None:
         if blake3(data["card"].encode()).hexdigest() != data["blake3"]:
             return None
         card = json.loads(data["card"])
-        if (card["version"], card["found"]) != (__version__, _fingerprint(folder)):
+        if card["of"] != _of(folder):
             return None
         status = SceneStatus.model_validate(card["status"])
     except (OSError, KeyError, TypeError, AttributeError, ValueError, ValidationError):
         return None
     return status if status.id == folder.name and status.asleep else None
+
+
+def _of(folder: SceneFolder) -> dict[str, Any]:
+    """Version of the service, format of the folder, and its content: a card of another one is not believed."""
+    return {"version": __version__, "format": FORMAT, "content": _fingerprint(folder)}
 
 
 def _fingerprint(folder: SceneFolder) -> list[Any]:

@@ -20,9 +20,9 @@ from typing import Any
 from client.wire import ExportModel, ExportRequest, ExportState
 from client.wire.exports import SUFFIXES
 from scas4d_core.errors import message_of
+from server.messages import Damaged, ExportEnded, ExportProgressed, ExportSpec
 from server.problems import Problem, counted
 from server.processes import exporter
-from server.processes.messages import Damaged, ExportEnded, ExportProgressed, ExportSpec
 from server.processes.placement import Ended, Placement
 from server.scene.scene import Scene
 from server.scene.scenes import Scenes
@@ -249,7 +249,7 @@ class Exports:
             case Damaged():
                 scene = self._scenes.by_id.get(export.scene)
                 if scene is not None and scene.has_place:  # of one that sleeps the next pass over it finds them
-                    scene.updates.mending.noticed(message.files)
+                    scene.mending.noticed(message.files)
             case ExportEnded():
                 end(message.fault)
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from scas4d_core.rig_checks import rig_warnings
 from scas4d_core.storage.npz import sync_folder
-from server.scene.status import SceneFacts, last_trouble, of_first_report
+from server.scene.status import SceneFacts
 from server.storage.definition import Definition, DefinitionError, read_definition, write_definition
 from server.storage.disk import no_room
 from server.storage.events import SceneCreated
@@ -20,6 +20,8 @@ from server.storage.journal import Journal
 from server.storage.layout import SceneFolder
 from server.storage.points import points_positions, points_sha256
 from server.storage.recovery import Recovered, recover
+from server.updates.reports import of_first_report
+from server.updates.trouble import last_trouble
 
 
 @dataclass(frozen=True)

@@ -7,20 +7,12 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from client.wire import PointKind, ReplayRequest, ReplayState, ReplayStatus, TradeoffPoint
+from server.background import Background
+from server.messages import Damaged, FrameReady, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated, SceneSpec
 from server.problems import Problem, counted
 from server.processes import replayer
-from server.processes.messages import (
-    Damaged,
-    FrameReady,
-    ReplayEnded,
-    ReplayPoint,
-    ReplaySpec,
-    ReplayUpdated,
-    SceneSpec,
-)
 from server.processes.placement import AnyProcess, Ended, Placement
 from server.scene.status import effective_budget
-from server.scene.supervision import Background
 from server.storage.ledger import Ledger
 
 KEPT = 32
@@ -70,7 +62,7 @@ class Replays:
         Raises:
             Problem: 409, one is running; or the frames, their pictures or the state before them are not here.
         """
-        id, device = self._ledger.scene, self._spec.settings.device
+        id = self._ledger.scene
         if self._process is not None:
             raise Problem(
                 409,
@@ -78,14 +70,6 @@ class Replays:
                 field="id",
                 value=id,
                 remedy=f"wait for it: GET /v1/scenes/{id}/tradeoff tells how far it is",
-            )
-        if device != "cpu":
-            raise Problem(
-                409,
-                f"the scene is updated on {device}: a replay there would slow its updates down",
-                field="settings.device",
-                value=device,
-                remedy="put other budgets in turn: PUT …/budget; the frames that run with them are measured",
             )
         base, indices = self._chosen(request.frames)
         own = self._own_iterations()

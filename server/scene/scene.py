@@ -6,7 +6,6 @@ import asyncio
 import logging
 import time
 from collections.abc import Iterator, Sequence
-from functools import partial
 from itertools import chain
 
 from client.wire import Budget, FrameReportModel, FrameState, SceneBudget, SceneEdit, SceneState, SceneStatus
@@ -14,19 +13,19 @@ from scas4d_core.cameras import Camera
 from scas4d_core.errors import message_of
 from scas4d_core.first_frame.calibration.record import in_use
 from scas4d_core.rig_checks import RigError, check_start
+from server.background import Background
+from server.hub import Hub, Publisher
 from server.ingest.acknowledge import Ingest, IngestRules, uncancelled
 from server.ingest.open_frames import OpenFrames
+from server.messages import SceneSpec
 from server.problems import Problem, counted, of_rig
-from server.processes.messages import SceneSpec
 from server.processes.placement import STOP_SECONDS, Placement
 from server.processes.readers import Readers
-from server.repair.mending import DamageKind, DamageLog
+from server.repair.mending import DamageKind, DamageLog, Mending
 from server.repair.scrub import Scrub
 from server.scene.found import FoundScene
 from server.scene.replays import Replays
-from server.scene.status import FrameReports, SceneFacts, camera_of, effective_budget
-from server.scene.supervision import Background
-from server.scene.updates import Updates
+from server.scene.status import SceneFacts, camera_of, effective_budget
 from server.settings import ServerSettings
 from server.storage.events import BudgetChanged, JournalEvent, PauseChanged, SceneCreated, SceneEdited
 from server.storage.frame_store import FrameLogIndex
@@ -34,7 +33,10 @@ from server.storage.frame_table import FrameTable
 from server.storage.journal import Journal
 from server.storage.ledger import SceneLog
 from server.storage.snapshot import events_of
-from server.stream.hub import FrameFinished, Hub, SceneChanged
+from server.updates.reports import FrameReports
+from server.updates.trouble import Trouble, last_trouble
+from server.updates.updates import Updates
+from server.updates.worker_process import WorkerProcess
 
 log = logging.getLogger("scas4d.server")
 
@@ -45,6 +47,9 @@ class Scene:
     Frames are numbered from 0 without gaps; a frame is acknowledged, waits in a bounded queue, and ends committed, set
     aside, missing or skipped. The ledger has all that is known of them; acknowledged changes are journalled first.
 
+    The way of a frame: `Ingest.acknowledge` journals it, `Updates.begin` sends it to the worker, `Updates._commit`
+    records that it is committed, and `Publisher.finished` publishes its report.
+
     Args:
         found: the content of its folder, of a new scene too.
         server: settings of the service. placement: starts its processes. hub: publishes its events.
@@ -53,7 +58,8 @@ class Scene:
         has_place: it has a place among the scenes that may have processes; else it is asleep. users: requests that are
             being answered, and connections. used: when the last of them ended, `time.monotonic`.
         log: journal, ledger and frame log. ingest: accepts whole frames. open_frames: accepts them camera by camera.
-        updates: gives frames to the worker. readers: answer queries. replays: of its last frames.
+        updates: gives frames to the worker. mending: of damaged files. readers: answer queries. replays: of its last
+            frames.
         points_sha256: of the initial cloud. warnings: what looks wrong with the rig, a sentence each.
     """
 
@@ -65,61 +71,62 @@ class Scene:
         hub: Hub,
     ) -> None:
         definition, content, folder = found.definition, found.content, found.content.folder
+        request = definition.request
         self.has_place, self.users, self.used = False, 0, time.monotonic()
-        self.id, self.request, self.created = definition.id, definition.request, definition.created
-        self.rig = rig = definition.request.rig.rig()
-        asked = definition.request.ingest
-        least = asked.minimum_cameras
-        self.rules = IngestRules(
-            rig,
-            definition.request.frames_per_second,
-            queue_frames=asked.queue_frames or server.queue_frames,
-            when_full=asked.when_full,
-            minimum_cameras=-(-len(rig) // 2) if least is None else min(least, len(rig)),
-            part_seconds=asked.part_seconds,
-        )
-        kept = content.ledger.edited.rules(asked)
-        least, rate = self.rules.minimum_cameras, definition.request.frames_per_second
-        self.spec = SceneSpec(folder, rig, definition.settings, least, kept, rate, definition.request.nodes)
-        self.points_sha256 = found.points_sha256
-        self.warnings = found.warnings
+        self.id, self.request, self.created = definition.id, request, definition.created
         self._definition = definition
-        self._hub = hub
+        self.rules = IngestRules.of(request, server)
+        self.rig = self.rules.rig
+        self.points_sha256, self.warnings = found.points_sha256, found.warnings
+        self.ledger = content.ledger
+        kept = self.ledger.edited.rules(request.ingest)
+        self.spec = SceneSpec(
+            folder,
+            self.rig,
+            definition.settings,
+            self.rules.minimum_cameras,
+            kept,
+            request.frames_per_second,
+            request.nodes,
+        )
+
+        # Events of the scene, and its log.
+        self._publisher = Publisher(hub, self.id)
+        self._trouble = Trouble(self._publisher, last_trouble(self.ledger))
         self._background = Background(self._failed)
         self._damage = DamageLog(content.damage)
-        self.ledger = content.ledger
         self.log = SceneLog(
-            content.ledger,
+            self.ledger,
             Journal(folder.journal, content.good, self._all_events, self._journal_renewed),
             FrameLogIndex(folder.frames, content.sizes),
-            self._waits,
+            self._trouble.report,
         )
-        self.readers = Readers(self.spec, placement, lambda files: self.updates.mending.noticed(files))
-        self._reports = FrameReports(self.ledger, folder.states, lambda files: self.updates.mending.noticed(files))
+
+        # Updates. Readers report damaged files to `mending`, which asks the worker to write them again.
+        worker = WorkerProcess(self.spec, placement)
+        self.mending = Mending(self.log, self._damage, self._background, to_worker=worker.send, remake=content.remake)
+        self.readers = Readers(self.spec, placement, self.mending.noticed)
+        self._reports = FrameReports(self.ledger, folder.states, self.mending.noticed)
         self.updates = Updates(
             self.log,
-            self.spec,
             self._damage,
+            worker,
+            self.mending,
             self.readers,
             self._reports,
+            self._trouble,
+            self._publisher,
             self._background,
-            placement,
             keep_frames=kept.keep_frames,
-            publish=partial(hub.publish, self.id),
-            close_due=lambda: self.open_frames.close_due(),
-            remake=content.remake,
             first=found.first,
         )
-        self.ingest = Ingest(
-            self.log,
-            self.rules,
-            can_begin=self._check_start,
-            remaining=self.updates.clock.remaining,
-            accepted=self.updates.begin,
-            ended=lambda index: self.updates.tell(FrameFinished(self.frames[index].report)),
-        )
-        self.open_frames = OpenFrames(self.ingest, self._background.run)
-        self.replays = Replays(self.spec, self.ledger, placement, self.updates.mending.noticed, self._background)
+
+        # Frames that come in.
+        self.ingest = Ingest(self.log, self.rules, self.updates, self._publisher, can_begin=self._check_start)
+        self.open_frames = OpenFrames(self.ingest, self._background)
+        self.updates.when_room_is_made(self.open_frames.close_due)
+        self.replays = Replays(self.spec, self.ledger, placement, self.mending.noticed, self._background)
+
         if content.events:
             self._background.run(self.log.write(*content.events))
         scrub = Scrub(
@@ -127,8 +134,7 @@ class Scene:
             folder,
             self.log,
             self._damage,
-            noticed=self.updates.mending.noticed,
-            at_work=lambda: self.updates.at_work,
+            self.mending,
             mb_per_second=server.scrub_mb_per_second,
             pause_seconds=server.scrub_pause_seconds,
         )
@@ -170,7 +176,7 @@ class Scene:
             first=updates.first,
             damage=self._damage.sentences,
             warnings=self.warnings,
-            trouble=updates.trouble or updates.mending.trouble,
+            trouble=self._trouble.sentence or self.mending.trouble,
             at_work=updates.at_work,
             progress=updates.progress,
             worker_deaths=updates.worker.deaths.count,
@@ -196,7 +202,7 @@ class Scene:
         """True where nothing is under way that would be lost or delayed if its processes ended."""
         closing = bool(self.ledger.open) and self.rules.part_seconds is not None
         busy = self.updates.has_work or self.readers.busy or self.replays.busy or self._background.busy
-        return not (self.users or closing or busy or self.log.lock.locked() or self._hub.count(self.id))
+        return not (self.users or closing or busy or self.log.lock.locked() or self._publisher.listeners)
 
     def camera(self, name: str) -> Camera:
         """Returns a camera of the rig, as frame 0 refined it where that was asked for; see `camera_of`."""
@@ -331,19 +337,15 @@ class Scene:
 
     # Events.
 
-    def _waits(self, sentence: str) -> None:
-        self.updates.trouble = sentence
-        self.updates.tell(SceneChanged())
-
     def _all_events(self) -> Iterator[JournalEvent]:
         """Snapshot for the journal; see `Journal`."""
         return chain((SceneCreated(definition=self._definition.as_json()),), events_of(self.ledger.copy()))
 
     def _journal_renewed(self, fault: str) -> None:
         self._damage.say(DamageKind.JOURNAL, f"{fault}; it was written anew from what the service knows")
-        self.updates.tell(SceneChanged())
+        self._publisher.changed()
 
     def _failed(self, error: BaseException) -> None:
         self.ledger.fatal = f"the service failed: {type(error).__name__}: {message_of(error)}"
         log.error("scene %s", self.id, exc_info=error)
-        self.updates.tell(SceneChanged())
+        self._publisher.changed()

@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 from client.wire import SceneCreate, SceneStatus
 from scas4d_core.errors import message_of
 from scas4d_core.settings import Settings
+from server.hub import Hub
 from server.problems import Problem
 from server.processes.placement import Placement
 from server.scene import sleep
@@ -28,7 +29,6 @@ from server.settings import ServerSettings
 from server.storage.definition import Definition, DefinitionError
 from server.storage.disk import FolderLock, full_disk, lock_data, no_room
 from server.storage.layout import DataFolder, SceneFolder
-from server.stream.hub import Hub
 
 log = logging.getLogger("scas4d.server")
 

@@ -4,7 +4,6 @@ reconstruction was begun anew: the journal has that first.
 
 from __future__ import annotations
 
-import copy
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -12,7 +11,6 @@ from datetime import UTC, datetime
 from typing import Any
 
 from blake3 import blake3
-from pydantic import ValidationError
 
 from client.wire import SceneCreate
 from scas4d_core.errors import message_of
@@ -22,7 +20,8 @@ from server.storage.events import JournalEvent, ReconstructionBegun, SceneCreate
 from server.storage.journal import replay
 from server.storage.layout import SceneFolder
 
-FORMAT = 1
+FORMAT = 2
+"""Of the folder of a scene: its definition, journal, frame log and points. Every change of one of them raises it."""
 
 
 class DefinitionError(ValueError):
@@ -51,7 +50,7 @@ class Definition:
         if event is None or (self.begun is not None and self.begun.number >= event.number):
             return self
         try:
-            return replace(self, settings=_within_limits(event.settings), begun=event)
+            return replace(self, settings=Settings.model_validate(event.settings), begun=event)
         except ValueError as error:
             raise DefinitionError(f"the settings cannot be read: {message_of(error)}") from None
 
@@ -74,46 +73,29 @@ class Definition:
             DefinitionError: it is of another format, or this version does not accept it.
         """
         try:
-            if data["format"] != FORMAT:
-                raise DefinitionError(f"it is of format {data['format']}; this version reads format {FORMAT}")
+            written = data["format"]
+            if written != FORMAT:
+                raise DefinitionError(
+                    f"the scene is of format {written}, and this version reads format {FORMAT}; "
+                    "open it with the version that wrote it, or move its folder out of the data folder"
+                )
             return cls(
                 data["id"],
                 datetime.fromisoformat(data["created"]).astimezone(UTC),
-                SceneCreate.model_validate(_exact_before(data["request"])),
-                _within_limits(data["settings"]),
+                SceneCreate.model_validate(data["request"]),
+                Settings.model_validate(data["settings"]),
                 begun_of(data),
             )
+        except DefinitionError:
+            raise
         except (KeyError, TypeError, ValueError) as error:  # pydantic's error is a ValueError
             raise DefinitionError(f"the definition cannot be read: {message_of(error)}") from None
-
-
-def _exact_before(request: Mapping[str, Any]) -> dict[str, Any]:
-    """The request of a scene; one from before states went to compact files keeps all of them exact."""
-    return {**request, "ingest": {"exact_states": None, **request.get("ingest", {})}}
 
 
 def begun_of(data: Mapping[str, Any]) -> ReconstructionBegun | None:
     """The event in what `as_json` made; None: the reconstruction is that which came with the scene."""
     begun = data.get("begun")
     return None if begun is None else ReconstructionBegun.model_validate(begun)
-
-
-def _within_limits(stored: Any) -> Settings:
-    """The settings; numbers beyond a limit that came after them are brought to it, so that the scene stays readable."""
-    try:
-        return Settings.model_validate(stored)
-    except ValidationError as error:
-        faults = error.errors(include_url=False)
-        if any(fault["type"] != "less_than_equal" for fault in faults):
-            raise
-        settings = copy.deepcopy(stored)
-        for fault in faults:
-            *way, last = fault["loc"]
-            place = settings
-            for name in way:
-                place = place[name]
-            place[last] = fault["ctx"]["le"]
-        return Settings.model_validate(settings)
 
 
 def write_definition(folder: SceneFolder, definition: Definition) -> None:
@@ -125,17 +107,17 @@ def write_definition(folder: SceneFolder, definition: Definition) -> None:
 
 
 def read_definition(folder: SceneFolder) -> tuple[Definition, str | None]:
-    """Reads the definition from `scene.json` or else from the journal.
+    """Reads the definition from `scene.json`, or from the journal where that file is damaged or gone.
 
     Returns:
         The definition, and a sentence about damage that was found, or None.
 
     Raises:
-        DefinitionError: it is in neither of them.
+        DefinitionError: it is in neither of them, or it is of another format, or this version does not accept it.
     """
-    found, fault = _checked(folder)
-    if isinstance(found, Definition):
-        return found, None
+    data, fault = _checked(folder)
+    if fault is None:
+        return Definition.of_json(data), None
     created: list[SceneCreated] = []
     replay(folder.journal, lambda event: created.append(event) if isinstance(event, SceneCreated) else None)
     if created:
@@ -148,28 +130,22 @@ def check_definition(folder: SceneFolder) -> str | None:
     return _checked(folder)[1]
 
 
-def _checked(folder: SceneFolder) -> tuple[Definition | None, str | None]:
-    """Reads `scene.json`: the definition, or its fault."""
+def _checked(folder: SceneFolder) -> tuple[Any, str | None]:
+    """Reads what `as_json` made from `scene.json`, and the fault of the file; with a fault there is nothing else."""
     try:
         text = folder.definition.read_text(encoding="utf-8")
         data = json.loads(text)
-        whole = (
-            _digest(_inner(text)) == data["blake3"] or _digest(json.dumps(data["scene"], indent=1)) == data["blake3"]
-        )
+        if _digest(_inner(text)) == data["blake3"]:
+            return data["scene"], None
     except FileNotFoundError:
         return None, f"{folder.definition.name} is gone"
     except (OSError, KeyError, TypeError, ValueError) as error:
         return None, f"{folder.definition.name} is damaged ({message_of(error)})"
-    if not whole:
-        return None, f"{folder.definition.name} is damaged (it fails its checksum)"
-    try:
-        return Definition.of_json(data["scene"]), None
-    except DefinitionError as error:  # as it was written, by a version that took other settings
-        return None, f"{folder.definition.name}: {error}"
+    return None, f"{folder.definition.name} is damaged (it fails its checksum)"
 
 
 def _inner(text: str) -> str:
-    """The text of the scene within the text of the file, where `write_definition` wrote it; its digest is of that.
+    """The text of the scene within the text of the file, as `write_definition` wrote it; the digest is of that.
 
     To encode the scene again takes longer than to read it, and a service starts over hundreds of them.
     """

@@ -1,6 +1,7 @@
 """Events of a scene's journal: the only record of its frames, from which the ledger is folded in order.
 
-The tag of each event, `fact`, and its fields are written in `journal.log` and stay as they are.
+The tag of each event, `fact`, and its fields are written in `journal.log`: a change of them is another format
+(`server.storage.definition.FORMAT`).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ Hashes = dict[str, dict[FileKind, str]]
 
 
 class _Event(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="ignore")
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 class SceneCreated(_Event):
@@ -93,11 +94,11 @@ class PicturesDeleted(_Event):
 
 
 class StatesDeleted(_Event):
-    """Retention deleted committed states, or they were found damaged or gone (`reason`)."""
+    """Committed states were deleted: by retention, or because they were found damaged or gone for a `reason`."""
 
     fact: Literal["states_deleted"] = "states_deleted"
     frames: tuple[int, ...]
-    reason: str = "retention"
+    reason: str | None = None
 
 
 class StateFound(_Event):

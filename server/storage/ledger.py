@@ -41,8 +41,6 @@ from server.storage.journal import Journal
 
 AGAIN_S = 1.0
 """An event that the disk has no room for is written again after so long."""
-RETENTION = "retention"
-"""Reason of `StatesDeleted` for states with which nothing is wrong."""
 HOPELESS = "the scene has failed at a frame before"
 
 
@@ -56,8 +54,9 @@ class Ledger:
     """Frames of one scene by index. No disk, no processes, no clock.
 
     Attributes:
-        frames: every index below `next_frame`. open: frames that cameras send one by one. fatal: reason why the scene
-            cannot go on, or None. budgets: the first frame that each holds for, rising.
+        frames: every index below `next_frame`. open: frames that cameras send one by one.
+        fatal: reason why the scene cannot go on, or None. failed_at: the frame that it failed at, or None.
+        budgets: the first frame that each holds for, rising.
         edited: the changes of its name, archive and retention since it was created.
         begun: the event that the present reconstruction was begun by; None: it came with the scene.
     """
@@ -68,6 +67,7 @@ class Ledger:
         self.open: dict[int, OpenFrame] = {}
         self.paused = False
         self.fatal: str | None = None
+        self.failed_at: int | None = None
         self.states_deleted = 0
         self.budgets: list[tuple[int, Budget]] = [(0, Budget())]
         self.edited = SceneEdited()
@@ -98,6 +98,11 @@ class Ledger:
         """Frames acknowledged and not finished."""
         return self.counts[FrameState.QUEUED] + self.counts[FrameState.UPDATING]
 
+    @property
+    def updating(self) -> bool:
+        """True while the worker has a frame."""
+        return self.counts[FrameState.UPDATING] > 0
+
     def apply(self, event: JournalEvent) -> None:
         """Applies one event. Events may come twice, and those before them may be lost."""
         match event:
@@ -119,7 +124,8 @@ class Ledger:
                 self._have(event.index)
                 note = self.frames.note(event.index)
                 note.error, note.dropped = event.reason, dict(event.dropped)
-                self.fatal = event.reason if event.fatal else self.fatal
+                if event.fatal:
+                    self.fatal, self.failed_at = event.reason, event.index
                 self.move(event.index, FrameState.SET_ASIDE)
             case WorkerDied():
                 self._have(event.index)
@@ -133,7 +139,7 @@ class Ledger:
             case StatesDeleted():
                 self._have(max(event.frames, default=-1))
                 self.states_deleted += self.frames.delete_states(event.frames)
-                if event.reason != RETENTION and len(event.frames) < FEW:
+                if event.reason is not None and len(event.frames) < FEW:
                     for index in event.frames:
                         self.frames.note(index).error = event.reason
             case StateFound():
@@ -144,7 +150,8 @@ class Ledger:
             case SceneEdited():
                 self.edited = event.after(self.edited)
             case ReconstructionBegun() if event.number > self.reconstruction:
-                self.begun, self.fatal, self.states_deleted = event, None, 0
+                self.begun, self.states_deleted = event, 0
+                self.fatal = self.failed_at = None
                 self.frames.begin_again(event.index)
             case BudgetChanged():
                 self.budgets = [one for one in self.budgets if one[0] < event.index] or [(0, Budget())]
@@ -213,7 +220,8 @@ class Ledger:
         """Copies the ledger without records of commits, for a thread to read."""
         new = Ledger(self.scene)
         new.frames, new.open = self.frames.copy(), copy.deepcopy(self.open)
-        new.paused, new.fatal, new.states_deleted = self.paused, self.fatal, self.states_deleted
+        new.paused, new.states_deleted = self.paused, self.states_deleted
+        new.fatal, new.failed_at = self.fatal, self.failed_at
         new.budgets, new.begun, new.edited = list(self.budgets), self.begun, self.edited
         return new
 

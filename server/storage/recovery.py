@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from client.wire import FileKind, FrameState
+from scas4d_core.storage.faults import OtherFormatError
 from scas4d_core.storage.frame_files import FrameFiles
 from scas4d_core.storage.history import History, HistoryError
-from server.storage.definition import begun_of
+from server.storage.definition import DefinitionError, begun_of
 from server.storage.disk import no_room
 from server.storage.events import (
     FrameAccepted,
@@ -164,8 +165,9 @@ def _deletes_states(definition: Mapping[str, Any], ledger: Ledger) -> bool:
     """True for a scene with a rule that deletes old states."""
     if ledger.edited.keep_states is not None:
         return any(value is not None for _, value in ledger.edited.keep_states)
-    rule = definition.get("request", {}).get("ingest", {}).get("keep_states") or {}
-    return any(value is not None for value in rule.values())
+    if not definition:  # of a new scene
+        return False
+    return any(value is not None for value in definition["request"]["ingest"]["keep_states"].values())
 
 
 def _remade(ledger: Ledger, states: _States, broken: bool, deletes: bool) -> dict[int, str]:
@@ -285,6 +287,8 @@ def _states(folder: Path, damage: list[str]) -> _States:
     """Reads the committed states of the folder; what is wrong with them is added to `damage`."""
     try:
         history = History.load(folder)
+    except OtherFormatError as error:  # not damage: the folder stays as it is
+        raise DefinitionError(str(error)) from None
     except HistoryError as error:
         if folder.exists() and FrameFiles(folder).listed():
             damage.append(f"the committed states cannot be read: {error}")

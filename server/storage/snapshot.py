@@ -22,7 +22,7 @@ from server.storage.events import (
     WorkerDied,
 )
 from server.storage.frame_table import FrameEntry
-from server.storage.ledger import RETENTION, Ledger
+from server.storage.ledger import Ledger
 
 TOGETHER = 10_000
 """An event names at most so many frames: the head of a record is bounded."""
@@ -44,7 +44,7 @@ def events_of(ledger: Ledger) -> Iterator[JournalEvent]:
     count = len(ledger.frames)
     for index in range(count):
         entry = ledger.frames[index]
-        yield from _of_frame(entry, ledger.fatal)
+        yield from _of_frame(entry, fatal=index == ledger.failed_at)
         if entry.deleted:
             if entry.state not in OWN_ERROR and entry.note.error is not None:
                 yield StatesDeleted(frames=(index,), reason=entry.note.error)
@@ -53,7 +53,7 @@ def events_of(ledger: Ledger) -> Iterator[JournalEvent]:
         if not entry.files and (entry.identity is not None or index == count - 1):
             bare.append(index)  # of the last one, that it is there
     for first in range(0, len(deleted), TOGETHER):
-        yield StatesDeleted(frames=tuple(deleted[first : first + TOGETHER]), reason=RETENTION)
+        yield StatesDeleted(frames=tuple(deleted[first : first + TOGETHER]))
     for first in range(0, len(bare), TOGETHER):
         yield PicturesDeleted(frames=tuple(bare[first : first + TOGETHER]))
     for frame in ledger.open.values():
@@ -67,7 +67,7 @@ def events_of(ledger: Ledger) -> Iterator[JournalEvent]:
         yield ledger.edited
 
 
-def _of_frame(entry: FrameEntry, fatal: str | None) -> Iterator[JournalEvent]:
+def _of_frame(entry: FrameEntry, *, fatal: bool) -> Iterator[JournalEvent]:
     index, note, receipt = entry.index, entry.note, entry.receipt
     if receipt is not None:
         if note.parts is not None:
@@ -79,7 +79,7 @@ def _of_frame(entry: FrameEntry, fatal: str | None) -> Iterator[JournalEvent]:
         yield WorkerDied(index=index, reason=BEFORE, own=own)
     match entry.state:
         case FrameState.SET_ASIDE if note.error is not None:
-            yield FrameSetAside(index=index, reason=note.error, dropped=note.dropped, fatal=note.error == fatal)
+            yield FrameSetAside(index=index, reason=note.error, dropped=note.dropped, fatal=fatal)
         case FrameState.MISSING:
             yield FrameMissing(index=index, reason=note.error or "")
         case FrameState.SKIPPED:

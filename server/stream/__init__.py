@@ -1,1 +1,1 @@
-"""Subscriptions: listeners of scenes, their messages, and queries shared among them."""
+"""Subscriptions: the listeners of scenes, their messages and their live queries."""

@@ -18,10 +18,11 @@ from client.wire.base import Model
 from client.wire.stream import BulkHead, PartsSubscription, StreamProblem, pack
 from server.problems import SERVICE_FAULT, Problem
 from server.processes.queries import PartsQuery, Query, RenderQuery, TracksQuery
-from server.routes import render, tracks
+from server.processes.shared_queries import SharedQueries, fingerprint
+from server.queries.render import render_query
+from server.queries.tracks import tracks_query
 from server.scene.scene import Scene
 from server.stream.outbox import Outbox
-from server.stream.shared_queries import SharedQueries, fingerprint
 
 log = logging.getLogger("scas4d.server")
 
@@ -141,7 +142,7 @@ class LiveRender(LiveQuery):
 
     def query(self) -> RenderQuery:
         """Returns the view as the reader takes it."""
-        return render.query_of(self.scene, self.request)
+        return render_query(self.scene, self.request)
 
     def head(self, query: Query) -> BulkHead:
         """Names the frame."""
@@ -175,7 +176,7 @@ class LiveTracks(LiveQuery):
         first = self.request.first if self._from is None else self._from
         if self._at is None:  # stays the same frame when the scene gives up its first ones
             self._at = self.scene.committed[0] if self.request.at is None else self.request.at
-        return tracks.query_of(self.scene, self.request.model_copy(update={"first": first, "at": self._at}))
+        return tracks_query(self.scene, self.request.model_copy(update={"first": first, "at": self._at}))
 
     def head(self, query: Query) -> BulkHead:
         """Names the frames."""

@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
 from client.wire.base import Model
-from server.health.metrics import STREAM_MISSED
+from server.counters import STREAM_MISSED
 
 UNSENT_REPLIES = 64
 """A client that sends without reading is not listened to until it has read down to so many replies."""

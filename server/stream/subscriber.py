@@ -29,10 +29,11 @@ from client.wire.stream import (
     Update,
 )
 from server.http import validation
+from server.hub import Channel, Event, FrameFinished
 from server.problems import Problem, counted
-from server.routes import render, tracks
+from server.queries.render import MOST_PIXELS
+from server.queries.tracks import MOST_POINTS
 from server.scene.scene import Scene
-from server.stream.hub import Channel, Event, FrameFinished
 from server.stream.live_queries import LiveParts, LiveQuery, LiveRender, LiveTracks
 from server.stream.outbox import Outbox
 
@@ -68,8 +69,8 @@ class Subscriber:
         return StreamLimits(
             subscriptions=MOST_SUBSCRIPTIONS,
             message_bytes=MESSAGE_KB * 1000,
-            render_pixels=render.MOST_PIXELS,
-            track_points=tracks.MOST_POINTS,
+            render_pixels=MOST_PIXELS,
+            track_points=MOST_POINTS,
         )
 
     async def greet(self) -> None:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from server.cluster.needs import Needs
-from server.processes.messages import SceneSpec, WaitsForNode
+from server.messages import SceneSpec, WaitsForNode
 from server.processes.placement import STOP_SECONDS, AnyProcess, Ended, Entry, Placement
 from studies.simulation.cluster import SimulatedCluster
 from studies.simulation.delays import LATE_S, LONGEST_SHARE, MESSAGE_S, STOPPING_S, TOLD_S, WAIT_S

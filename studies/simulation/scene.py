@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from server.processes.messages import FrameCommitted, FrameReady, Ready, SceneSpec, WaitsForNode
+from server.background import Background
+from server.messages import FrameCommitted, FrameReady, Ready, SceneSpec, WaitsForNode
 from server.processes.placement import STOP_SECONDS, Ended
-from server.scene.supervision import Background, WorkerProcess
+from server.updates.worker_process import WorkerProcess
 from studies.simulation.delays import JOURNAL_S
 from studies.simulation.process import SimulatedPlacement
 from studies.simulation.work import frame_file, listed, read_frame
@@ -35,7 +36,7 @@ class ScenePlan:
 
 
 class SimulatedScene:
-    """Stands in for `server.scene.updates.Updates`, of one service; the next one makes its scenes anew.
+    """Stands in for `server.updates.updates.Updates`, of one service; the next one makes its scenes anew.
 
     Attributes:
         worker: the real one. trouble: as in the scene's status. ended: a user has ended the scene.
@@ -56,7 +57,8 @@ class SimulatedScene:
         self._dead = False
         self._frames.acknowledged.setdefault(plan.name, 0)
         self._recover()
-        self.worker = WorkerProcess(plan.spec, placement, self._from_worker, self._worker_ended)
+        self.worker = WorkerProcess(plan.spec, placement)
+        self.worker.listen(self._from_worker, self._worker_ended)
         self._times.want(plan.name, reason, plan.kind)
         self.worker.start()
         self._expect()

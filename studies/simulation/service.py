@@ -7,7 +7,7 @@ from collections.abc import Callable
 from random import Random
 
 from server.cluster.needs import Needs
-from server.processes.messages import SceneSpec
+from server.messages import SceneSpec
 from studies.simulation.cluster import SimulatedCluster
 from studies.simulation.delays import DOWN_S, RECOVER_S
 from studies.simulation.process import SimulatedPlacement

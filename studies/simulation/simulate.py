@@ -14,8 +14,8 @@ from typing import Any
 
 from scas4d_core.settings import Settings
 from server.cluster.needs import Needs, needs_of
+from server.messages import SceneSpec
 from server.processes import worker
-from server.processes.messages import SceneSpec
 from server.settings import ServerSettings
 from server.storage.layout import DataFolder
 from studies.simulation.clock import run_virtual

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from server.processes.messages import FrameCommitted, FrameReady, Ready
+from server.messages import FrameCommitted, FrameReady, Ready
 from studies.simulation.cluster import SimulatedCluster
 from studies.simulation.delays import ADRIFT_S, ADRIFT_UPDATE_S, QUICKEST_S, START_S, Range
 from studies.simulation.record import FoundFrame, FrameRecord

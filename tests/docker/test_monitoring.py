@@ -13,9 +13,9 @@ import yaml
 from prometheus_client import Metric
 
 from client.wire import Cluster, Node
-from server.health import metrics
+from server import counters
+from server.health.metrics import State
 from server.settings import ServerSettings
-from server.stream.hub import Hub
 
 DOCKER = Path(__file__).parents[2] / "docker"
 RULES = [
@@ -35,13 +35,13 @@ MATCHER = re.compile(r'(\w+)\s*(?:=~|!~|!=|=)\s*"([^"]*)"')
 def families(tmp_path_factory: pytest.TempPathFactory) -> list[Metric]:
     """All metrics of a service that is ready, and has had every outcome: other tests may have had some of them."""
     for outcome in ("answered", "failed", "cancelled"):  # `Readers.ask`
-        metrics.ANSWER_SECONDS.labels("render", outcome)
+        counters.ANSWER_SECONDS.labels("render", outcome)
     settings = ServerSettings(data=tmp_path_factory.mktemp("data"))
     room = {"cpus": 8, "cpus_taken": 1, "gpus": 0, "memory_mb": 16_000, "memory_taken_mb": 700}
     node = Node(id="n", host="h", alive=True, scenes=["s"], **room)
     cluster = Cluster(placement="ray", nodes=[node], waiting=[])
-    state = metrics.State(settings, [], Hub(1), 1.0, {"idle": 0}, cluster)
-    return [*metrics.registry.collect(), *state.collect()]
+    state = State(settings, [], 0, 1.0, {"idle": 0}, cluster)
+    return [*counters.registry.collect(), *state.collect()]
 
 
 def exposed(families: list[Metric]) -> dict[str, Metric]:

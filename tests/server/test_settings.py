@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import re
 import subprocess
 import sys
@@ -10,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from server.settings import FORMER, ServerSettings, SettingsError, unknown
+from server.settings import ServerSettings, SettingsError, unknown
 
 ROOT = Path(__file__).parents[2]
 
@@ -61,30 +60,6 @@ def test_a_file_that_is_not_there_is_refused():
 def test_a_misspelt_variable_is_noticed():
     environment = {"SCAS4D_PORT": "1", "SCAS4D_PROT": "1", "SCAS4D_CONFIG": "x", "SCAS4D_URL": "y", "PATH": "/bin"}
     assert unknown(environment) == ["SCAS4D_PROT"]
-
-
-def fixed(name):
-    module, _, constant = FORMER[name].partition(":")
-    return getattr(importlib.import_module(module), constant)
-
-
-@pytest.mark.parametrize("name", FORMER)
-def test_a_setting_that_became_a_constant_is_taken_at_its_value_and_refused_at_another(tmp_path, name):
-    variable, value, file = f"SCAS4D_{name.upper()}", fixed(name), tmp_path / "scas4d.toml"
-    file.write_text(f"{name} = {value!r}\n")
-    config = {"SCAS4D_CONFIG": str(file)}
-    assert ServerSettings.from_environment({variable: str(value), **config}) == ServerSettings()
-    assert unknown({variable: str(value)}) == []
-    other = "another" if isinstance(value, str) else value + 1
-    for environment in ({variable: str(other)}, config):
-        file.write_text(f"{name} = {other!r}\n")
-        with pytest.raises(SettingsError, match="no setting any more") as refused:
-            ServerSettings.from_environment(environment)
-        said = str(refused.value)
-        assert variable in said or f"setting {name} " in said
-        assert repr(value) in said
-        assert repr(other) in said or repr(str(other)) in said
-        assert "leave it out" in said
 
 
 @pytest.mark.parametrize("name", ServerSettings.model_fields)

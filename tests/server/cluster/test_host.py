@@ -14,7 +14,7 @@ from waiting import HANG_S
 
 from server.cluster import host, marks
 from server.cluster.host import Host, Manner
-from server.processes.messages import Stop
+from server.messages import Stop
 
 
 def echo(spec: Any, connection: Connection[Any, Any]) -> None:

@@ -11,8 +11,8 @@ from running import make_rig
 from client.wire import RigModel, SceneCreate
 from scas4d_core.settings import Settings
 from server.cluster.needs import needs_of
+from server.messages import ExportSpec, ReplaySpec, SceneSpec
 from server.processes import exporter, renderer, replayer, worker
-from server.processes.messages import ExportSpec, ReplaySpec, SceneSpec
 from server.settings import ServerSettings
 from server.storage.layout import SceneFolder
 

@@ -58,7 +58,7 @@ class Cluster(LosableCluster):
         for name in ("check_folder", "mark", "announced"):
             monkeypatch.setattr(ray_placement, name, lambda *arguments: None)
         monkeypatch.setattr(ray_placement, "all_nodes", list)
-        monkeypatch.setattr(ray_placement, "needs_of", lambda *arguments: Needs("worker", "scene", 1, 0, 1))
+        monkeypatch.setattr(ray_placement, "needs_of", lambda *arguments: Needs("worker", "scene", 1, 1))
         self.placement = ray_placement.RayPlacement(None, None, ServerSettings(data=Path("data")))
         monkeypatch.setattr(self.placement, "host", self._host)
         self.ends: list[Ended] = []

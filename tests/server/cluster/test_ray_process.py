@@ -27,7 +27,7 @@ from server.settings import ServerSettings  # noqa: E402
 from tests.server.cluster.others import others_have_called  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("default")
-NEEDS = Needs("worker", "scene", 1, 0, 1)
+NEEDS = Needs("worker", "scene", 1, 1)
 
 
 class Remote:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
-
 import httpx
 import pytest
 from running import make_rig, picture, pictures, problem
@@ -132,12 +130,12 @@ def test_one_camera_is_no_cameras(http, quiet_scene):
     assert "1 camera:" in detail
 
 
-@pytest.mark.skipif(importlib.util.find_spec("gsplat") is not None, reason="this machine may have the device")
-def test_a_device_that_is_not_there_is_refused_before_the_scene_is_made(http):
+def test_a_device_without_an_engine_is_refused_with_the_reason(http):
     before = http.get("/v1/scenes").json()
     document = problem(http.post("/v1/scenes", json=body(settings={"device": "cuda"})), 422)
     assert (document["field"], document["value"]) == ("settings.device", "cuda")
-    assert "pip install -e '.[cuda]'" in document["remedy"]
+    assert "no engine" in document["detail"]
+    assert document["remedy"] == "give 'cpu'"
     assert http.get("/v1/scenes").json() == before
 
 

@@ -11,7 +11,7 @@ from running import make_rig
 
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
-from server.processes.messages import SceneSpec
+from server.messages import SceneSpec
 from server.processes.part_labels import fitted
 from server.processes.queries import Answer, AskedQuery, GaussiansQuery, PartsQuery, Refused, RenderQuery
 from server.processes.renderer import Renderer

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from histories import state
 
-from scas4d_core.storage.frame_files import born_file
+from scas4d_core.storage.frame_files import FIRST_COPY, FIXED_COPY, born_file
 from scas4d_core.storage.history import History
-from server.processes.messages import Mend, MendOutcome
+from server.messages import Mend, MendOutcome
 from server.repair.repairs import mend, mend_at_start
 
 
@@ -35,6 +35,14 @@ def test_one_of_both_is_written_from_the_other(history, tmp_path, copy):
     file.unlink()
     assert file.name in mend_at_start(History.open(tmp_path))[0]
     assert file.exists()
+
+
+@pytest.mark.parametrize("name", [FIXED_COPY, FIRST_COPY])
+def test_a_copy_that_is_gone_is_written_again_and_named(history, tmp_path, name):
+    (tmp_path / name).unlink()
+    (sentence,) = mend_at_start(History.open(tmp_path))
+    assert sentence.startswith(name)
+    assert (tmp_path / name).exists()
 
 
 def test_both_are_written_from_memory(history, tmp_path):

@@ -16,7 +16,7 @@ from client.wire import CameraModel
 from scas4d_core.storage.history import History
 from server.processes import track_answers
 from server.processes.queries import TracksQuery
-from server.routes import tracks
+from server.queries import tracks
 
 FRAMES = 6
 

@@ -16,7 +16,7 @@ from client.sdk import Client, ServiceError
 from client.wire import CameraModel
 from scas4d_core.compact import CompactReader
 from scas4d_core.query.ply import read_ply
-from server.routes import tracks as routes
+from server.queries import tracks as queries
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +139,7 @@ def test_a_bad_track_query_is_refused_by_name(http, finished, query, field):
 
 
 def test_many_tracks_and_any_camera(sdk, finished, monkeypatch):
-    monkeypatch.setattr(routes, "MOST_POINTS", 5000)
+    monkeypatch.setattr(queries, "MOST_POINTS", 5000)
     mine = make_rig().cameras[0].scaled(2)
     tracks = sdk.tracks(finished, points=np.zeros((3000, 3)), frames=(2, 2), project=[mine, "c1"])
     assert np.shape(tracks.positions) == (3000, 1, 3)

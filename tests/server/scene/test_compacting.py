@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 from running import make_rig, pictures
-from sending import create, filled, finished, put_form, serving_with, status, view, wait_for
+from sending import create, finished, put_form, serving_with, status, view, wait_for
 
 from client.wire import RigModel, StateBounds
 from scas4d_core.compact import Bounds, CompactReader
 from scas4d_core.storage.chunks import chunk_of
-from scas4d_core.storage.history import History
-from server.storage.definition import _digest
 
 COUNT, EXACT = 32, 24
 
@@ -77,28 +73,6 @@ def test_older_states_go_to_a_compact_file_and_are_asked_for_as_before(tmp_path)
         wait_for(lambda: exact(folder) == [0, *range(COUNT - EXACT + 1, COUNT + 1)])
         assert len(chunks(folder)) == 1
         assert not status(http, id)["damage"]
-
-
-def test_a_scene_from_before_keeps_its_states_exact_until_it_is_asked_not_to(tmp_path):
-    with serving_with(tmp_path) as (_, http, _sdk):
-        id = filled(http, COUNT)
-    path = tmp_path / "scenes" / id / "scene.json"
-    text = path.read_text()
-    older = json.loads(text)
-    del older["scene"]["request"]["ingest"]["exact_states"]
-    older["blake3"] = _digest(json.dumps(older["scene"], indent=1))
-    path.write_text(json.dumps(older, indent=1))
-    folder = folder_of(tmp_path, id)
-    with serving_with(tmp_path) as (_, http, _sdk):
-        assert status(http, id)["ingest"]["exact_states"] is None
-        sent(http, id, [COUNT])
-        assert exact(folder) == list(range(COUNT + 1))
-        edited = http.patch(f"/v1/scenes/{id}", json={"exact_states": EXACT})
-        assert edited.json()["ingest"]["exact_states"] == EXACT
-        wait_for(lambda: exact(folder) == [0, *range(COUNT - EXACT + 1, COUNT + 1)])
-        assert view(http, id, 3).status_code == 200
-        assert not status(http, id)["damage"]
-    assert History.load(folder).indices == list(range(COUNT + 1))
 
 
 def test_a_damaged_compact_file_is_told_and_frames_are_made_again_or_lost(tmp_path):

@@ -15,10 +15,10 @@ from waiting import HANG_S
 from scas4d_core.storage.history import History
 from server.processes import worker
 from server.processes.placement import Ended, Placement
-from server.scene import supervision
-from server.scene.supervision import LONGEST_AFTER_LOST_S, OTHER_DEATHS, WorkerDeaths
 from server.storage.fencing import epoch_read
 from server.storage.layout import DataFolder
+from server.updates import worker_process
+from server.updates.worker_process import LONGEST_AFTER_LOST_S, OTHER_DEATHS, WorkerDeaths
 
 
 class Machines(Placement):
@@ -71,7 +71,7 @@ def test_no_frame_is_set_aside_for_machines_that_were_lost(tmp_path):
     [OSError(errno.EIO, "Input/output error"), OSError(errno.ENOSPC, "No space left"), KeyError("a fault of its own")],
 )
 def test_states_that_cannot_be_taken_over_are_tried_again(tmp_path, monkeypatch, fault):
-    begin, faults = supervision.begin_epoch, []
+    begin, faults = worker_process.begin_epoch, []
 
     def faulty(states, lock):
         if len(faults) < 2:
@@ -79,7 +79,7 @@ def test_states_that_cannot_be_taken_over_are_tried_again(tmp_path, monkeypatch,
             raise fault
         return begin(states, lock)
 
-    monkeypatch.setattr(supervision, "begin_epoch", faulty)
+    monkeypatch.setattr(worker_process, "begin_epoch", faulty)
     with service(tmp_path, Machines) as http:
         id = create(http)
         wait_for(lambda: "the committed states cannot be taken over: " in (status(http, id)["error"] or ""))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import threading
 import time
@@ -10,6 +11,7 @@ import fakes
 import httpx
 import numpy as np
 import pytest
+from blake3 import blake3
 from running import Running, fake_settings, make_rig, picture, pictures, problem
 from sending import create, serving, settled
 from sending import put_form as put
@@ -18,6 +20,7 @@ from waiting import HANG_S
 from client.wire import RigModel
 from scas4d_core.captures import InitialPoints
 from server.storage import recovery
+from server.storage.definition import FORMAT
 from server.storage.frame_table import LOST
 
 
@@ -180,6 +183,28 @@ def test_a_damaged_definition_comes_back_from_the_journal_and_without_it_is_left
     assert file.read_text() == "{"  # whoever knows more may still repair it
 
 
+def test_a_scene_of_another_format_is_refused_by_name_and_left_as_it_is(tmp_path):
+    with serving(tmp_path) as (http, _):
+        id = create(http)
+        put(http, id, 0)
+        settled(http, id)
+    folder = tmp_path / "scenes" / id
+    written = json.loads((folder / "scene.json").read_text())["scene"] | {"format": FORMAT + 1}
+    digest = blake3(json.dumps(written, indent=1).encode()).hexdigest()
+    (folder / "scene.json").write_text(json.dumps({"blake3": digest, "scene": written}, indent=1))
+    before = contents(folder)
+    with serving(tmp_path) as (http, _):
+        document = problem(http.get(f"/v1/scenes/{id}"), 404)
+        assert f"format {FORMAT + 1}" in document["detail"]
+        assert "open it with the version that wrote it" in document["detail"]
+        assert http.get("/v1/scenes").json()["scenes"] == []
+    assert contents(folder) == before
+
+
+def contents(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
 def test_a_lost_journal_costs_the_events_and_no_state(tmp_path):
     with serving(tmp_path) as (http, sdk):
         id = create(http, keep_frames={"last": 0})
@@ -260,8 +285,8 @@ def test_two_services_do_not_share_a_folder(tmp_path):
 def _start_second(folder):
     import asyncio
 
+    from server.hub import Hub
     from server.processes.placement import Placement
     from server.scene.scenes import Scenes
-    from server.stream.hub import Hub
 
     asyncio.run(Scenes(fake_settings(folder), Placement(), Hub(1)).open())

@@ -8,7 +8,7 @@ import pytest
 from running import make_rig
 
 from scas4d_core.presets import preset
-from server.processes.messages import Mend, SceneSpec, Stop
+from server.messages import Mend, SceneSpec, Stop
 from server.processes.worker import Worker, _Stopped
 from server.storage.layout import SceneFolder
 

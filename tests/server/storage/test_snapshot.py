@@ -95,7 +95,7 @@ def lives(draw):
     if held:
         events.append(PicturesDeleted(frames=tuple(held)))
     if gone := [index for index in committed if draw(st.booleans())]:
-        events.append(StatesDeleted(frames=tuple(gone), reason=draw(st.sampled_from(["retention", "damaged"]))))
+        events.append(StatesDeleted(frames=tuple(gone), reason=draw(st.sampled_from([None, "damaged"]))))
     if draw(st.booleans()):
         begun = draw(st.integers(0, 9))
         events.insert(draw(st.integers(0, len(events))), begins(1, begun))
@@ -158,6 +158,12 @@ def test_a_fatal_frame_stays_fatal():
         ]
     )
     assert fold(events_of(ledger)).fatal == "x"
+    ledger.fatal = "the service failed: only in memory"
+    assert fold(events_of(ledger)).fatal == "x"
+
+
+def test_a_fault_of_the_service_is_not_journalled():
+    ledger = fold([FrameAccepted(index=0, time=0.0, identity=identity(0), files=("a",))])
     ledger.fatal = "the service failed: only in memory"
     assert fold(events_of(ledger)).fatal is None
 

@@ -15,11 +15,11 @@ from websockets.asyncio.client import connect
 from client.wire import CameraModel, RenderRequest
 from client.wire.stream import STREAM_PROTOCOL, Subscribed, unpack
 from server.problems import Problem
+from server.processes import shared_queries
 from server.processes.queries import Answer, PartsQuery, RenderQuery
-from server.stream import shared_queries
+from server.processes.shared_queries import SharedQueries, fingerprint
 from server.stream.live_queries import LiveRender
 from server.stream.outbox import UNSENT_REPLIES, Outbox
-from server.stream.shared_queries import SharedQueries, fingerprint
 
 READERS = 99
 FRAMES = 5

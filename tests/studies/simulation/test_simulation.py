@@ -7,8 +7,8 @@ import threading
 
 import pytest
 
-from server.scene import supervision
 from server.storage import fencing
+from server.updates import worker_process
 from studies.simulation import cluster, process
 from studies.simulation.clock import StandstillError, run_virtual
 from studies.simulation.failures import Failure
@@ -41,12 +41,12 @@ def test_the_same_seed_gives_the_same_outcome() -> None:
 
 
 def test_workers_that_share_an_epoch_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    begin = supervision.begin_epoch
+    begin = worker_process.begin_epoch
 
     def same(states, lock):
         return begin(states, lock) if (epoch := fencing.epoch_read(states)) is None else epoch
 
-    monkeypatch.setattr(supervision, "begin_epoch", same)
+    monkeypatch.setattr(worker_process, "begin_epoch", same)
     outcome = simulate(SMALL)
     assert outcome.frames.foreign > 0
     assert outcome.frames.twice > 0
@@ -63,7 +63,7 @@ def test_a_link_that_is_not_moved_is_found(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(
         fencing, "_point", lambda states, epoch: None if states.is_symlink() and epoch > 2 else point(states, epoch)
     )
-    monkeypatch.setattr(supervision, "sweep", lambda states, epoch: [])
+    monkeypatch.setattr(worker_process, "sweep", lambda states, epoch: [])
     monkeypatch.setattr("studies.simulation.simulate.PATIENCE_S", 60.0)
     outcome = simulate(SMALL)
     assert outcome.frames.lost > 0

@@ -8,17 +8,11 @@ import pytest
 from running import make_rig
 
 from scas4d_core.presets import preset
-from server.processes.messages import SceneSpec
+from server.messages import SceneSpec
 from server.processes.placement import Ended
-from server.scene.supervision import (
-    FIRST_GUESS_S,
-    OVERDUE,
-    SHORTEST_S,
-    UPDATES_KEPT,
-    WorkClock,
-    WorkerProcess,
-)
 from server.storage.layout import SceneFolder
+from server.updates.work_clock import FIRST_GUESS_S, OVERDUE, SHORTEST_S, UPDATES_KEPT, WorkClock
+from server.updates.worker_process import WorkerProcess
 from studies.simulation.clock import run_virtual
 
 
@@ -135,7 +129,8 @@ def test_nothing_starts_a_worker_before_the_pause_after_its_end_is_over(tmp_path
     async def deaths():
         there = Processes()
         spec = SceneSpec(SceneFolder(tmp_path), make_rig(), preset("scas4d"))
-        process = WorkerProcess(spec, there, lambda message: None, lambda why: None)
+        process = WorkerProcess(spec, there)
+        process.listen(lambda message: None, lambda why: None)
         process.start()
         for seconds in (1, 30):
             there.ends[-1](Ended(-9))

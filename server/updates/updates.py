@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -9,9 +10,10 @@ from dataclasses import replace
 from typing import Any
 
 from client.wire import FrameState, IngestSettings, ProgressModel, Retention
-from server.health import metrics
-from server.processes.kernels import STAGE
-from server.processes.messages import (
+from server import counters
+from server.background import Background
+from server.hub import Publisher
+from server.messages import (
     Broken,
     FrameCommitted,
     FrameFailed,
@@ -20,19 +22,20 @@ from server.processes.messages import (
     Mended,
     Progressed,
     Ready,
-    SceneSpec,
     Stalled,
     StatesRetained,
     WaitsForNode,
 )
-from server.processes.placement import Ended, Placement
+from server.processes.kernels import STAGE
+from server.processes.placement import Ended
 from server.processes.readers import Readers
 from server.repair.mending import DamageKind, DamageLog, Mending
-from server.scene.status import FrameReports, last_trouble, of_first_report, trouble_of
-from server.scene.supervision import Background, WorkClock, WorkerProcess, given_up
 from server.storage.events import FrameSetAside, PicturesDeleted, StatesDeleted, WorkerDied
 from server.storage.ledger import SceneLog
-from server.stream.hub import Event, FrameFinished, SceneChanged
+from server.updates.reports import FrameReports, of_first_report
+from server.updates.trouble import Trouble, last_trouble, trouble_of
+from server.updates.work_clock import WorkClock
+from server.updates.worker_process import WorkerProcess, given_up
 
 log = logging.getLogger("scas4d.server")
 
@@ -40,80 +43,62 @@ log = logging.getLogger("scas4d.server")
 class Updates:
     """The updates of one scene, and the worker that runs them.
 
+    A frame that was acknowledged waits in the ledger. `begin` sends it to the worker as `FrameReady`. The worker
+    answers with `FrameCommitted` or `FrameFailed`, or it dies; `_commit`, `_set_aside` and `_after_death` record that.
+
     Args:
-        scene_log, spec, damage, readers, reports, background: of the scene.
+        scene_log, damage, worker, mending, readers, reports, trouble, publisher, background: of the scene.
         keep_frames: rule of retention for pictures.
-        tell: publishes an event to the scene's subscribers.
-        close_due: closes open frames for which there may be room now.
-        remake: frames whose states were found damaged at the start, with the reason.
         first: see below.
 
     Attributes:
-        trouble: why the scene is degraded: a sentence about the last frame, the worker or the disk, or None.
-        progress: of frame 0, while it is at work. worker: its process.
+        clock: predicts the end of the frame at work. worker: its process.
+        progress: of frame 0, while it is at work.
         first: what of the first frame's report matters later: its cloud and its calibration.
     """
 
     def __init__(
         self,
         scene_log: SceneLog,
-        spec: SceneSpec,
         damage: DamageLog,
+        worker: WorkerProcess,
+        mending: Mending,
         readers: Readers,
         reports: FrameReports,
+        trouble: Trouble,
+        publisher: Publisher,
         background: Background,
-        placement: Placement,
         *,
         keep_frames: Retention,
-        publish: Callable[[Event], None],
-        close_due: Callable[[], Awaitable[None]],
-        remake: Mapping[int, str],
         first: Mapping[str, Any],
     ) -> None:
         self._log = scene_log
         self._ledger = scene_log.ledger
-        self._spec = spec
         self._damage = damage
+        self._mending = mending
         self._readers = readers
         self._reports = reports
+        self._trouble = trouble
+        self._publisher = publisher
         self._background = background
-        self._placement = placement
         self._keep_frames = keep_frames
-        self._publish = publish
-        self._close_due = close_due
+        self._room_made: Callable[[], Awaitable[None]] | None = None
         self.clock = WorkClock()
-        self.worker = WorkerProcess(spec, placement, self._from_worker, self._worker_ended)
-        self.trouble = last_trouble(self._ledger)
+        self.worker = worker
         self.progress: ProgressModel | None = None
         self.first = first
         self._index: int | None = None
         self._holding = 0
         self._rule: IngestSettings | None = None
-        """For states, that the worker has not said it keeps."""
-        self._told = False
-        self.mending = Mending(
-            self._ledger,
-            damage,
-            to_worker=self.worker.send,
-            changed=self._states_changed,
-            journal=lambda event: background.run(scene_log.write(event)),
-            remake=remake,
-        )
+        """For states, that the worker has not confirmed yet."""
+        self._rule_sent = False
+        self._mending_again: asyncio.TimerHandle | None = None
+        """Begins again where mending waits for room on the disk."""
+        worker.listen(self._from_worker, self._worker_ended)
 
-    def tell(self, event: Event) -> None:
-        """Counts and publishes an event; to be called at every change of the scene's status or of a frame."""
-        if isinstance(event, FrameFinished):
-            report = event.report
-            metrics.FRAMES.labels(report.state.value).inc()
-            if report.state == FrameState.COMMITTED:
-                metrics.LEFT_OUT.inc(len(report.dropped_cameras))
-                for alarm in report.alarms:
-                    metrics.ALARMS.labels(alarm.what.value).inc()
-                if report.outcome is not None and report.outcome.degraded:
-                    metrics.DEGRADED.labels("held" if report.outcome.held else "in_part").inc()
-            for stage, seconds in report.seconds.items():
-                metrics.UPDATE_SECONDS.labels(stage).observe(seconds)
-        self._publish(event)
+    def when_room_is_made(self, call: Callable[[], Awaitable[None]]) -> None:
+        """Sets the coroutine function that closes open frames once a frame is over and the queue has room."""
+        self._room_made = call
 
     @property
     def at_work(self) -> bool:
@@ -123,7 +108,7 @@ class Updates:
     @property
     def has_work(self) -> bool:
         """True while a frame is at work or waits, or something is mended or will be."""
-        mending = self.mending.at_work is not None or self.mending.trouble is not None
+        mending = self._mending.at_work is not None or self._mending.trouble is not None
         waits = bool(self._holding or self._waiting()) or self._rule is not None or self.worker.starts_again
         return self._index is not None or waits or mending
 
@@ -133,20 +118,20 @@ class Updates:
 
     def begin(self) -> None:
         """Gives the worker its next frame, if it is idle and one waits; to be called whenever that may have changed."""
-        self.tell(SceneChanged())
+        self._publisher.changed()
         ledger = self._ledger
-        if self._index is not None or self._holding or self.mending.at_work is not None:
+        if self._index is not None or self._holding or self._mending.at_work is not None:
             return
         waiting = self._waiting()
         if not self.worker.ready:
-            if waiting or self.mending.trouble is not None or self._rule is not None:
+            if waiting or self._mending.trouble is not None or self._rule is not None:
                 self.worker.start()
             return
-        if self._rule is not None and not self._told:
-            self._told = self.worker.send(KeepStates(self._rule))
+        if self._rule is not None and not self._rule_sent:
+            self._rule_sent = self.worker.send(KeepStates(self._rule))
         if not waiting:
-            if self.mending.waiting:
-                self.mending.begin()
+            if self._mending.waiting and (seconds := self._mending.begin()) > 0:
+                self._begin_in(seconds)
             return
         index = waiting[0]
         entry = ledger.frames[index]
@@ -156,7 +141,12 @@ class Updates:
         self._index = index
         self.clock.begin(first=not ledger.committed)
         self.worker.send(FrameReady(index, receipt.time, entry.files, receipt.identity, ledger.budget_of(index)))
-        self.tell(SceneChanged())
+        self._publisher.changed()
+
+    def _begin_in(self, seconds: float) -> None:
+        if self._mending_again is not None:
+            self._mending_again.cancel()
+        self._mending_again = asyncio.get_running_loop().call_later(seconds, self.begin)
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -178,7 +168,7 @@ class Updates:
                 over = message.stage == STAGE and message.done == message.total  # an update tells no other stage
                 self.progress = None if over else ProgressModel(**vars(message))
                 self.clock.progress(message.stage, message.done, message.total, message.detail.get("seconds_left"))
-                self.tell(SceneChanged())
+                self._publisher.changed()
             case FrameCommitted():
                 self._background.run(self._commit(message))
             case StatesRetained():
@@ -190,26 +180,27 @@ class Updates:
                 )
                 self._background.run(self._set_aside(event))
             case Mended():
-                self.mending.mended(message)
+                frames = self._mending.mended(message)
+                if frames:
+                    self._readers.refresh(frames)
+                self.begin()
                 if not self.first:  # it could not be read before
                     self._background.run(self._recall())
             case Stalled():
-                self.trouble = f"frame {message.index} waits for room on the disk: {message.reason}"
                 self.clock.stall(message.seconds)
-                self.tell(SceneChanged())
+                self._trouble.report(f"frame {message.index} waits for room on the disk: {message.reason}")
             case WaitsForNode():
-                self.trouble = message.reason
-                self.tell(SceneChanged())
+                self._trouble.report(message.reason)
             case Broken():
                 self._ledger.fatal = f"what is committed cannot be gone on from: {message.reason}"
                 log.error("scene %s: %s", self._ledger.scene, self._ledger.fatal)
-                self.tell(SceneChanged())
+                self._publisher.changed()
 
     async def _resume(self, ready: Ready, life: object) -> None:
         """Brings the ledger in line with the committed states that a new worker has loaded, and goes on."""
         ledger = self._ledger
         newest = ledger.committed[-1] if ledger.committed else -1
-        again = self.mending.waiting.keys() | {i for i in ready.damaged if i < max(ready.indices, default=-1)}
+        again = self._mending.waiting.keys() | {i for i in ready.damaged if i < max(ready.indices, default=-1)}
         events = ledger.reconcile(ready.indices, ready.damaged, again)
         for fault in ready.faults:
             log.warning("scene %s: %s", ledger.scene, fault)
@@ -220,12 +211,12 @@ class Updates:
             self._record(ready.indices[-1], ready.report)
             self._readers.refresh()
             if ready.indices[-1] > newest:  # committed by a worker that died before it could say so
-                self.tell(FrameFinished(ledger.frames[ready.indices[-1]].report))
+                self._publisher.finished(ledger.frames[ready.indices[-1]].report)
         if life is None or life is not self.worker.life:  # it died meanwhile
             return
-        self.trouble = last_trouble(self._ledger)
+        self._trouble.sentence = last_trouble(self._ledger)
         self.worker.ready = True
-        self.mending.taken_up(ready.damaged)
+        self._mending.taken_up(ready.damaged)
         self.begin()
         self._background.run(self.worker.sweep(), endless=True)
 
@@ -236,22 +227,25 @@ class Updates:
         self._ledger.move(message.index, FrameState.COMMITTED)
         self._record(message.index, message.report)
         report = self._ledger.frames[message.index].report
-        self.trouble = trouble_of(report)
+        self._trouble.sentence = trouble_of(report)
         self._readers.refresh((message.index,))
-        self.tell(FrameFinished(report))
+        self._publisher.finished(report)
         self.begin()
         await self._states_deleted(message.deleted)
         await self.retain()
-        if self._ledger.open:
-            await self._close_due()
+        await self._make_room()
+
+    async def _make_room(self) -> None:
+        if self._ledger.open and self._room_made is not None:
+            await self._room_made()
 
     async def _states_deleted(self, frames: tuple[int, ...]) -> None:
         if frames:
-            self.mending.retired(frames)
+            self._mending.retired(frames)
             self._readers.refresh(frames)
             deleted = StatesDeleted(frames=frames)
             self._ledger.apply(deleted)
-            self.tell(SceneChanged())
+            self._publisher.changed()
             await self._log.write(deleted)
 
     async def _set_aside(self, event: FrameSetAside) -> None:
@@ -259,16 +253,15 @@ class Updates:
         self._ledger.apply(event)
         self.clock.end(committed=False)
         self._index, self.progress = None, None
-        self.trouble = trouble_of(self._ledger.frames[event.index].report)
+        self._trouble.sentence = trouble_of(self._ledger.frames[event.index].report)
         if event.fatal:
             async with self._log.lock:  # a frame that is just being acknowledged waits like the others
                 pass
             await self._fail_waiting()
-        log.warning("scene %s: %s", self._ledger.scene, self.trouble)
-        self.tell(FrameFinished(self._ledger.frames[event.index].report))
+        log.warning("scene %s: %s", self._ledger.scene, self._trouble.sentence)
+        self._publisher.finished(self._ledger.frames[event.index].report)
         self.begin()
-        if self._ledger.open:
-            await self._close_due()
+        await self._make_room()
 
     async def _fail_waiting(self) -> None:
         events = self._ledger.hopeless()
@@ -276,7 +269,7 @@ class Updates:
             await self._log.write(*events)
         for event in events:
             self._ledger.apply(event)
-            self.tell(FrameFinished(self._ledger.frames[event.index].report))
+            self._publisher.finished(self._ledger.frames[event.index].report)
 
     def _record(self, index: int, record: Mapping[str, Any]) -> None:
         self._ledger.frames.set_record(index, record)
@@ -289,13 +282,13 @@ class Updates:
 
     async def retain(self) -> None:
         """Deletes pictures from the frame log by the scene's rule, except those needed to make states again."""
-        gone = [i for i in self._log.deletable(self._keep_frames) if i not in self.mending.waiting]
+        gone = [i for i in self._log.deletable(self._keep_frames) if i not in self._mending.waiting]
         if not gone:
             return
         names = [name for index in gone for name in self._ledger.frames[index].files]
         event = PicturesDeleted(frames=tuple(gone))
         self._ledger.apply(event)
-        self.tell(SceneChanged())
+        self._publisher.changed()
         await self._log.delete_pictures(names)
         await self._log.write(event)
 
@@ -304,29 +297,22 @@ class Updates:
         before = self.worker.spec.kept
         if (rules.keep_states, rules.exact_states) != (before.keep_states, before.exact_states):
             self.worker.spec = replace(self.worker.spec, kept=rules)
-            self._rule, self._told = rules, False
+            self._rule, self._rule_sent = rules, False
             self.begin()
         self._keep_frames = rules.keep_frames
         await self.retain()
 
-    # Mending.
-
-    def _states_changed(self, frames: tuple[int, ...]) -> None:
-        if frames:
-            self._readers.refresh(frames)
-        self.begin()
-
     # The worker's life.
 
     def _worker_ended(self, reason: Ended) -> None:
-        self.progress, self._told = None, False
+        self.progress, self._rule_sent = None, False
         self.clock.end(committed=False)
         if self._ledger.fatal is not None:
             return
-        metrics.RESTARTS.labels("worker").inc()
+        counters.RESTARTS.labels("worker").inc()
         own, delay = self.worker.deaths.died(reason)
-        self.trouble = f"the worker is gone: {reason}; it is started again in {delay:g} s"
-        log.error("scene %s: %s", self._ledger.scene, self.trouble)
+        self._trouble.sentence = f"the worker is gone: {reason}; it is started again in {delay:g} s"
+        log.error("scene %s: %s", self._ledger.scene, self._trouble.sentence)
         self._background.run(self._after_death(reason, own, delay))
 
     async def _after_death(self, reason: Ended, own: bool, delay: float) -> None:
@@ -341,10 +327,12 @@ class Updates:
                 event = given_up(self._ledger.frames[index], death)
                 if event is not None and not await self._reports.is_committed(index):
                     await self._set_aside(event)
-        self.tell(SceneChanged())
+        self._publisher.changed()
         self.worker.start_in(delay)
 
     def stop(self) -> None:
         """Starts no worker again, and tries no mending again."""
         self.worker.close()
-        self.mending.stop()
+        self._mending.stop()
+        if self._mending_again is not None:
+            self._mending_again.cancel()

@@ -1,4 +1,4 @@
-"""Supervises a scene's worker: starts it, counts its deaths, times its frames; keeps the scene's background tasks.
+"""Supervises a scene's worker process: starts it, counts its deaths, starts it again.
 
 A death is the worker's own doing or not; that decides when it is started again and when a frame is given up.
 """
@@ -8,17 +8,14 @@ from __future__ import annotations
 import asyncio
 import logging
 import signal
-import time
-from collections import deque
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from dataclasses import replace
-from statistics import median
 from typing import Any
 
 from scas4d_core.errors import message_of
 from server.health.oom import oom_kills
+from server.messages import SceneSpec
 from server.processes import worker
-from server.processes.messages import SceneSpec
 from server.processes.placement import AnyProcess, Ended, Placement
 from server.storage.events import FrameSetAside, WorkerDied
 from server.storage.fencing import FencingError, begin_epoch, sweep
@@ -42,15 +39,6 @@ LONGEST_AFTER_LOST_S = 8.0
 
 SWEEP_AFTER_S = 120.0
 """The states of a worker that was given up are kept for so long: NFS shows a link as it was for up to a minute."""
-
-UPDATES_KEPT = 8
-"""The prediction is the median of so many updates: a changed budget shows after a few frames."""
-FIRST_GUESS_S = 1.0
-"""Seconds of an update, before one has been timed."""
-SHORTEST_S = 0.1
-"""The shortest prediction in seconds."""
-OVERDUE = 0.25
-"""A frame that takes longer than predicted is predicted to take this share of its time so far again."""
 
 
 class WorkerDeaths:
@@ -105,8 +93,7 @@ class WorkerProcess:
 
     Args:
         spec: of the scene; another one holds from the next start on.
-        received: called with every message of the process.
-        ended: called when the process ended without being asked to; `start_in` starts the next.
+        placement: starts the process.
 
     Attributes:
         ready: the process has said that it has taken the scene up; to be set by who receives that message.
@@ -114,20 +101,14 @@ class WorkerProcess:
         deaths: how often a process died, and whether by its own doing.
     """
 
-    def __init__(
-        self,
-        spec: SceneSpec,
-        placement: Placement,
-        received: Callable[[Any], None],
-        ended: Callable[[Ended], None],
-    ) -> None:
+    def __init__(self, spec: SceneSpec, placement: Placement) -> None:
         self.spec = spec
         self.ready = False
         self.life: object | None = None
         self.deaths = WorkerDeaths()
         self._placement = placement
-        self._received = received
-        self._ended = ended
+        self._received: Callable[[Any], None]
+        self._ended: Callable[[Ended], None]
         self._process: AnyProcess | None = None
         self._next: asyncio.TimerHandle | None = None
         self._closed = False
@@ -136,6 +117,15 @@ class WorkerProcess:
         self._epoch: int | None = None
         self._fencing: asyncio.Task[None] | None = None
         """Begins an epoch for the next process."""
+
+    def listen(self, received: Callable[[Any], None], ended: Callable[[Ended], None]) -> None:
+        """Sets the receiver of messages; to be called once, before the first start.
+
+        Args:
+            received: called with every message of the process.
+            ended: called when the process ended without being asked to; `start_in` starts the next.
+        """
+        self._received, self._ended = received, ended
 
     @property
     def starts_again(self) -> bool:
@@ -215,113 +205,3 @@ class WorkerProcess:
         if not self._closed:
             self._ends = True
             self._ended(reason)
-
-
-class WorkClock:
-    """Predicts the end of the frame at work, from the frames before it and from its progress.
-
-    Frame 0 is not counted as an update: it takes minutes where an update takes a second.
-
-    Args:
-        now: seconds of a clock that never goes back.
-
-    Example:
-        >>> seconds = iter([0.0, 2.0, 2.0, 2.5])
-        >>> clock = WorkClock(lambda: next(seconds))
-        >>> clock.begin(first=False)
-        >>> clock.end(committed=True)
-        >>> clock.begin(first=False)
-        >>> clock.remaining()
-        1.5
-    """
-
-    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
-        self._now = now
-        self._updates: deque[float] = deque(maxlen=UPDATES_KEPT)
-        self._began: float | None = None
-        self._first = False
-        self._stage = ""
-        self._stage_began = 0.0
-        self._done = 0.0
-        self._first_end: float | None = None
-        self._stalled_until: float | None = None
-
-    @property
-    def update_seconds(self) -> float:
-        """Predicted seconds of an update."""
-        return median(self._updates) if self._updates else FIRST_GUESS_S
-
-    def begin(self, *, first: bool) -> None:
-        """Notes that the worker has a frame; ``first``: there is no committed state before it."""
-        self._began, self._first, self._stalled_until = self._now(), first, None
-        self._stage, self._done, self._first_end = "", 0.0, None
-
-    def progress(self, stage: str, done: int, total: int, seconds: float | None = None) -> None:
-        """Notes how far frame 0 is in one of its stages; `seconds`: predicted until its end."""
-        if stage != self._stage:
-            self._stage, self._stage_began = stage, self._now()
-        self._done = done / total if total > 0 else 0.0
-        self._first_end = None if seconds is None else self._now() + seconds
-
-    def stall(self, seconds: float) -> None:
-        """Notes that the frame at work waits for room on the disk and is tried again after so long."""
-        self._stalled_until = self._now() + seconds
-
-    def end(self, *, committed: bool) -> None:
-        """Notes that the worker has no frame; one that was not committed, or stalled, is not counted as an update."""
-        if committed and self._began is not None and not self._first and self._stalled_until is None:
-            self._updates.append(self._now() - self._began)
-        self._began = self._stalled_until = None
-
-    def remaining(self) -> float:
-        """Returns the seconds until the frame at work ends; an update where there is none."""
-        if self._began is None:
-            return max(SHORTEST_S, self.update_seconds)
-        now = self._now()
-        if self._stalled_until is not None:
-            return max(0.0, self._stalled_until - now) + self.update_seconds
-        elapsed = now - self._began
-        if self._first:
-            if self._first_end is not None and now < self._first_end:
-                return max(SHORTEST_S, self._first_end - now)
-            in_stage = now - self._stage_began
-            if 0 < self._done < 1:
-                return max(SHORTEST_S, in_stage * (1 - self._done) / self._done)
-            return max(SHORTEST_S, OVERDUE * elapsed)  # between two stages nothing better is known
-        return max(SHORTEST_S, self.update_seconds - elapsed, OVERDUE * (elapsed - self.update_seconds))
-
-
-class Background:
-    """Keeps the background tasks of a scene until they are done; the scene's end cancels them.
-
-    Args:
-        failed: called with the error that a task ended with.
-    """
-
-    def __init__(self, failed: Callable[[BaseException], None]) -> None:
-        self._failed = failed
-        self._tasks: set[asyncio.Task[None]] = set()
-        self._endless: set[asyncio.Task[None]] = set()
-
-    @property
-    def busy(self) -> bool:
-        """True while a task is not done that ends by itself."""
-        return bool(self._tasks - self._endless)
-
-    def run(self, coroutine: Coroutine[Any, Any, None], *, endless: bool = False) -> None:
-        """Begins a task; tasks run in the order of the calls where they do not wait."""
-        task = asyncio.get_running_loop().create_task(coroutine)
-        self._tasks.add(task)
-        if endless:
-            self._endless.add(task)
-        task.add_done_callback(self._done)
-
-    def _done(self, task: asyncio.Task[None]) -> None:
-        self._tasks.discard(task)
-        if not task.cancelled() and (error := task.exception()) is not None:
-            self._failed(error)
-
-    def cancel(self) -> None:
-        """Cancels all tasks."""
-        for task in tuple(self._tasks):
-            task.cancel()

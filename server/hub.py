@@ -1,4 +1,4 @@
-"""Channels of scenes and their listeners. Publishing hands an event to every listener and waits for none."""
+"""Publishes what happens in the scenes. Publishing hands an event to every listener of a scene and waits for none."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol, TypeVar
 
-from client.wire import FrameReportModel, SceneStatus
+from client.wire import FrameReportModel, FrameState, SceneStatus
+from server import counters
 from server.problems import Problem
-from server.stream.shared_queries import AskReaders, SharedQueries
+from server.processes.shared_queries import AskReaders, SharedQueries
 
 log = logging.getLogger("scas4d.server")
 
@@ -141,3 +142,37 @@ class Hub:
     def _give_up(self, scene: str) -> list[Listener]:
         channel = self._channels.pop(scene, None)
         return [] if channel is None else channel.listeners
+
+
+class Publisher:
+    """Publishes the events of one scene, and counts its finished frames in the metrics.
+
+    Args:
+        hub: of the service. scene: id of the scene.
+    """
+
+    def __init__(self, hub: Hub, scene: str) -> None:
+        self._hub = hub
+        self._scene = scene
+
+    @property
+    def listeners(self) -> int:
+        """Number of listeners of the scene."""
+        return self._hub.count(self._scene)
+
+    def changed(self) -> None:
+        """Publishes that the status of the scene has changed; to be called at every change."""
+        self._hub.publish(self._scene, SceneChanged())
+
+    def finished(self, report: FrameReportModel) -> None:
+        """Counts and publishes a finished frame; to be called once a frame."""
+        counters.FRAMES.labels(report.state.value).inc()
+        if report.state == FrameState.COMMITTED:
+            counters.LEFT_OUT.inc(len(report.dropped_cameras))
+            for alarm in report.alarms:
+                counters.ALARMS.labels(alarm.what.value).inc()
+            if report.outcome is not None and report.outcome.degraded:
+                counters.DEGRADED.labels("held" if report.outcome.held else "in_part").inc()
+        for stage, seconds in report.seconds.items():
+            counters.UPDATE_SECONDS.labels(stage).observe(seconds)
+        self._hub.publish(self._scene, FrameFinished(report))
