@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scas4d_core.engines.cpu.blocks import as_grid, tile_grid
 from scas4d_core.engines.cpu.gloss import features_seen
 from scas4d_core.engines.cpu.rasterizer import CpuRasterizer, Drawing
+from scas4d_core.engines.fit import FitEngine
 from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.engines.renderer import Comparison, Gradients, Picture
 from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView, means
@@ -66,11 +67,6 @@ class CpuRenderer:
         self.mask_part = 0.0
         self.psnr = 0.0
 
-    def apart(self) -> CpuRenderer:
-        """A renderer with the same background and limits, the image loss alone, and buffers of its own."""
-        red, green, blue, _ = self._background.tolist()
-        return CpuRenderer((red, green, blue), limits=Limits(*self.rasterizer.limits.tolist()))
-
     # The ``Renderer`` interface: states.
 
     def render(
@@ -117,6 +113,14 @@ class CpuRenderer:
             np.take(array, rows, axis=0) for array in (state.means, state.factors, state.opacities, features)
         )
         return as_grid(blocks_of(self.rasterizer, means, factors, opacities, features, camera), camera)
+
+    def fit_engine(self, mask_weight: float = 0.0) -> FitEngine:
+        """See ``Renderer.fit_engine``."""
+        from scas4d_core.engines.cpu.fit import CpuFitEngine  # it needs this module
+
+        red, green, blue, _ = self._background.tolist()
+        limits = Limits(*self.rasterizer.limits.tolist())
+        return CpuFitEngine(CpuRenderer((red, green, blue), 1.0, mask_weight, mask_weight == 0, limits))
 
     # The loss of an iteration: arrays that change in place.
 
