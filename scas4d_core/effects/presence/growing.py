@@ -91,7 +91,7 @@ def grown(
     parameters = initial_parameters(points, colours, None, len(points), rng)
     parameters[:, OPACITY] = logit(np.array(FIRST_OPACITY))
     parameters[:, LABEL] = logit(np.array(float(moves)))
-    born = _fitted(state, parameters, views, rig, renderer, rng, time, iterations=ITERATIONS)
+    born = _fit_crops(state, parameters, views, rig, renderer, rng, time, iterations=ITERATIONS)
     if born is None:
         time.put_off.append(f"{len(points)} Gaussians that {'move' if moves else 'stand'} were not born")
     return born
@@ -130,7 +130,7 @@ def settled(
     parameters[:, COLOUR] = mine.colours
     parameters[:, LABEL] = logit(mine.foreground[:, None])
     given = views, rig, renderer, rng, time
-    fitted = _fitted(others, parameters, *given, iterations=SETTLING, opacities=False)
+    fitted = _fit_crops(others, parameters, *given, iterations=SETTLING, opacities=False)
     if fitted is None:
         time.put_off.append(f"{len(rows)} young Gaussians were not settled")
         return state
@@ -168,7 +168,7 @@ class _Schedule:
         return FitScalars((left * self._rates).astype(np.float32))
 
 
-def _fitted(
+def _fit_crops(
     state: Gaussians,
     parameters: Array,
     views: Sequence[TrainingView],
@@ -180,7 +180,7 @@ def _fitted(
     iterations: int,
     opacities: bool = True,
 ) -> Gaussians | None:
-    """Parameters fitted beside a state that stays fixed, each step with a part of one view; None without time for it.
+    """Fit parameters beside a state that stays fixed, each step to a part of one view; None where time is too short.
 
     Args:
         opacities: whether these change.
@@ -194,8 +194,10 @@ def _fitted(
         order = schedule.view_order(len(fit.views), iterations, rng)
         fit.run(order, steps.scalars, steps.begin)
     time.spent += perf_counter() - began
-    born = fit.state()
-    return born.replace(foreground=np.round(born.foreground)) if steps.whole else None
+    if not steps.whole:
+        return None
+    fitted = fit.state()
+    return fitted.replace(foreground=np.round(fitted.foreground))
 
 
 def _beside(
