@@ -126,39 +126,6 @@ def degraded_text(outcome: FrameOutcome, reason: str) -> str | None:
     return HELD_TEXT + reason if outcome.held else reason
 
 
-def outcome_of(record: Mapping[str, Any]) -> FrameOutcome | None:
-    """The outcome in a report as it was committed. Reports of earlier versions have the text alone, which is read here.
-
-    Args:
-        record: as ``History.report`` gives it.
-
-    Returns:
-        None for a report that was lost, or whose outcome only a later version knows.
-
-    >>> outcome_of({"degraded": "held as it was: the pictures are 0.01 times as bright as they were"})
-    <FrameOutcome.HELD_UNUSABLE: 'held_unusable'>
-    >>> outcome_of({"outcome": "stood", "degraded": None})
-    <FrameOutcome.STOOD: 'stood'>
-    """
-    if not record:
-        return None
-    if "outcome" in record:
-        try:
-            return FrameOutcome(record["outcome"])
-        except ValueError:
-            return None
-    text = record.get("degraded")
-    if text is None:
-        return FrameOutcome.STOOD if record.get("iterations") == 0 else FrameOutcome.UPDATED
-    if text.startswith("held"):
-        if "less than usual" in text:
-            return FrameOutcome.HELD_UNMET
-        return FrameOutcome.HELD_IMPLAUSIBLE if "not finite" in text else FrameOutcome.HELD_UNUSABLE
-    if "taken as it is" in text:
-        return FrameOutcome.ACCEPTED
-    return FrameOutcome.RELOCATED if "less than usual" in text else FrameOutcome.RETRIED
-
-
 COVERS_LITTLE = 0.25
 """Share of the pictures up to which the points of frame 0 that cameras agree on cover little: from
 it on the surest ways to points are enough (``first_frame.initial_points``)."""
@@ -251,5 +218,5 @@ def timing_warnings(timing: Mapping[str, CameraTiming] | None) -> list[str]:
     off = {name: one["frames"] for name, one in sorted((timing or {}).items()) if one["off"]}
     if not off:
         return []
-    told = ", ".join(f"{name!r} is {'late' if way > 0 else 'early'}" for name, way in off.items())
-    return [f"cameras are out of step: {told}; check their trigger or genlock"]
+    cameras = ", ".join(f"{name!r} is {'late' if way > 0 else 'early'}" for name, way in off.items())
+    return [f"cameras are out of step: {cameras}; check their trigger or genlock"]

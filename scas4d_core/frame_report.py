@@ -39,20 +39,6 @@ CHECKPOINTS = 10
 """Points of the curve of an update at most."""
 
 
-@dataclass(frozen=True)
-class Progress:
-    """Progress of a long task.
-
-    Attributes:
-        stage: in words. done, total: of its steps. detail: figures by name, as the loss.
-    """
-
-    stage: str
-    done: int
-    total: int
-    detail: dict[str, float] = field(default_factory=dict)
-
-
 class CurvePoint(TypedDict):
     """A point of an update's curve, as it is on disk.
 
@@ -71,7 +57,7 @@ class FrameReport:
     """Report of frame 0, or of the update of a frame.
 
     Attributes:
-        outcome: of the frame; ``frame_outcome.outcome_of`` reads it from a record of any version.
+        outcome: of the frame.
         seconds: by stage; ``report`` is what this report costs, and the writing of the one before.
         loss: each iteration's weighted sum; of frame 0 at most ``REPORTED_LOSSES`` means.
         psnr: dB, over the training views of the last iterations, each as it was rendered then; NaN where not measured.
@@ -133,8 +119,8 @@ class FrameReport:
     def warnings(self) -> list[str]:
         """Sentences on what looks wrong, or was too much for its time (``first_warnings``, ``timing_warnings``)."""
         named = {"cloud": self.cloud, "calibration": self.calibration}
-        told = {name: asdict(found) for name, found in named.items() if found is not None}
-        first = first_warnings({**told, "shortened": self.shortened, "grey": self.grey})
+        given = {name: asdict(value) for name, value in named.items() if value is not None}
+        first = first_warnings({**given, "shortened": self.shortened, "grey": self.grey})
         return [*first, *timing_warnings(self.timing)]
 
     def record(self) -> dict[str, Any]:

@@ -72,11 +72,6 @@ class Gaussians:
         for name, array in (("retired", retired), ("own_opacities", own), ("opacities", shown)):
             object.__setattr__(self, name, array)
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Unpickles, states of earlier versions too, which had none retired."""
-        self.__dict__.update(state)
-        self.__post_init__()
-
     @classmethod
     def of_points(cls, points: ArrayLike, radius: float, colours: ArrayLike = 0.5) -> Gaussians:
         """Round Gaussians that move, one for each point: for scenes made by hand.

@@ -62,14 +62,14 @@ INFINITY = float("inf")
 
 NOT_FINITE = _guard(
     "not_finite", 1e15, NAN,
-    unit="m", where="kernels/projection.py, rasterize/twin.py",
+    unit="m", where="kernels/projection.py, engines/torch/rasterizer.py",
     reason="A Gaussian is left out whose mean, factor, opacity or features are NaN, infinite or beyond this: it would "
     "turn every pixel that it reaches into NaN. Its gradients are 0.",
     counted="Gaussians left out of a picture",
 )  # fmt: skip
 FEATURE_CEILING = _guard(
     "feature_ceiling", 1e9, INFINITY,
-    unit="1", where="kernels/projection.py, rasterize/twin.py",
+    unit="1", where="kernels/projection.py, engines/torch/rasterizer.py",
     reason="The same for features beyond this: the fourth powers in SSIM would overflow. Colours are nominally 0…1.",
     counted="under not_finite",
 )  # fmt: skip
@@ -92,14 +92,14 @@ GRADIENT_NOT_FINITE = _guard(
 
 HELD_BACK = _guard(
     "held_back", 0.0, NAN,
-    unit="–", where="update/deformation.py",
+    unit="–", where="engines/cpu/deformation.py",
     reason="A Gaussian that is not finite as an update begins is left as it is: the pivot of its cluster, a mean, "
     "would be NaN, and so all that the cluster holds. It weighs nothing in pivots and neighbour terms.",
     counted="Gaussians held back in an update",
 )  # fmt: skip
 EMPTY_CLUSTER = _guard(
     "empty_cluster", 1.0, 0.0,
-    unit="Gaussians", where="kernels/cascade.py, torch_backend/deformation.py",
+    unit="Gaussians", where="kernels/cascade.py, engines/torch/deformation.py",
     reason="Least number that a pivot's sum is divided by: a cluster whose Gaussians are all held back has the pivot 0 "
     "instead of NaN, which its gradient would carry on.",
     counted="clusters without a Gaussian in an update",
@@ -113,7 +113,7 @@ EXPONENT = _guard(
 )  # fmt: skip
 HALF_TURN = _guard(
     "half_turn", 1e-12, 0.0,
-    unit="1", where="kernels/cascade.py, torch_backend/deformation.py",
+    unit="1", where="kernels/cascade.py, engines/torch/deformation.py",
     reason="Floor of the polar rotation's cosine part, and of the radius it is divided by: a map that folds space "
     "straight back has no rotation of its own; it counts as none instead of 0/0.",
     counted="Gaussians in a layer, forward",
@@ -156,38 +156,38 @@ LEFT_OUT = _guard(
 
 ALPHA_FLOOR = _convention(
     "alpha_floor", 1.0 / 255.0, 1e-8,
-    unit="1", where="rasterize/limits.py",
+    unit="1", where="engines/limits.py",
     reason="A Gaussian covers exactly the pixels where its alpha is at least this; 8-bit pictures cannot show less.",
     counted="ends the support of every Gaussian",
 )  # fmt: skip
 ALPHA_CAP = _convention(
     "alpha_cap", 0.99, 1.0,
-    unit="1", where="rasterize/limits.py",
+    unit="1", where="engines/limits.py",
     reason="No single Gaussian is opaque: 1/(1 − alpha) of the backward pass stays below 100.",
     counted="meets every opaque Gaussian's middle, pixel by pixel",
 )  # fmt: skip
 TRANSMITTANCE_STOP = _convention(
     "transmittance_stop", 1e-4, 0.0,
-    unit="1", where="rasterize/limits.py",
+    unit="1", where="engines/limits.py",
     reason="A pixel is finished once less light than this would pass; what is left never gets denormal.",
     counted="ends every opaque pixel",
 )  # fmt: skip
 LOW_PASS = _convention(
     "low_pass", 0.3, 0.0,
-    unit="pixels²", where="rasterize/limits.py",
+    unit="pixels²", where="engines/limits.py",
     reason="Added to the diagonal of the projected covariance: a Gaussian is at least a pixel wide, and the covariance "
     "definite whatever its factor.",
     counted="added to every Gaussian",
 )  # fmt: skip
 NEAR = _convention(
     "near", 0.01, -INFINITY,
-    unit="m", where="rasterize/limits.py",
+    unit="m", where="engines/limits.py",
     reason="Nearer Gaussians are not drawn: the projection has its pole at depth 0.",
     counted="culls in every picture, as the sides of the picture do",
 )  # fmt: skip
 TANGENT_MARGIN = _convention(
     "tangent_margin", 0.3, 1e9,
-    unit="halves of the picture", where="rasterize/limits.py",
+    unit="halves of the picture", where="engines/limits.py",
     reason="How far beyond the border x/z may lie before the projection's Jacobian is taken at the clamped place: "
     "89° off the axis the linear footprint would cover the picture.",
     counted="holds every Gaussian beside the picture",
@@ -201,7 +201,7 @@ COVER_SLACK = _convention(
 )  # fmt: skip
 ROOT_FLOOR = _convention(
     "root_floor", 1e-20, 0.0,
-    unit="m²", where="kernels/neighbour_terms.py, torch_backend/losses.py",
+    unit="m²", where="kernels/neighbour_terms.py, engines/torch/losses.py",
     reason="Under the roots of the neighbour terms, as in Dynamic3DGaussians: where nothing has moved the gradient is "
     "0, not NaN.",
     counted="part of every pair's term",
@@ -214,19 +214,19 @@ ADAM_EPSILON = _convention(
 )  # fmt: skip
 SSIM_C1 = _convention(
     "ssim_c1", 0.01**2, 0.0,
-    unit="1", where="kernels/image_loss.py, torch_backend/losses.py",
+    unit="1", where="kernels/image_loss.py, engines/torch/losses.py",
     reason="SSIM's own (Wang et al. 2004): means that are both black compare as equal.",
     counted="part of every window",
 )  # fmt: skip
 SSIM_C2 = _convention(
     "ssim_c2", 0.03**2, 0.0,
-    unit="1", where="kernels/image_loss.py, torch_backend/losses.py",
+    unit="1", where="kernels/image_loss.py, engines/torch/losses.py",
     reason="SSIM's own: windows that are both flat compare as equal.",
     counted="part of every window",
 )  # fmt: skip
 SMALLEST_SQUARE = _convention(
     "smallest_square", 1e-9, 0.0,
-    unit="1", where="torch_backend/losses.py, update/picture_loss.py",
+    unit="1", where="engines/torch/losses.py, engines/cpu/renderer.py",
     reason="Sum of squared differences below which two pictures count as equal: PSNR stays finite.",
     counted="acts on a reported figure, not on the state",
 )  # fmt: skip

@@ -7,7 +7,7 @@ made of the scene's *roots*: Θ_0, with the Gaussians born since at the places t
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 from zlib import crc32
 
@@ -16,11 +16,13 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.captures.frame import Frame
+from scas4d_core.checkpoint import CarryOver
 from scas4d_core.effects.appearance.camera_gain import known_gains
 from scas4d_core.effects.cameras.pose_drift import posed
 from scas4d_core.effects.coherence.floor import floor_inside
 from scas4d_core.effects.effect import Effect, effect
 from scas4d_core.effects.evidence import Seen
+from scas4d_core.effects.presence.motion_mask import labelled, labels_learnt
 from scas4d_core.effects.switches import (
     Switch,
     Switches,
@@ -33,6 +35,7 @@ from scas4d_core.effects.switches import (
     switched_by,
 )
 from scas4d_core.engines.choose import engine_of
+from scas4d_core.engines.plan import UpdatePlan
 from scas4d_core.engines.renderer import Renderer
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.first_frame.static_result import StaticResult
@@ -40,9 +43,7 @@ from scas4d_core.frame_outcome import FrameOutcome
 from scas4d_core.gaussians import UNBORN, Gaussians
 from scas4d_core.settings import Settings
 from scas4d_core.storage.births import FOUNDERLESS, grown_roots
-from scas4d_core.storage.checkpoint import CarryOver
 from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
-from scas4d_core.structure.motion_mask import labelled, labels_learnt
 from scas4d_core.structure.neighbours import Neighbours, build_neighbours
 from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.parts import Arrays, PlanBuilder
@@ -61,17 +62,35 @@ MOST_BORN = 0.5
 """Of the Gaussians of frame 0, that may be born in a scene: memory is bounded."""
 
 
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """All that the next update starts from, beside Θ_{t−1}. It is replaced as a whole, or not at all.
+
+    Attributes:
+        updater: updates frames, with the effects that are on.
+        carried: what the update before left. roots: Θ_0, with the Gaussians born since.
+    """
+
+    updater: FrameUpdate
+    carried: CarryOver
+    roots: Gaussians
+
+    @property
+    def plan(self) -> UpdatePlan:
+        """The plan of its updates."""
+        return self.updater.plan
+
+    def carry(self, **changes: Any) -> Prepared:
+        """The same with changes of what is carried over."""
+        return replace(self, carried=replace(self.carried, **changes))
+
+
 class Preparation:
-    """Makes the updaters of a scene.
+    """Prepares the updates of a scene.
 
     Args:
         factory: of its views. settings: of the scene. world: user's to inside. renderer: draws.
-
-    Attributes:
-        built: plan and parts of the updater that was made last.
     """
-
-    built: PlanBuilder
 
     def __init__(self, factory: ViewFactory, settings: Settings, world: WorldFrame, renderer: Renderer) -> None:
         self._factory, self._settings, self._renderer = factory, settings, renderer
@@ -95,39 +114,68 @@ class Preparation:
         arrays = began(switches, self._settings, seen)
         return switched_by(arrays, switches, seen), arrays
 
-    def views(self, frame: Frame, fixed: dict[str, NDArray[np.float32]], carried: CarryOver) -> list[TrainingView]:
+    def views(self, frame: Frame, fixed: dict[str, NDArray[np.float32]], prepared: Prepared) -> list[TrainingView]:
         """The views of a frame, with the poses and exposures of the cameras as they are known by now.
 
         Without masks where no term asks for them: they are not even read.
 
         Args:
-            fixed: [3, 2] gain and offset of each camera, that frame 0 found.
+            fixed: [3, 2] gain and offset of each camera, as frame 0 has them.
 
         Raises:
             ValueError: see ``ViewFactory.views``.
         """
-        self._factory.posed = posed(self._factory.rig, carried.effects)
-        exposures = known_gains(fixed, carried.effects, self._factory.rig.names)
-        return self._factory.views(self._factory.scaled(frame), exposures, self.built.plan.mask > 0)
+        effects = prepared.carried.effects
+        self._factory.posed = posed(self._factory.rig, effects)
+        exposures = known_gains(fixed, effects, self._factory.rig.names)
+        return self._factory.views(self._factory.scaled(frame), exposures, prepared.plan.mask > 0)
 
-    def updater(self, first: Gaussians, switches: Switches) -> tuple[FrameUpdate, int]:
-        """The updater of ``settings.device``, and the digest of its clusters and neighbours.
+    def first(self, roots: Gaussians, switches: Switches) -> Prepared:
+        """Prepares the first update of a scene.
 
         Args:
-            first: the roots, with the labels to go by. switches: of the effects.
+            roots: Θ_0. switches: of the effects.
         """
-        update = self._settings.update
-        hierarchy = self._clusters(first)
-        built = joined(PlanBuilder(self._scene, update, self._factory, hierarchy, first), names_on(switches))
-        self.built = built
+        updater, structure = self._updater(roots, switches)
+        return Prepared(updater, CarryOver(structure=structure, switches=switches), roots)
+
+    def again(self, roots: Gaussians, carried: CarryOver) -> Prepared:
+        """Prepares the next update anew; a motion that belongs to other clusters is dropped from the carry-over.
+
+        Args:
+            roots: Θ_0 with all born since.
+        """
+        known = {**first_switches(self._settings, 0), **carried.switches}  # where a report was lost, none are carried
+        switches = {
+            name: replace(switch, on=switch.on and effect(name).refused(self._settings) is None)
+            for name, switch in known.items()
+        }
+        carried = replace(carried, switches=switches)  # a replay may have other settings than the scene
+        updater, structure = self._updater(labelled(roots, carried.labels), switches)
+        if carried.structure != structure:
+            carried = replace(carried, motion=None, structure=structure)
+        return Prepared(updater, carried, roots)
+
+    def _updater(self, roots: Gaussians, switches: Switches) -> tuple[FrameUpdate, int]:
+        """The updater on the engine of ``settings.device``, and the digest of its clusters and neighbours.
+
+        Args:
+            roots: with the labels of what moves.
+        """
+        hierarchy = self._clusters(roots)
+        builder = PlanBuilder(self._scene, self._settings.update, self._factory, hierarchy, roots)
+        built = joined(builder, names_on(switches))
         if not built.plan.freedom.clusters:  # no cascade either
             hierarchy = built.hierarchy = hierarchy.without_layers
-        tied = built.plan.neighbour_terms
-        if tied and self._neighbours is None:
-            self._neighbours = build_neighbours(first.means[hierarchy.rows], NEIGHBOURS, NEIGHBOUR_FALLOFF)
-        neighbours = self._neighbours if tied else None
+        neighbours = self._neighbour_graph(roots, hierarchy) if built.plan.neighbour_terms else None
         updater = FrameUpdate(engine_of(self._settings.device), built, neighbours)
         return updater, digest(hierarchy, neighbours)
+
+    def _neighbour_graph(self, roots: Gaussians, hierarchy: Hierarchy) -> Neighbours:
+        """The graph of the hierarchy that was made last."""
+        if self._neighbours is None:
+            self._neighbours = build_neighbours(roots.means[hierarchy.rows], NEIGHBOURS, NEIGHBOUR_FALLOFF)
+        return self._neighbours
 
     def _clusters(self, first: Gaussians) -> Hierarchy:
         """The hierarchy of what moves; that of the updater before where the same Gaussians do, with its neighbours."""
@@ -138,70 +186,42 @@ class Preparation:
             self._hierarchy = build_hierarchy(*self._made_of, update.clusters, SMALLEST_CLUSTER, update.seed)
         return self._hierarchy
 
-    def again(self, first: Gaussians, carried: CarryOver) -> tuple[FrameUpdate, CarryOver]:
-        """The updater for a carry-over; a motion that belongs to other clusters is dropped from that.
-
-        Args:
-            first: the roots.
-        """
-        switches = {
-            name: replace(switch, on=switch.on and effect(name).refused(self._settings) is None)
-            for name, switch in carried.switches.items()
-        }
-        carried = replace(carried, switches=switches)  # a replay may have other settings than the scene
-        updater, structure = self.updater(labelled(first, carried.labels), switches)
-        same = carried.structure == structure
-        return updater, carried if same else replace(carried, motion=None, structure=structure)
-
-    def relabelled(
-        self,
-        updater: FrameUpdate,
-        carried: CarryOver,
-        newest: Gaussians,
-        first: Gaussians,
-        believed: Sequence[TrainingView],
-    ) -> tuple[FrameUpdate, CarryOver]:
-        """The updater and carry-over with the Gaussians that the pictures show to move, for scenes without masks.
+    def relabelled(self, prepared: Prepared, newest: Gaussians, believed: Sequence[TrainingView]) -> Prepared:
+        """Prepared anew with the Gaussians that the pictures show to move, for scenes without masks.
 
         A Gaussian that has moved once stays in the hierarchy. The labels become part of the state with the commit of
         the frame. A hierarchy of other Gaussians is a new one: the motion before does not fit it, and the update
         starts cold.
 
         Args:
-            newest: Θ_{t−1}. first: the roots. believed: views of the frame.
+            newest: Θ_{t−1}. believed: views of the frame.
         """
+        carried = prepared.carried
         labels = labels_learnt(newest, carried.labels, carried.seen, believed, self._renderer)
         if labels is None:
-            return updater, carried
-        return self.again(first, replace(carried, labels=labels, motion=None))
+            return prepared
+        return self.again(prepared.roots, replace(carried, labels=labels, motion=None))
 
-    def switched(
-        self, updater: FrameUpdate, carried: CarryOver, seen: Seen, first: Gaussians
-    ) -> tuple[FrameUpdate, CarryOver]:
-        """The updater and carry-over of the next frame, with the effects that a frame calls for.
+    def followed(self, prepared: Prepared, seen: Seen, populates: bool) -> tuple[UpdateResult, Prepared]:
+        """What follows from a frame that was learnt: its result, and what the next update starts from.
 
         Args:
-            seen: the frame. first: the roots.
+            seen: the frame. populates: whether Gaussians may come and go.
         """
-        switches = decided(carried.switches, self._settings, seen)
-        before, carried = names_on(carried.switches), replace(carried, switches=switches)
-        return (updater, carried) if names_on(switches) == before else self.again(first, carried)
-
-    def followed(
-        self, updater: FrameUpdate, carried: CarryOver, seen: Seen, first: Gaussians, populates: bool
-    ) -> tuple[UpdateResult, FrameUpdate, CarryOver, Gaussians]:
-        """What follows from a frame that was learnt: its result, and the updater, carry-over and roots of the next.
-
-        Args:
-            seen: the frame. first: the roots before. populates: whether Gaussians may come and go.
-        """
-        on, seen = names_on(carried.switches), noted(carried.switches, self._settings, seen)
-        carried = replace(carried, effects=seen.result.carried)
-        updater, carried = self.switched(updater, carried, seen, first)
+        on, seen = names_on(prepared.carried.switches), noted(prepared.carried.switches, self._settings, seen)
+        prepared = self._switched(prepared.carry(effects=seen.result.carried), seen)
         if not populates:
-            return seen.result, updater, carried, first
+            return seen.result, prepared
         result = self.populated(on, seen)
-        return result, *self.regrown(updater, carried, seen, result, first)
+        return result, prepared if result is seen.result else self._regrown(prepared, seen, result)
+
+    def _switched(self, prepared: Prepared, seen: Seen) -> Prepared:
+        """With the effects that a frame calls for."""
+        before = names_on(prepared.carried.switches)
+        prepared = prepared.carry(switches=decided(prepared.carried.switches, self._settings, seen))
+        if names_on(prepared.carried.switches) == before:
+            return prepared
+        return self.again(prepared.roots, prepared.carried)
 
     def populated(self, names: Sequence[str], seen: Seen) -> UpdateResult:
         """The result of a frame with all that is born, retired or revived in it; what is not finite is left out.
@@ -223,35 +243,32 @@ class Preparation:
                     seen = replace(seen, result=result, room=max(0, seen.room - born))
         return seen.result
 
-    def regrown(
-        self, updater: FrameUpdate, carried: CarryOver, seen: Seen, result: UpdateResult, first: Gaussians
-    ) -> tuple[FrameUpdate, CarryOver, Gaussians]:
-        """The updater, carry-over and roots after a frame in which Gaussians have come or gone.
+    def _regrown(self, prepared: Prepared, seen: Seen, result: UpdateResult) -> Prepared:
+        """Prepared after a frame in which Gaussians have come or gone.
 
         Args:
-            seen: the frame before they did. result: after. first: the roots before.
+            seen: the frame before they did. result: after.
         """
         before, now = seen.result.gaussians, result.gaussians
-        if result is seen.result:
-            return updater, carried, first
         effects = {
             name: {key: _lengthened(array, len(before), result.joins) for key, array in arrays.items()}
             for name, arrays in result.carried.items()
         }
-        carried = replace(carried, effects=effects)
+        prepared = prepared.carry(effects=effects)
         if len(now) == len(before) and np.array_equal(now.retired, before.retired):
-            return updater, carried, first
-        roots, labels = grown_roots(first, now, result.joins), carried.labels
+            return prepared
+        roots, labels = grown_roots(prepared.roots, now, result.joins), prepared.carried.labels
         if labels is not None:
             labels = np.concatenate([labels, now.foreground[len(labels) :] > 0.5])
-        updater, carried = self.again(roots, replace(carried, labels=labels))
-        if carried.motion is None and seen.result.motion is not None and self._goes_on(result):
-            rows = updater.hierarchy.rows
+        prepared = self.again(roots, replace(prepared.carried, labels=labels))
+        if prepared.carried.motion is None and seen.result.motion is not None and self._goes_on(result):
+            hierarchy = prepared.updater.hierarchy
             known = np.zeros(len(now), np.bool_)
             known[: len(before)] = seen.before.moving & before.moving
-            moved = motion_between(updater.hierarchy, seen.before, now, known[rows], seen.result.motion.seconds)
-            carried = replace(carried, motion=moved)
-        return updater, carried, roots
+            seconds = seen.result.motion.seconds
+            motion = motion_between(hierarchy, seen.before, now, known[hierarchy.rows], seconds)
+            prepared = prepared.carry(motion=motion)
+        return prepared
 
     def _goes_on(self, result: UpdateResult) -> bool:
         """Whether the difference of two states is a motion; a jump is none."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from scas4d_core.effects.registry import Mode
+from scas4d_core.effect_names import Mode
 from scas4d_core.effects.switches import contradictions
 from scas4d_core.errors import InputError
 from scas4d_core.settings import Settings, StaticSettings, UpdateSettings, Weights
@@ -118,7 +118,7 @@ def preset(name: str, *changes: Mapping[str, Any]) -> Settings:
 
     >>> preset("adaptive").update.iterations
     50
-    >>> preset("adaptive", {"update": {"iterations": 20}}, {"device": "cuda"}).update.iterations
+    >>> preset("adaptive", {"update": {"iterations": 20}}, {"device": "cpu"}).update.iterations
     20
     """
     if name not in PRESETS:
@@ -171,8 +171,6 @@ def _setting_error(error: ValidationError) -> SettingError:
         fault = "there is no setting of this name"
         if near := difflib.get_close_matches(setting, list(_names(Settings().model_dump())), 1):
             remedy = f"did you mean {near[0]}? {remedy}"
-    elif first["type"] == "constant":  # a former setting
-        fault, remedy = first["msg"], first["ctx"]["remedy"]
     elif first["type"] == "value_error":
         own = first["ctx"]["error"]
         fault, remedy = (own.fault, own.remedy) if isinstance(own, InputError) and own.remedy else (str(own), remedy)

@@ -17,7 +17,9 @@ from numba import get_num_threads
 
 from scas4d_core.cameras import Rig, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
+from scas4d_core.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, cold_start, find_commit
 from scas4d_core.effects.evidence import FitTime, Seen
+from scas4d_core.effects.presence.motion_mask import first_labels, labelled
 from scas4d_core.effects.switches import kept_of, switches_record
 from scas4d_core.engines.choose import renderer_of
 from scas4d_core.engines.engine import REPORT
@@ -28,9 +30,11 @@ from scas4d_core.first_frame.calibration.record import Calibration, in_use
 from scas4d_core.first_frame.calibration.refine import first_calibration
 from scas4d_core.first_frame.start import FirstFrame, as_begun, fit_first, with_background
 from scas4d_core.first_frame.static_result import StaticResult
-from scas4d_core.frame_report import FrameReport, Progress, report_of_first, report_of_update
+from scas4d_core.frame_context import FrameContext, Observed
+from scas4d_core.frame_report import FrameReport, report_of_first, report_of_update
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.preparation import Preparation, room_for_births
+from scas4d_core.preparation import Preparation, Prepared, room_for_births
+from scas4d_core.progress import Progress
 from scas4d_core.query.committed import CommittedScene
 from scas4d_core.rig_checks import check_rig
 from scas4d_core.robust.alarms import first_watched, sharpness
@@ -39,10 +43,7 @@ from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.solve_frame import FrameSolver
 from scas4d_core.robust.update_input import RESTING, UpdateInput
 from scas4d_core.settings import Settings, UpdateSettings
-from scas4d_core.storage.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, cold_start, find_commit
 from scas4d_core.storage.history import History, HistoryError
-from scas4d_core.structure.motion_mask import first_labels, labelled
-from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.result import Stopwatch
 from scas4d_core.update.schedule import TimeBudget
 from scas4d_core.update.view_factory import ViewFactory
@@ -87,8 +88,8 @@ class Reconstruction(CommittedScene):
         self.report: FrameReport | None = None
         self.resumed: ResumePoint | None = None
         self._fixed: FirstFrame
-        self._updater: FrameUpdate
-        self.populates, self._carried = True, CarryOver()
+        self._prepared: Prepared
+        self.populates = True
         self._checkpoints = None if history.directory is None else Checkpoints(history.directory)
         self._budget = TimeBudget(settings.update.budget_ms)
 
@@ -135,18 +136,17 @@ class Reconstruction(CommittedScene):
         fitted = perf_counter()
         fixed = len(frame.masks) > 0, result.exposures, axis_lengths(result.gaussians), self.settings.scene.behind
         self._fixed = FirstFrame(*fixed)
-        self._roots = result.gaussians
         switches, effects = self._preparation.begun(scaled, result)
-        self._updater, structure = self._preparation.updater(result.gaussians, switches)
+        self._prepared = self._preparation.first(result.gaussians, switches)
         seen = self._factory.views(scaled, {}, False) if self._learns_labels else ()
         load = {} if started is None else {"load": began - started}
         stages = {"calibration": checked - began, "fit": fitted - checked, "prepare": perf_counter() - fitted}
-        rows = len(self._updater.hierarchy.rows)
+        rows = len(self._prepared.updater.hierarchy.rows)
         report = report_of_first(frame, result, self.rig.names, rows, {**load, **stages}, dropped, found)
         psnr, shown = {name: fit["psnr"] for name, fit in result.cameras.items()}, fingerprints(frame.images)
         past = replace(first_watched(Past.of_first(psnr, brightness(frame.images)), frame.images), fitted=frame.time)
-        carried = CarryOver(seen=seen, structure=structure, past=past, shown=shown, switches=switches, effects=effects)
-        self._commit(report, result.gaussians, carried, {**self._fixed.record(), **(notes or {})})
+        prepared = self._prepared.carry(seen=seen, past=past, shown=shown, effects=effects)
+        self._commit(report, result.gaussians, prepared, {**self._fixed.record(), **(notes or {})})
         return self
 
     @classmethod
@@ -189,7 +189,7 @@ class Reconstruction(CommittedScene):
         """Writes the checkpoint of the newest commit again; False for another one, which is not in memory."""
         if self._checkpoints is None or index != self.history.indices[-1]:
             return False
-        self._checkpoints.save(index, self._carried)
+        self._checkpoints.save(index, self._prepared.carried)
         return True
 
     @classmethod
@@ -210,12 +210,10 @@ class Reconstruction(CommittedScene):
 
     def _go_on(self, index: int, carried: CarryOver) -> bool:
         """Prepare the updates after a committed one; False: the motion that it left does not fit today's clusters."""
-        self._take_roots(self.history.roots(index))
-        self._updater, self._carried = self._preparation.again(self._roots, carried)
-        return self._carried.structure == carried.structure
-
-    def _take_roots(self, roots: Gaussians) -> None:
-        self._roots, self._fixed = roots, replace(self._fixed, lengths=axis_lengths(roots))
+        roots = self.history.roots(index)
+        self._fixed = replace(self._fixed, lengths=axis_lengths(roots))
+        self._prepared = self._preparation.again(roots, carried)
+        return self._prepared.carried.structure == carried.structure
 
     def step(
         self,
@@ -236,66 +234,124 @@ class Reconstruction(CommittedScene):
             StepError: not later than the last frame, no picture of the rig, or a picture of another size.
         """
         seconds, watch = self._seconds_to(frame), Stopwatch(started)
-        frame = replace(frame, images=dict(frame.images))  # decoded once: a capture's pictures are, whenever looked at
+        frame = replace(frame, images=dict(frame.images))  # a capture's pictures are decoded whenever looked at
+        context = FrameContext(frame, watch, dropped, notes or {})
+        self._observe(context, seconds)
+        self._prepare(context)
+        self._solve(context)
+        self._populate(context)
+        report = self._report(context)
+        self._commit_update(context, report)
+        return report
+
+    def _observe(self, context: FrameContext, seconds: float) -> None:
+        """Decodes the pictures, and judges their brightness and the light."""
+        frame, watch, past = context.frame, context.watch, self._prepared.carried.past
         views = self._views(frame)
         watch.lap("decode")
         bright, shown = brightness(frame.images), fingerprints(frame.images)
-        judged = bright if self.settings.update.judge else {}  # of no picture nothing is found
-        exposure, left_out, unusable = check_brightness(self._carried.past, judged)
-        moves = exposure != 1.0 and goes_on(self._carried.past, judged)
-        past = noted(lit(self._carried.past, exposure), bright)
+        judged = bright if self.settings.update.judge else {}  # then no picture is doubted
+        exposure, left_out, unusable = check_brightness(past, judged)
+        changes = exposure != 1.0 and goes_on(past, judged)
+        past = noted(lit(past, exposure), bright)
+        context.observed = Observed(seconds, views, bright, shown, exposure, left_out, unusable, changes, past)
         watch.lap("judge")
-        believed = [view for view in views if view.name not in left_out]
-        steady = unusable is None and exposure == 1.0  # else nothing can be told from differences of the pictures
-        updater, carried, learns = self._updater, self._carried, steady and self._learns_labels
-        if learns and carried.seen:
-            newest = self.history.newest
-            updater, carried = self._preparation.relabelled(updater, carried, newest, self._roots, believed)
-        given = UpdateInput(
-            state=self.history.newest if carried.labels is None else labelled(self.history.newest, carried.labels),
+
+    def _prepare(self, context: FrameContext) -> None:
+        """Labels what moves, where no masks do, and gathers the input of the update."""
+        observed, frame, prepared, newest = context.observed, context.frame, self._prepared, self.history.newest
+        believed, learns = observed.believed, observed.steady and self._learns_labels
+        if learns and prepared.carried.seen:
+            prepared = self._preparation.relabelled(prepared, newest, believed)
+        carried, past, shown = prepared.carried, observed.past, observed.fingerprints
+        context.prepared = prepared
+        context.given = UpdateInput(
+            state=labelled(newest, carried.labels),
             motion=carried.motion,
-            seconds=frame.time - past.fitted if isfinite(past.fitted) else seconds,
-            step=seconds, views=believed, suspects=[view for view in views if past.is_out(view.name)],
-            brightness=bright, seed=frame.index, past=past, lengths=self._fixed.lengths, exposure=exposure,
-            end=self._budget.end(watch.began), each=self._budget.each, light_moves=moves, left_out=left_out,
-            same=[name for name in shown if shown[name] == carried.shown.get(name)], sharp=sharpness(frame.images),
-            unusable=unusable, carried=carried.effects,
+            seconds=frame.time - past.fitted if isfinite(past.fitted) else observed.seconds,
+            step=observed.seconds,
+            views=believed,
+            suspects=[view for view in observed.views if past.is_out(view.name)],
+            brightness=observed.bright,
+            seed=frame.index,
+            past=past,
+            lengths=self._fixed.lengths,
+            exposure=observed.exposure,
+            light_moves=observed.light_changes,
             rests=learns and carried.labels is None and len(self.history.indices) <= RESTING,
-        )  # fmt: skip
-        solver = FrameSolver(updater, self._factory, self._renderer, self._update)
-        result, past = solver.run(given)
-        watch.lap("update")
-        watch.move("update", "judge", solver.judging)
-        if result.outcome.held:  # motion that seemed to be in its pictures is as little believed as they are
-            updater, carried = self._updater, self._carried
-            result = replace(result, gaussians=self.history.newest, motion=carried.motion, carried=carried.effects)
-        how = {"cold": given.motion is None, "relabelled": updater is not self._updater, **(notes or {})}
-        carried = carried.after(result, past, frame.time, believed if self._learns_labels else None, shown)
-        roots, fits = self._roots, FitTime(self._budget.end_of_births(watch.began))
-        if result.outcome.learnt and result.exposure == 1.0:  # in a light that is taken out again much looks new
-            learnt = [view for view in result.views or believed if view.name not in result.trace.left_out]
-            aside = [view for view in views if view.name not in {view.name for view in learnt}]
-            room = room_for_births(len(self.history.first), len(result.gaussians))
-            looked_at = (result, self._factory.posed, learnt, self._renderer, room, fits, aside)
-            seen, populates = Seen(frame.index, given.state, *looked_at), self.populates and exposure == 1.0
-            result, updater, carried, roots = self._preparation.followed(updater, carried, seen, roots, populates)
-            tried = self._budget.births  # time that was kept and not enough is not kept again
-            self._budget.births = bool(fits.spent or fits.put_off) and not (tried and fits.put_off)
-            watch.lap("presence")
-        report = report_of_update(
-            frame, result, self.history.newest, left_out, self.rig.names, watch, dropped, fits.put_off
+            same=[name for name in shown if shown[name] == carried.shown.get(name)],
+            sharp=sharpness(frame.images),
+            left_out=observed.left_out,
+            unusable=observed.unusable,
+            carried=carried.effects,
+            end=self._budget.end(context.watch.began),
+            each=self._budget.each,
         )
-        birth = {} if roots is self._roots else {"roots": roots, "joins": result.joins}
-        self._commit(report, result.gaussians, carried, how, **birth)
-        self._updater = updater
-        commit = solver.judging + watch.seconds.get("presence", 0.0) - fits.spent
-        commit += perf_counter() - watch.began - watch.total
-        self._budget.learn(result.trace.moments, result.trace.seconds, commit)
-        return report
+
+    def _solve(self, context: FrameContext) -> None:
+        """Updates Θ_{t−1} to the frame; of a frame that is not believed nothing stays."""
+        solver = FrameSolver(context.prepared.updater, self._factory, self._renderer, self._update)
+        result, context.past = solver.run(context.given)
+        context.judging = solver.judging
+        context.watch.lap("update")
+        context.watch.move("update", "judge", solver.judging)
+        if result.outcome.held:  # motion that seemed to be in its pictures is as little believed as they are
+            carried = self._prepared.carried
+            context.prepared = self._prepared
+            result = replace(result, gaussians=self.history.newest, motion=carried.motion, carried=carried.effects)
+        context.result = result
+
+    def _populate(self, context: FrameContext) -> None:
+        """Takes the effects' evidence, lets Gaussians come and go, and prepares the next update."""
+        observed, result, believed = context.observed, context.result, context.observed.believed
+        learnt_from = believed if self._learns_labels else None
+        carried = context.prepared.carried.after(
+            result, context.past, context.frame.time, learnt_from, observed.fingerprints
+        )
+        relabelled = context.prepared.updater is not self._prepared.updater
+        context.notes = {"cold": context.given.motion is None, "relabelled": relabelled, **context.notes}
+        context.prepared = replace(context.prepared, carried=carried)
+        context.fits = FitTime(self._budget.end_of_births(context.watch.began))
+        if not result.outcome.learnt or result.exposure != 1.0:  # in a light that is taken out again much looks new
+            return
+        learnt = [view for view in result.views or believed if view.name not in result.trace.left_out]
+        names = {view.name for view in learnt}
+        seen = Seen(
+            index=context.frame.index,
+            before=context.given.state,
+            result=result,
+            rig=self._factory.posed,
+            views=learnt,
+            renderer=self._renderer,
+            room=room_for_births(len(self.history.first), len(result.gaussians)),
+            time=context.fits,
+            suspects=[view for view in observed.views if view.name not in names],
+        )
+        populates = self.populates and observed.exposure == 1.0
+        context.result, context.prepared = self._preparation.followed(context.prepared, seen, populates)
+        self._budget.saw_births(context.fits.spent, context.fits.put_off)
+        context.watch.lap("presence")
+
+    def _report(self, context: FrameContext) -> FrameReport:
+        return report_of_update(
+            context.frame, context.result, self.history.newest, context.observed.left_out, self.rig.names,
+            context.watch, context.dropped, context.fits.put_off,
+        )  # fmt: skip
+
+    def _commit_update(self, context: FrameContext, report: FrameReport) -> None:
+        """Commits the frame with what was born in it, and lets the budget learn from its time."""
+        result, prepared, watch = context.result, context.prepared, context.watch
+        grown = prepared.roots is not self._prepared.roots
+        birth = {"roots": prepared.roots, "joins": result.joins} if grown else {}
+        self._commit(report, result.gaussians, prepared, context.notes, **birth)
+        after = context.judging + watch.seconds.get("presence", 0.0) - context.fits.spent
+        after += perf_counter() - watch.began - watch.total
+        self._budget.learn(result.trace.moments, result.trace.seconds, after)
 
     @property
-    def _learns_labels(self) -> bool:  # motion tells what moves: no masks do, and the effects ask for it
-        return self._preparation.built.plan.learns_labels and not self._fixed.masked
+    def _learns_labels(self) -> bool:
+        """True where motion says what moves: no masks do, and the effects ask for it."""
+        return self._prepared.plan.learns_labels and not self._fixed.masked
 
     def _seconds_to(self, frame: Frame) -> float:
         """Seconds from the last committed frame to one that comes after it."""
@@ -310,7 +366,7 @@ class Reconstruction(CommittedScene):
     def _views(self, frame: Frame) -> list[TrainingView]:
         """The views of a frame, as the scene knows its cameras by now."""
         try:
-            return self._preparation.views(frame, self._fixed.exposures, self._carried)
+            return self._preparation.views(frame, self._fixed.exposures, self._prepared)
         except ValueError as error:
             raise StepError(str(error)) from error
 
@@ -329,9 +385,10 @@ class Reconstruction(CommittedScene):
         self._budget.milliseconds = self._update.budget_ms
 
     def _commit(
-        self, report: FrameReport, gaussians: Gaussians, carried: CarryOver, more: Mapping[str, Any], **birth: Any
+        self, report: FrameReport, gaussians: Gaussians, prepared: Prepared, more: Mapping[str, Any], **birth: Any
     ) -> None:
         """The checkpoint first, then state and report in one rename; ``birth``: see ``History.append``."""
+        carried = prepared.carried
         if self._checkpoints is not None:
             self._checkpoints.save(report.index, carried)
         began = perf_counter()
@@ -344,7 +401,8 @@ class Reconstruction(CommittedScene):
         kept = kept_of(carried.effects) if self.history.indices else carried.effects
         self.history.append(report.index, report.time, gaussians, record, effects=kept, **birth)
         if birth:
-            self._take_roots(self.history.roots())
-        self._carried, self.report = carried, report
+            prepared = replace(prepared, roots=self.history.roots())
+            self._fixed = replace(self._fixed, lengths=axis_lengths(prepared.roots))
+        self._prepared, self.report = prepared, report
         if self._checkpoints is not None:
             self._checkpoints.clean(self.history.indices)

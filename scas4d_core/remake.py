@@ -12,7 +12,6 @@ from typing import Any
 from scas4d_core.cameras import Rig
 from scas4d_core.captures.frame import Frame
 from scas4d_core.effects.effect import Group, effect
-from scas4d_core.frame_outcome import outcome_of
 from scas4d_core.gaussians import PER_FRAME, WHOLES
 from scas4d_core.reconstruction import Reconstruction, StepError
 from scas4d_core.settings import Settings
@@ -52,11 +51,10 @@ def remake(
     aside = Reconstruction.aside(rig, settings, history, base)
     aside.populates = False  # what came and went in it is known, and states after it have it
     aside.set_budget(**budget)
-    aside.step(frame, dropped=dropped, notes={**(notes or {}), REMADE: True})
+    made = aside.step(frame, dropped=dropped, notes={**(notes or {}), REMADE: True})
+    if made.outcome.held:  # nothing was learnt from the pictures
+        raise StepError(f"frame {frame.index} does not fit the frame before it: {made.degraded}")
     report = aside.history.report(frame.index)
-    outcome = outcome_of(report)
-    if outcome is not None and outcome.held:  # nothing was learnt from the pictures
-        raise StepError(f"frame {frame.index} does not fit the frame before it: {report['degraded']}")
     arrays = history.completed(frame.index, aside.history.gaussians(frame.index)).arrays()
     kept = {name: arrays[name] for name in (*PER_FRAME, *WHOLES) if name in arrays}
     # Who was young in it is not known: its births are those of the history, not of this update.

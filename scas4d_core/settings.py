@@ -1,20 +1,16 @@
 """Settings of a scene: every number that a user can set, with its unit, range and the reason for its default.
 
-Numbers that only the method's author would turn are constants beside their use; ``SettingsModel.constants`` lists those
-that were settings once.
+Numbers that only the method's author would turn are constants beside their use.
 """
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
-from pydantic_core import InitErrorDetails, PydanticCustomError
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from scas4d_core.effects.registry import EFFECTS, Mode
+from scas4d_core.effect_names import EFFECTS, Mode
 from scas4d_core.errors import InputError
 
 Positive = Annotated[float, Field(gt=0)]
@@ -24,54 +20,10 @@ NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 
 
-@dataclass(frozen=True)
-class Constant:
-    """A former setting: the value that it has for good, and the dotted name of the constant that holds it.
-
-    ``place`` is empty where the feature went and only ``value``, which switched it off or was its default, is accepted.
-    """
-
-    value: Any
-    place: str = ""
-
-
 class SettingsModel(BaseModel):
-    """Base of all settings: they do not change once read, and an unknown name is an error.
-
-    Attributes:
-        constants: former settings by name. Stored settings and requests may still name them: at the constant's value
-            they are dropped, at any other the error (type ``constant``) names the value given, the constant's value and
-            its place. ``studies/constants.py`` varies one.
-    """
+    """Base of all settings: they do not change once read, and an unknown name is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-    constants: ClassVar[Mapping[str, Constant]] = {}
-
-    @model_validator(mode="before")
-    @classmethod
-    def _drop_constants(cls, given: Any) -> Any:
-        if not isinstance(given, Mapping) or not (named := given.keys() & cls.constants.keys()):
-            return given
-        wrong = [_refusal(name, given[name], cls.constants[name]) for name in sorted(named)]
-        if errors := [error for error in wrong if error is not None]:
-            raise ValidationError.from_exception_data(cls.__name__, errors)
-        return {name: value for name, value in given.items() if name not in named}
-
-
-def _refusal(name: str, given: Any, constant: Constant) -> InitErrorDetails | None:
-    """The error of a former setting that is given another value than its constant has; None: it has the same."""
-    value = list(constant.value) if isinstance(constant.value, tuple) else constant.value
-    if (list(given) if isinstance(given, tuple) else given) == value and isinstance(given, bool) == isinstance(
-        value, bool
-    ):
-        return None
-    now = f"it is the constant {constant.place} = {value} now" if constant.place else f"only {value} is accepted still"
-    error = PydanticCustomError(
-        "constant",
-        "{name} cannot be {given}: it is no setting any more, {now}",
-        {"name": name, "given": repr(given), "now": now, "remedy": f"leave {name} out"},
-    )
-    return InitErrorDetails(type=error, loc=(name,), input=given)
 
 
 class SceneSettings(SettingsModel):
@@ -117,28 +69,10 @@ class SceneSettings(SettingsModel):
 class StaticSettings(SettingsModel):
     """Frame 0: 3D Gaussian Splatting with adaptive density control.
 
-    >>> StaticSettings.model_validate({"seed": 3, "min_views": 2}).seed  # min_views is a constant now: dropped
-    3
+    >>> StaticSettings(seed=3).detail
+    1.0
     """
 
-    constants: ClassVar[Mapping[str, Constant]] = {
-        "initial_share": Constant(0.6, "scas4d_core.first_frame.static_scene.INITIAL_SHARE"),
-        "densify_from": Constant(200, "scas4d_core.first_frame.static_scene.DENSIFY_FROM"),
-        "densify_every": Constant(100, "scas4d_core.first_frame.static_scene.DENSIFY_EVERY"),
-        "densify_until": Constant(0.6, "scas4d_core.first_frame.static_scene.DENSIFY_UNTIL"),
-        "densify_gradient": Constant(1e-6, "scas4d_core.first_frame.static_scene.DENSIFY_GRADIENT"),
-        "prune_opacity": Constant(0.01, "scas4d_core.first_frame.static_scene.PRUNE_OPACITY"),
-        "min_views": Constant(2, "scas4d_core.first_frame.static_scene.MIN_VIEWS"),
-        "seen_pixels": Constant(0.05, "scas4d_core.first_frame.static_scene.SEEN_PIXELS"),
-        "rate_position": Constant(1.6e-4, "scas4d_core.first_frame.static_scene.RATE_POSITION"),
-        "rate_position_end": Constant(1.6e-6, "scas4d_core.first_frame.static_scene.RATE_POSITION_END"),
-        "rate_colour": Constant(2.5e-3, "scas4d_core.first_frame.static_scene.RATE_COLOUR"),
-        "rate_opacity": Constant(5e-2, "scas4d_core.first_frame.static_scene.RATE_OPACITY"),
-        "rate_scale": Constant(5e-3, "scas4d_core.first_frame.static_scene.RATE_SCALE"),
-        "rate_rotation": Constant(2e-3, "scas4d_core.first_frame.static_scene.RATE_ROTATION"),
-        "rate_exposure": Constant(1e-3, "scas4d_core.first_frame.static_scene.RATE_EXPOSURE"),
-        "weight_mask": Constant(3.0, "scas4d_core.first_frame.static_scene.WEIGHT_MASK"),
-    }
     iterations: int = Field(3000, ge=1, le=1_000_000, description="Iterations of frame 0, one training view each.")
     seconds: Annotated[float, Field(gt=0, le=1_000_000)] | None = Field(
         110.0,
@@ -172,19 +106,12 @@ class StaticSettings(SettingsModel):
 class LayerRates(SettingsModel):
     """Adam rates of one layer of clusters."""
 
-    constants: ClassVar[Mapping[str, Constant]] = {"scaling": Constant(0.002, "scas4d_core.update.rates.RATE_SCALING")}
     rotation: Positive = Field(description="Per iteration, in units of tan(angle/2).")
     translation: Positive = Field(description="Metres per iteration, for a scene radius of 4 m.")
 
 
 class Weights(SettingsModel):
     """Weights of the terms, beside 1 for the image loss. A term with weight 0 is not computed."""
-
-    constants: ClassVar[Mapping[str, Constant]] = {
-        "image": Constant(1.0, "scas4d_core.update.schedule.IMAGE_WEIGHT"),
-        "soft_colour": Constant(0.01, "scas4d_core.update.schedule.SOFT_COLOUR_WEIGHT"),
-        "floor": Constant(2.0, "scas4d_core.effects.coherence.floor.FLOOR_WEIGHT"),
-    }
 
     mask: NotNegative = Field(
         1.0,
@@ -210,18 +137,6 @@ class UpdateSettings(SettingsModel):
     >>> UpdateSettings(iterations=50, budget_ms=400).clusters
     (64, 320, 1280)
     """
-
-    constants: ClassVar[Mapping[str, Constant]] = {
-        "smallest_cluster": Constant(8, "scas4d_core.preparation.SMALLEST_CLUSTER"),
-        "layer_starts": Constant((0.0, 0.2, 0.4), "scas4d_core.update.rates.LAYER_STARTS"),
-        "coarse_until": Constant(0.0),
-        "coarse_scale": Constant(0.5),
-        "warm_start": Constant(1.0, "scas4d_core.update.warm_start.WARM_START"),
-        "neighbours": Constant(20, "scas4d_core.preparation.NEIGHBOURS"),
-        "neighbour_falloff": Constant(2000.0, "scas4d_core.preparation.NEIGHBOUR_FALLOFF"),
-        "neighbour_sample": Constant(4000, "scas4d_core.update.schedule.NEIGHBOUR_SAMPLE"),
-        "max_scale": Constant(0.02, "scas4d_core.update.deformation.MAX_SCALE"),
-    }
 
     iterations: int = Field(100, ge=1, le=100_000, description="Iterations a frame, each a step down the gradient.")
     views: int = Field(
@@ -337,7 +252,14 @@ class Settings(SettingsModel):
         description='Effects (docs/effects.md) that are pinned "on" or "off", by name; the others are "auto": on where '
         "the scene calls for them.",
     )
-    device: Literal["cpu", "cuda"] = Field("cpu", description="Where the update runs.")
+    device: Literal["cpu"] = Field("cpu", description="Where the update runs: the CPU; it is the only engine so far.")
+
+    @field_validator("device", mode="before")
+    @classmethod
+    def _has_an_engine(cls, device: object) -> object:
+        if device != "cpu":
+            raise InputError(f"device {device!r} has no engine; updates run on the CPU so far", "give 'cpu'")
+        return device
 
     @field_validator("effects")
     @classmethod

@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from scas4d_core.effect_names import EFFECTS
 from scas4d_core.effects.effect import effect
-from scas4d_core.effects.registry import EFFECTS
 
 PAGE = Path(__file__).parents[1] / "docs" / "effects.md"
 BEGIN, END = "<!-- effects -->\n", "<!-- end -->"

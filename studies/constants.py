@@ -1,7 +1,4 @@
-"""Varies constants of the method: what only its author turns is a constant in the module that uses it, not a setting.
-
-``SettingsModel.constants`` in ``scas4d_core/settings.py`` lists the constants that were settings once.
-"""
+"""Varies constants of the method: those that only its author turns, in the module that uses them."""
 
 from __future__ import annotations
 

@@ -8,14 +8,6 @@ from pathlib import Path
 import pytest
 from source_tree import MODULES, PACKAGES, ROOT, circles, docstrings, imports, product, tree, within
 
-MOST_FILES = 14
-"""In one folder: a reader sees at a glance which of them matter."""
-EXEMPT_FOLDERS = ("server/routes",)
-"""One file a resource, however many there are."""
-
-MOST_LINES = 350
-"""Kernels are exempt: one flat function is one file."""
-
 MOST_HEADLESS = 20
 HEADLESS = {"What", "Who", "Whoever", "Where", "Which", "How", "Whether", "That"}
 """First words of docstrings without a subject."""
@@ -55,29 +47,6 @@ def test_the_product_imports_neither_studies_nor_tests(package: str) -> None:
     for name in product():
         if within(name, (package,)):
             assert not [found for found in imports(name, lazy=True) if within(found, outside)], name
-
-
-def folders() -> dict[str, int]:
-    """Number of Python files by folder of the packages, the studies and the tests, `__init__` aside."""
-    found: dict[str, int] = {}
-    for top in (*PACKAGES, "studies", "tests"):
-        for path in (ROOT / top).rglob("*.py"):
-            if path.name != "__init__.py":
-                folder = path.parent.relative_to(ROOT).as_posix()
-                found[folder] = found.get(folder, 0) + 1
-    return found
-
-
-def test_no_folder_is_crowded() -> None:
-    counts = folders()
-    assert counts["scas4d_core/update"] > 5  # the tree was read
-    assert {folder: n for folder, n in counts.items() if n > MOST_FILES and folder not in EXEMPT_FOLDERS} == {}
-
-
-def test_no_file_is_long() -> None:
-    lines = {path.relative_to(ROOT).as_posix(): path.read_text().count("\n") for path in product().values()}
-    assert len(lines) > 100  # the tree was read
-    assert {path: n for path, n in lines.items() if n > MOST_LINES and "/kernels/" not in path} == {}
 
 
 def headless(paths: list[Path]) -> list[str]:

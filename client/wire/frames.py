@@ -236,9 +236,7 @@ class FrameReportModel(Model):
     )
     psnr: float | None = Field(default=None, description="dB, training views of the last iterations.")
     cameras: dict[str, CameraFitModel] = Field(default_factory=dict, description="By camera that the update saw.")
-    alarms: list[AlarmModel] = Field(
-        default_factory=list, description="What a person should look at; frames of earlier versions have none."
-    )
+    alarms: list[AlarmModel] = Field(default_factory=list, description="What a person should look at.")
     timing: dict[str, CameraTimingModel] = Field(
         default_factory=dict, description="By camera; only where motion tells it well enough. Never on a GPU."
     )

@@ -3,7 +3,16 @@
 from scas4d_core.compact.bounds import Bounds
 from scas4d_core.compact.head import Head
 from scas4d_core.compact.reader import CompactReader, DamagedFileError, FileError
-from scas4d_core.compact.records import checked_records
+from scas4d_core.compact.records import FormatError, checked_records
 from scas4d_core.compact.writer import CompactWriter
 
-__all__ = ["Bounds", "CompactReader", "CompactWriter", "DamagedFileError", "FileError", "Head", "checked_records"]
+__all__ = [
+    "Bounds",
+    "CompactReader",
+    "CompactWriter",
+    "DamagedFileError",
+    "FileError",
+    "FormatError",
+    "Head",
+    "checked_records",
+]

@@ -11,10 +11,10 @@ import numpy as np
 
 from scas4d_core.cameras import Camera, Rig, WorldFrame
 from scas4d_core.compact.bounds import Bounds
-from scas4d_core.compact.records import FileError
+from scas4d_core.compact.records import FileError, FormatError
 
 VERSION = 1
-"""Of the format (docs/format.md); files of later ones are refused."""
+"""Of the format (docs/format.md); files of another one are refused."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Head:
         """The head of a file of this name.
 
         Raises:
-            FileError: it is none, or of a later version.
+            FileError: it is none. FormatError: it is of another version of the format.
         """
         try:
             record = json.loads(text)
@@ -70,9 +70,10 @@ class Head:
                 raise ValueError(f"format {record['format']!r}, version {version!r}")
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             raise FileError(f"{name}: its head is no head of a compact file ({error})") from None
-        if version > VERSION:
-            raise FileError(
-                f"{name}: version {version} of the format; this scas4d reads up to {VERSION}, take a later one"
+        if version != VERSION:
+            raise FormatError(
+                f"{name}: a compact 4D file of version {version}; this scas4d reads version {VERSION}: "
+                "use the scas4d that wrote it"
             )
         try:
             origin = np.array(record["world"]["origin"], np.float64).reshape(3)

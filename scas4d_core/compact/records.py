@@ -48,7 +48,11 @@ class Kind(IntEnum):
 
 
 class FileError(ValueError):
-    """A file that is no compact file, or of a later version; the message names the file and the fault."""
+    """A file that is no compact file, or of another version; the message names the file and the fault."""
+
+
+class FormatError(FileError):
+    """A compact file of another version of the format; it stays as it is."""
 
 
 class DamagedFileError(FileError):

@@ -12,7 +12,7 @@ from importlib import import_module
 from operator import attrgetter
 from typing import TYPE_CHECKING
 
-from scas4d_core.effects.registry import EFFECTS
+from scas4d_core.effect_names import EFFECTS
 
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import Evidence, Seen

@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from scas4d_core.effect_names import EFFECTS, Mode
 from scas4d_core.effects.effect import Effect, effect
-from scas4d_core.effects.registry import EFFECTS, Mode
 from scas4d_core.errors import InputError
 from scas4d_core.settings import Settings
 
@@ -96,12 +96,12 @@ def switches_record(switches: Switches) -> dict[str, dict[str, Any]]:
 
 
 def switches_of(record: Mapping[str, Mapping[str, Any]]) -> dict[str, Switch]:
-    """The switches of a record; effects that this version does not know are left out.
+    """The switches of a record.
 
     >>> switches_of(switches_record({"floor": Switch(on=True, since=3)}))["floor"].since
     3
     """
-    return {name: Switch(**values) for name, values in record.items() if name in EFFECTS}
+    return {name: Switch(**values) for name, values in record.items()}
 
 
 def decided(switches: Switches, settings: Settings, seen: Seen) -> dict[str, Switch]:
@@ -160,8 +160,7 @@ def noted(switches: Switches, settings: Settings, seen: Seen) -> Seen:
 
 def kept_of(carried: Mapping[str, Arrays]) -> dict[str, Arrays]:
     """The arrays that are committed with a frame after the first, of those that the effects leave, by effect."""
-    known = {name: own for name, own in carried.items() if name in EFFECTS}
-    kept = {name: {key: own[key] for key in effect(name).kept if key in own} for name, own in known.items()}
+    kept = {name: {key: own[key] for key in effect(name).kept if key in own} for name, own in carried.items()}
     return {name: own for name, own in kept.items() if own}
 
 

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float32]
 
 
+CHANNELS = 4
+"""Red, green, blue, label; features are drawn so many at a time."""
 BLOCK = 4
 """Pixels of the side of a block, see ``Renderer.reached``."""
 
@@ -64,17 +66,24 @@ class Renderer(Protocol):
     """Draws states of one scene, with its background and limits.
 
     Colours are those that the camera sees: gloss is part of a state. ``features`` [N, C], where given, are drawn
-    instead; C is a multiple of 4.
+    instead; C is a multiple of ``CHANNELS``.
     """
 
     def render(
-        self, state: Gaussians, camera: CameraArrays, features: Array | None = None, depth_channel: int = -1
+        self,
+        state: Gaussians,
+        camera: CameraArrays,
+        features: Array | None = None,
+        *,
+        depth_channel: int = -1,
+        background: Array | None = None,
     ) -> Picture:
         """RGB and label of a state as a camera sees it, without the camera's exposure.
 
         Args:
             features: [N, C] drawn instead of RGB and label.
             depth_channel: channel of ``features`` that is filled with the depth of the centres (metres along z).
+            background: [C] float32 behind every Gaussian; None: the scene's, and 0 in further channels.
         """
 
     def compare(self, state: Gaussians, view: TrainingView, features: Array | None = None) -> Comparison:

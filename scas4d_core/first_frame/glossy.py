@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from scas4d_core.effect_names import Mode
 from scas4d_core.effects.effect import effect
 from scas4d_core.effects.evidence import Evidence
-from scas4d_core.effects.registry import Mode
 from scas4d_core.engines.cpu.gloss import GLOSS, Shading
 from scas4d_core.engines.fit import COLOUR, COLUMNS, MEAN, FitLoss, FitScalars
 from scas4d_core.first_frame.fit_schedule import FitProgress

@@ -15,13 +15,6 @@ from scas4d_core.captures.frame import InitialPoints
 from scas4d_core.first_frame.points.agreement import Search, agreed_points
 from scas4d_core.first_frame.points.merging import SPACING
 from scas4d_core.first_frame.points.plane import plane_points
-from scas4d_core.first_frame.points.posed_pictures import (
-    InitialPointsError,
-    PosedPicture,
-    collect_views,
-    look_at_point,
-    pixels_inside,
-)
 from scas4d_core.first_frame.points.silhouettes import backdrop, plain_background, with_silhouettes
 from scas4d_core.first_frame.points.stereo import ITERATIONS
 from scas4d_core.first_frame.points.surroundings import Stage, surroundings
@@ -30,6 +23,13 @@ from scas4d_core.first_frame.points.visual_hull import pixel_at
 from scas4d_core.first_frame.points.volume import shared_volume, stage_distances
 from scas4d_core.first_frame.time_limit import TimeLimit
 from scas4d_core.frame_outcome import COVERS_LITTLE
+from scas4d_core.posed_pictures import (
+    InitialPointsError,
+    PosedPicture,
+    collect_views,
+    look_at_point,
+    pixels_inside,
+)
 
 OnProgress = Callable[[str, int, int], None]
 """Called with a stage, the steps done and the steps in all."""

@@ -21,7 +21,7 @@ from scas4d_core.first_frame.points.stereo import load_stereo
 from scas4d_core.first_frame.static_result import FirstCloud, StaticResult
 from scas4d_core.first_frame.static_scene import first_trainer
 from scas4d_core.first_frame.time_limit import TimeLimit
-from scas4d_core.frame_report import Progress
+from scas4d_core.progress import Progress
 from scas4d_core.robust.checks import axis_lengths
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings
 from scas4d_core.storage.history import History, HistoryError
@@ -68,7 +68,7 @@ def as_begun(settings: Settings, history: History) -> Settings:
     """The settings with the background with which a scene began; as they are where its first frame cannot be read."""
     if settings.scene.background != "auto":
         return settings
-    with suppress(HistoryError, KeyError):
+    with suppress(HistoryError):
         return _over(settings, history.background)
     return settings
 

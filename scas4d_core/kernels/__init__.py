@@ -1,1 +1,1 @@
-"""Fused CPU kernels: flat Numba functions over arrays. Each has a plain-torch twin that tests compare it with."""
+"""Fused CPU kernels: flat Numba functions over arrays. Each is tested against plain torch in ``engines.torch``."""

@@ -1,4 +1,4 @@
-"""Front-to-back blending of tiles, forward and backward. Twin: ``rasterize.twin.render``.
+"""Front-to-back blending of tiles, forward and backward. Reference: ``engines.torch.rasterizer``.
 
 A tile is 8×8 blocks of 4×4 pixels, and a block is one ``Lanes``. For each Gaussian, the blocks that its support meets
 are visited (``tiles.cover``), in the order of their bits.

@@ -1,4 +1,6 @@
-"""The gradients of features alone, where nothing asks for those of places and shapes. Twin: ``rasterize.twin.render``.
+"""The gradients of features alone, where nothing asks for those of places and shapes.
+
+Reference: ``engines.torch.rasterizer``.
 
 A feature's gradient is the incoming gradient summed with the weights that its Gaussian was blended with. These are
 found front to back, as ``blend`` finds them, and what lies behind is not asked for: the bits of ``blend_backward``.

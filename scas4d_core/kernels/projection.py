@@ -1,4 +1,4 @@
-"""EWA projection of Gaussians into a camera, and its backward. Twin: ``rasterize.twin.project``.
+"""EWA projection of Gaussians into a camera, and its backward. Reference: ``engines.torch.rasterizer``.
 
 A camera enters as ``pose`` [3, 4] float32 (world to camera, OpenCV axes) and ``lens`` [6] float32
 (fx, fy, cx, cy, width, height) in pixels; pixel centres at +0.5.

@@ -9,12 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.cameras import Camera, WorldFrame
-from scas4d_core.engines.cpu.gloss import colours_seen
-from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
+from scas4d_core.engines.choose import renderer_of
 from scas4d_core.engines.limits import DEFAULT, Limits
-from scas4d_core.engines.views import CameraArrays
+from scas4d_core.engines.renderer import CHANNELS
+from scas4d_core.engines.views import LABEL, CameraArrays
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.kernels.blend import GROUP
 from scas4d_core.query.tracks import ALPHA_OF_A_SURFACE
 
 Array = NDArray[np.float32]
@@ -64,7 +63,7 @@ class ViewRenderer:
 
     def __init__(self, world: WorldFrame, limits: Limits = DEFAULT) -> None:
         self.world = world
-        self._rasterizer = CpuRasterizer(limits)
+        self._renderer = renderer_of("cpu", (0.0, 0.0, 0.0), limits)
 
     def render(
         self,
@@ -87,34 +86,33 @@ class ViewRenderer:
         """
         inside = self.world.camera_to_inside(camera)
         arrays = CameraArrays.of(inside)
-        shown = colours_seen(gaussians, arrays) if colours is None else colours
-        features = np.concatenate([shown, np.zeros((len(gaussians), 1), np.float32)], axis=1)
-        picture = self._rasterizer.forward(
-            gaussians.means, gaussians.factors, gaussians.opacities, features, arrays,
-            np.array([*background, 0.0], np.float32), depth_channel=3,
-        )  # fmt: skip
+        picture = self._renderer.render(
+            gaussians,
+            arrays,
+            None if colours is None else gaussians.features(colours),
+            depth_channel=LABEL,  # no view shows the label
+            background=np.array([*background, 0.0], np.float32),
+        )
         colour = np.moveaxis(picture.features[:3], 0, -1).copy()
         alpha = 1 - picture.rest
         with np.errstate(invalid="ignore", divide="ignore"):
-            depth = picture.features[3] / alpha / np.float32(self.world.metres_per_unit)
+            depth = picture.features[LABEL] / alpha / np.float32(self.world.metres_per_unit)
         depth[alpha < ALPHA_OF_A_SURFACE] = np.nan
         parts = None if labels is None else self._parts_picture(gaussians, np.asarray(labels), arrays)
         return View(colour, alpha, depth, parts)
 
     def _parts_picture(self, gaussians: Gaussians, labels: NDArray[Any], camera: CameraArrays) -> NDArray[np.uint8]:
-        """[H, W] uint8: the label whose Gaussians weigh most in the pixel, plus 1. A pass renders ``GROUP`` labels."""
+        """[H, W] uint8: the label whose Gaussians weigh most in the pixel, plus 1. A pass has ``CHANNELS`` labels."""
         if labels.shape != (len(gaussians),) or not ((labels >= -1) & (labels <= MOST_LABEL)).all():
             raise ValueError(
                 f"labels {labels.shape} must be [{len(gaussians)}], one a Gaussian, each in -1...{MOST_LABEL}"
             )
         found = np.zeros((camera.height, camera.width), np.uint8)
         most = np.full(found.shape, -1.0, np.float32)
-        black = np.zeros(GROUP, np.float32)
-        for first in range(-1, int(labels.max(initial=-1)) + 1, GROUP):
-            weights = (labels[:, None] == np.arange(first, first + GROUP)).astype(np.float32)
-            picture = self._rasterizer.forward(
-                gaussians.means, gaussians.factors, gaussians.opacities, weights, camera, black
-            )
+        black = np.zeros(CHANNELS, np.float32)
+        for first in range(-1, int(labels.max(initial=-1)) + 1, CHANNELS):
+            weights = (labels[:, None] == np.arange(first, first + CHANNELS)).astype(np.float32)
+            picture = self._renderer.render(gaussians, camera, weights, background=black)
             best = picture.features.max(axis=0)
             wins = best > most
             found[wins] = (first + 1 + picture.features.argmax(axis=0))[wins]

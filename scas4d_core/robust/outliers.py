@@ -126,22 +126,18 @@ class Past:
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Past:
-        """From ``arrays``; from none, where nothing is known.
+        """From ``arrays``.
 
         Raises:
             KeyError, ValueError: some are missing, or do not fit.
         """
-        if not arrays:
-            return cls()
         rows = list(zip(arrays["names"].tolist(), arrays["cameras"].tolist(), strict=True))
         places = {name: place for name, (place, _, _) in rows}
         bright = {name: value for name, (_, value, _) in rows}
         outs = {name: int(out) for name, (_, _, out) in rows}
-        scene: list[float] = arrays["scene"].tolist()
-        scene += [1.0, 0.0, 1.0][len(scene) - 6 :]  # older checkpoints know nothing of the light
-        level, updates, held, fitted, behind, iterations, light, lit, step = scene
+        level, updates, held, fitted, behind, iterations, light, lit, step = arrays["scene"].tolist()
         error = dict(zip(arrays["witnesses"].tolist(), arrays["error"].tolist(), strict=True))
-        last = dict(zip(arrays["shown"].tolist(), arrays["last"].tolist(), strict=True)) if "last" in arrays else {}
+        last = dict(zip(arrays["shown"].tolist(), arrays["last"].tolist(), strict=True))
         watch, timing = _rows(arrays, "watched", "watch"), _rows(arrays, "timed", "timing")
         return cls(
             places, bright, outs, level,
@@ -159,9 +155,7 @@ class Past:
 
 
 def _rows(arrays: Mapping[str, NDArray[Any]], names: str, rows: str) -> dict[str, tuple[float, ...]]:
-    """Figures by camera; none from an older checkpoint, which does not know them."""
-    if rows not in arrays:
-        return {}
+    """Figures by camera."""
     return {name: tuple(row) for name, row in zip(arrays[names].tolist(), arrays[rows].tolist(), strict=True)}
 
 

@@ -1,1 +1,1 @@
-"""Committed states on disk: history, frame files, checkpoint."""
+"""Committed states on disk: history, frame files, chunks."""

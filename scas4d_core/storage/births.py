@@ -122,12 +122,12 @@ def lives_of(events: Int, wanted: Iterable[int], first: int) -> list[Life]:
     Args:
         events: the log. first: the first frame, in which those are born that no event bears.
     """
-    found = []
+    lives = []
     for id in wanted:
         own = events[(events[:, 2] <= id) & (id <= events[:, 3])]
         born, retired, revived = (tuple(own[own[:, 1] == kind, 0].tolist()) for kind in Event)
-        found.append(Life(int(id), born[0] if born else first, retired, revived))
-    return found
+        lives.append(Life(int(id), born[0] if born else first, retired, revived))
+    return lives
 
 
 def grown_roots(roots: Gaussians, state: Gaussians, joins: Int | None) -> Gaussians:
@@ -166,10 +166,10 @@ def grown_roots(roots: Gaussians, state: Gaussians, joins: Int | None) -> Gaussi
 
 
 def _turned(turns: NDArray[Any], vectors: NDArray[Any]) -> NDArray[Any]:
-    found: NDArray[Any] = (turns @ vectors[:, :, None])[:, :, 0]
-    return found
+    turned: NDArray[Any] = (turns @ vectors[:, :, None])[:, :, 0]
+    return turned
 
 
 def _inverse(quaternions: NDArray[Any]) -> NDArray[Any]:
-    found: NDArray[Any] = quaternions * np.array([1, -1, -1, -1])
-    return found
+    conjugates: NDArray[Any] = quaternions * np.array([1, -1, -1, -1])
+    return conjugates

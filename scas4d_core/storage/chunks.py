@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from scas4d_core.compact import CompactReader, FileError
+from scas4d_core.compact import CompactReader, FileError, FormatError
 from scas4d_core.errors import message_of
 from scas4d_core.storage.births import Int
 from scas4d_core.storage.frame_arrays import EVENTS, Arrays, Stamp
@@ -42,7 +42,7 @@ class Chunk:
         path: of it. size, changed: bytes, and time of change in ns, when it was looked at.
         times: seconds of its frames by index. stamps: of its frames: bytes of the file that they take, and −1 less
             the checksum of the state, which no file of a frame of its own has.
-        damage: why frames after those are not listed; None where nothing is wrong.
+        damage: why frames after those are not listed; None where nothing is wrong. foreign: it is of another format.
     """
 
     path: Path
@@ -51,6 +51,7 @@ class Chunk:
     times: dict[int, float] = field(default_factory=dict)
     stamps: dict[int, Stamp] = field(default_factory=dict)
     damage: str | None = None
+    foreign: bool = False
 
     @property
     def first(self) -> int:
@@ -78,10 +79,10 @@ class Chunks:
     def look(self) -> None:
         """Picks up chunks that are new, grew or are gone; others stay unopened."""
         firsts = sorted(first for name in os.listdir(self.directory) if (first := chunk_of(name)) is not None)
-        found = {first: chunk for first in firsts if (chunk := self._looked_at(first)) is not None}
-        for first in self.known.keys() - found.keys():
+        known = {first: chunk for first in firsts if (chunk := self._looked_at(first)) is not None}
+        for first in self.known.keys() - known.keys():
             self._close(self.known[first].path)
-        self.known, self._firsts = found, list(found)
+        self.known, self._firsts = known, list(known)
 
     def look_at(self, first: int) -> None:
         """Picks up the chunk that begins with a frame, which is new or grew."""
@@ -130,6 +131,11 @@ class Chunks:
         """A sentence for each chunk that is damaged so that frames of it are not listed."""
         return [chunk.damage for chunk in self.known.values() if chunk.damage is not None]
 
+    @property
+    def foreign(self) -> list[str]:
+        """A sentence for each chunk of another format."""
+        return [str(chunk.damage) for chunk in self.known.values() if chunk.foreign]
+
     def read(self, index: int, names: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
         """Arrays of a frame, as its own file would have them; ``report`` is its note.
 
@@ -149,24 +155,24 @@ class Chunks:
             return self._read_from(chunk, index, names, optional)
 
     def _read_from(self, chunk: Chunk, index: int, names: Sequence[str], optional: Sequence[str]) -> Arrays:
-        found: Arrays = {}
+        arrays: Arrays = {}
         asked = {*names, *optional}
         if "time" in asked:
-            found["time"] = np.asarray(chunk.times[index], np.float64)
+            arrays["time"] = np.asarray(chunk.times[index], np.float64)
         if asked <= {"time"}:
-            return found
+            return arrays
         reader = self._reader(chunk)
         if "report" in asked:
             text = json.dumps(reader.note(index).get(REPORT, {}))
-            found["report"] = np.frombuffer(text.encode(), np.uint8)
+            arrays["report"] = np.frombuffer(text.encode(), np.uint8)
         if EVENTS in asked and len(log := _log(reader, index)):
-            found[EVENTS] = log
+            arrays[EVENTS] = log
         if asked - {"time", "report", EVENTS}:
-            arrays = reader.state(index).arrays()
-            found |= {name: arrays[name] for name in asked & arrays.keys()}
-        if missing := set(names) - found.keys():
+            state = reader.state(index).arrays()
+            arrays |= {name: state[name] for name in asked & state.keys()}
+        if missing := set(names) - arrays.keys():
             raise FileError(f"{chunk.path.name}: frame {index} has no {', '.join(sorted(missing))}")
-        return found
+        return arrays
 
     def reader(self, index: int) -> CompactReader:
         """An open reader of the chunk that holds a frame; it is this object's own.
@@ -270,7 +276,9 @@ def _listed(path: Path, status: os.stat_result) -> Chunk:
             stamps = {index: (taken, -1 - checksum) for index, taken, checksum in reader.sizes()}
             return Chunk(path, size, changed, times, stamps, reader.damage)
     except (FileError, OSError) as error:
-        return Chunk(path, size, changed, damage=f"{path.name}: {message_of(error)}")
+        return Chunk(
+            path, size, changed, damage=f"{path.name}: {message_of(error)}", foreign=isinstance(error, FormatError)
+        )
 
 
 @contextmanager

@@ -39,13 +39,13 @@ def packed(effects: EffectArrays) -> NDArray[np.uint8] | None:
 
 def unpacked(given: NDArray[np.uint8] | None) -> dict[str, Arrays]:
     """The arrays of effects, by effect and name, that were ``packed``."""
-    found: dict[str, Arrays] = {}
+    effects: dict[str, Arrays] = {}
     if given is not None:
         with np.load(BytesIO(given.tobytes()), allow_pickle=False) as file:
             for name in file.files:
                 effect, _, key = name.partition(".")
-                found.setdefault(effect, {})[key] = file[member(name)]
-    return found
+                effects.setdefault(effect, {})[key] = file[member(name)]
+    return effects
 
 
 def as_written(

@@ -73,14 +73,14 @@ class ScratchFile:
     def get(self, begins: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
         """The array that begins there."""
         assert self._file is not None
-        found = np.empty(shape, dtype)
-        left, at = found.reshape(-1).view(np.uint8).data, begins
+        array = np.empty(shape, dtype)
+        left, at = array.reshape(-1).view(np.uint8).data, begins
         while left:
             count = os.preadv(self._file.fileno(), [left], at)
             if count == 0:
                 raise OSError(f"the scratch file ends at byte {at}")
             left, at = left[count:], at + count
-        return found
+        return array
 
     def free(self, places: Mapping[str, tuple[int, int]]) -> None:
         """Has places, each where it begins and its bytes, used again. Without the lock: a collection may call this."""

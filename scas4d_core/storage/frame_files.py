@@ -20,9 +20,13 @@ import numpy as np
 
 from scas4d_core.compact import FileError
 from scas4d_core.storage.chunks import Chunks
+from scas4d_core.storage.faults import UnreadableFrameError, other_format
 from scas4d_core.storage.frame_arrays import Arrays, Stamp
 from scas4d_core.storage.npz import read_npz, sync_folder, verify, write_npz
 
+FORMAT = 1
+"""Of a folder of states, in ``fixed.npz``; a folder of another format is refused."""
+_FORMAT = "format"
 INDEX = "index"
 """Array in the copy of the first frame: its index."""
 
@@ -30,18 +34,6 @@ FIXED_FILE, FIXED_COPY, FIRST_COPY = "fixed.npz", "fixed.copy.npz", "first.copy.
 _CHECKPOINT_FILE = re.compile(r"checkpoint_(\d{6,})\.npz")
 _FRAME_FILE = re.compile(r"frame_(\d{6,})\.npz")
 _BORN_FILE = re.compile(r"born_(\d{6,})(\.copy)?\.npz")
-
-
-class HistoryError(ValueError):
-    """A history that cannot be extended or read; the message names the frame or file, the fault and the remedy."""
-
-
-class UnreadableFrameError(HistoryError):
-    """A frame that is not in the history, or whose file is damaged."""
-
-
-class DamagedFrameError(UnreadableFrameError):
-    """A frame whose file is damaged, in contrast to one that was deleted."""
 
 
 class FrameFiles:
@@ -73,39 +65,39 @@ class FrameFiles:
 
     def listed(self) -> dict[int, Stamp]:
         """Stamps of the frames in the directory, rising; the first one is listed also where only its copy exists."""
-        found: dict[int, Stamp] = {}
+        stamps: dict[int, Stamp] = {}
         with os.scandir(self.directory) as entries:
             for entry in entries:
                 if (index := frame_of(entry.name)) is None:
                     continue
                 try:
-                    found[index] = _stamp(entry.stat())
+                    stamps[index] = _stamp(entry.stat())
                 except FileNotFoundError:  # deleted, or compacted, meanwhile
                     continue
         self.chunks.look()  # after the files: a frame goes to a chunk before its own file goes
-        found = self.chunks.stamps() | found
+        stamps = self.chunks.stamps() | stamps
         first = self._first()
-        if found and first is not None and first[1] < min(found):
-            found[first[1]] = first[0]
-        return dict(sorted(found.items()))
+        if stamps and first is not None and first[1] < min(stamps):
+            stamps[first[1]] = first[0]
+        return dict(sorted(stamps.items()))
 
     def stamped(self, indices: Iterable[int]) -> dict[int, Stamp]:
         """Stamps of the given frames that exist, without listing the directory."""
-        found: dict[int, Stamp] = {}
+        stamps: dict[int, Stamp] = {}
         absent: list[int] = []
         for index in sorted(indices):
             try:
-                found[index] = _stamp(self.path(index).stat())
+                stamps[index] = _stamp(self.path(index).stat())
             except FileNotFoundError:
                 first = self._first()
                 if first is not None and first[1] == index:
-                    found[index] = first[0]
+                    stamps[index] = first[0]
                 else:
                     absent.append(index)
         if absent:
             self.chunks.look()
-        found |= {index: stamp for index in absent if (stamp := self.chunks.stamp(index)) is not None}
-        return dict(sorted(found.items()))
+        stamps |= {index: stamp for index in absent if (stamp := self.chunks.stamp(index)) is not None}
+        return dict(sorted(stamps.items()))
 
     def _first(self) -> tuple[Stamp, int] | None:
         """Stamp and frame of the copy of the first frame, if there is one that can be read."""
@@ -125,8 +117,8 @@ class FrameFiles:
 
     def write_fixed(self, arrays: Arrays, index: int, first: Mapping[str, Any]) -> None:
         """Writes the arrays that all frames share, and both copies; before the first frame, ``index``, is committed."""
-        write_npz(self.fixed, arrays)
-        write_npz(self.fixed_copy, arrays)
+        write_npz(self.fixed, with_format(arrays))
+        write_npz(self.fixed_copy, with_format(arrays))
         write_npz(self.first_copy, {**first, INDEX: np.int64(index)})
 
     def time(self, index: int, stamp: Stamp | None = None) -> float:
@@ -162,9 +154,9 @@ class FrameFiles:
                 if index in self.chunks:  # it was made again, or not deleted: the other is better than none
                     return self.chunks.read(index, names, optional)
                 raise
-            found = _read(self.first_copy, names, optional)
+            arrays = _read(self.first_copy, names, optional)
             self.faults[self.path(index).name] = _reason(self.path(index), error)
-            return found
+            return arrays
 
     def _from_chunk(self, index: int, names: Sequence[str], optional: Sequence[str]) -> Arrays:
         try:
@@ -178,6 +170,20 @@ class FrameFiles:
         if not self.path(index).exists() and index in self.chunks:
             return self.chunks.fault(index)
         return fault_of(self.path(index))
+
+    def require_format(self) -> None:
+        """Looks at the format of the folder, where a file that names it can be read.
+
+        Raises:
+            OtherFormatError: it is another than ``FORMAT``.
+        """
+        try:
+            known = self._either(self.fixed, self.fixed_copy, (), (_FORMAT,))
+        except UnreadableFrameError:  # reading the states says so
+            return
+        written = int(known[_FORMAT]) if _FORMAT in known else None
+        if written != FORMAT:
+            raise other_format(f"{self.directory.name}, a folder of states,", written, FORMAT)
 
     def read_fixed(self, names: Sequence[str]) -> Arrays:
         """Named arrays of those that all frames share.
@@ -204,14 +210,14 @@ class FrameFiles:
         """Frames with a file of the born, committed or not, rising."""
         return sorted({index for name in os.listdir(self.directory) if (index := born_of(name)) is not None})
 
-    def _either(self, path: Path, copy: Path, names: Sequence[str] | None) -> Arrays:
+    def _either(self, path: Path, copy: Path, names: Sequence[str] | None, optional: Sequence[str] = ()) -> Arrays:
         try:
-            return _read(path, names)
+            return _read(path, names, optional)
         except (FileNotFoundError, UnreadableFrameError) as error:
             reason = _reason(path, error)
             self.faults[path.name] = reason
             try:
-                return _read(copy, names)
+                return _read(copy, names, optional)
             except FileNotFoundError:
                 raise UnreadableFrameError(reason) from error
 
@@ -226,7 +232,7 @@ class FrameFiles:
             The fault of each file that was written, by name. A file without a whole copy is left.
         """
         mended: dict[str, str] = {}
-        needed = {self.fixed: fixed, self.fixed_copy: fixed}
+        needed = dict.fromkeys((self.fixed, self.fixed_copy), with_format(fixed))
         for index, arrays in born.items():
             needed |= {self.directory / born_file(index, copy): arrays for copy in (False, True)}
         for file, arrays in needed.items():
@@ -282,6 +288,11 @@ class FrameFiles:
     def sync(self) -> None:
         """Syncs the directory: deleted files stay deleted after a power cut."""
         sync_folder(self.directory)
+
+
+def with_format(fixed: Arrays) -> Arrays:
+    """The arrays of ``fixed.npz``: those that all frames share, and the format of the folder."""
+    return {**fixed, _FORMAT: np.asarray(FORMAT, np.int64)}
 
 
 def frame_file(index: int) -> str:

@@ -15,14 +15,9 @@ from numpy.typing import NDArray
 
 from scas4d_core.gaussians import FIXED
 from scas4d_core.storage.births import NO_EVENTS, Int
+from scas4d_core.storage.faults import DamagedFrameError, HistoryError, OtherFormatError, UnreadableFrameError
 from scas4d_core.storage.frame_arrays import EFFECTS, EVENTS, Arrays, Stamp, unpacked
-from scas4d_core.storage.frame_files import (
-    DamagedFrameError,
-    FrameFiles,
-    HistoryError,
-    UnreadableFrameError,
-    frame_file,
-)
+from scas4d_core.storage.frame_files import FrameFiles, frame_file
 
 FRAMES_KEPT = 4
 """Frames of a history on disk that stay in memory: the newest, and the last ones read."""
@@ -65,14 +60,18 @@ class FramesReader:
             only: the frames that are read, where these are known; else every file of the directory is looked at.
 
         Raises:
-            HistoryError: no history there, or the file that all frames need is damaged.
+            HistoryError: no history there, or the file that all frames need is damaged. OtherFormatError: the folder,
+                or a compact file in it, is of another format.
         """
         files = FrameFiles(Path(directory))
         if not files.exists:
             raise HistoryError(f"{files.directory.name} holds no history: {files.fixed.name} is missing")
+        files.require_format()
         history = cls()
         history._files = files
         history.refresh(only)
+        if foreign := files.chunks.foreign:
+            raise OtherFormatError("; ".join(foreign))
         if history._stamps:
             history._fixed = files.read_fixed(FIXED)
         return history
@@ -209,10 +208,10 @@ class FramesReader:
             HistoryError: its file is damaged, and the copy as well.
         """
         if self._background is None and self._times:
-            found = self.report(next(iter(self._times))).get("background")
-            if found is None:  # of an earlier version; or the first frame cannot be read, for now
+            given = self.report(next(iter(self._times))).get("background")
+            if given is None:  # its report was lost
                 return 0.0, 0.0, 0.0
-            red, green, blue = found
+            red, green, blue = given
             self._background = (red, green, blue)
         return self._background or (0.0, 0.0, 0.0)
 
@@ -223,11 +222,11 @@ class FramesReader:
     def _left(self, index: int) -> NDArray[np.uint8] | None:
         """The same, packed; None: nothing."""
         self._require(index)
-        found = self._packed.get(index)
-        if found is None and self._files is not None:
+        left = self._packed.get(index)
+        if left is None and self._files is not None:
             with suppress(FileNotFoundError, UnreadableFrameError):  # the state may be whole all the same
-                found = self._files.read(index, (), (EFFECTS,)).get(EFFECTS)
-        return found
+                left = self._files.read(index, (), (EFFECTS,)).get(EFFECTS)
+        return left
 
     def _events(self) -> Int:
         """[E, 4] the log of the newest frame that can be read."""

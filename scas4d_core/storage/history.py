@@ -21,9 +21,10 @@ from numpy.typing import NDArray
 
 from scas4d_core.gaussians import FIXED, PER_FRAME, UNBORN, WHOLES, Gaussians
 from scas4d_core.storage.births import FOUNDERLESS, Event, Int, births_in, events_of, retired_after
+from scas4d_core.storage.faults import DamagedFrameError, HistoryError, UnreadableFrameError
 from scas4d_core.storage.frame_arrays import Arrays, EffectArrays, as_written, packed
 from scas4d_core.storage.frame_aside import IN_MEMORY, ScratchFile
-from scas4d_core.storage.frame_files import DamagedFrameError, FrameFiles, HistoryError, UnreadableFrameError
+from scas4d_core.storage.frame_files import FrameFiles
 from scas4d_core.storage.frames_reader import FRAMES_KEPT
 from scas4d_core.storage.history_reader import ROOT, ROOTS, HistoryReader
 from scas4d_core.storage.npz import clear_parts
@@ -63,7 +64,7 @@ class History(HistoryReader):
            [0., 0., 3.]], dtype=float32)
     >>> history.append(1, 0.2, state)
     Traceback (most recent call last):
-    scas4d_core.storage.frame_files.HistoryError: frame 1 comes after frame 1; append frames in rising order
+    scas4d_core.storage.faults.HistoryError: frame 1 comes after frame 1; append frames in rising order
     """
 
     def __init__(self, directory: Path | str | None = None) -> None:
@@ -84,8 +85,9 @@ class History(HistoryReader):
         """
         folder = Path(directory)
         folder.mkdir(parents=True, exist_ok=True)
+        history = cls.load(folder) if FrameFiles(folder).exists else cls(folder)
         clear_parts(folder)
-        return cls.load(folder) if FrameFiles(folder).exists else cls(folder)
+        return history
 
     def save(self, directory: Path | str) -> None:
         """Writes a copy of this history into another directory, one frame at a time."""

@@ -21,7 +21,7 @@ from scas4d_core.storage.births import (
     revived_in,
     rows_among,
 )
-from scas4d_core.storage.frame_files import DamagedFrameError, HistoryError, UnreadableFrameError
+from scas4d_core.storage.faults import DamagedFrameError, HistoryError, UnreadableFrameError
 from scas4d_core.storage.frames_reader import FramesReader
 
 ROOT = "root."
@@ -227,7 +227,7 @@ def _taken(array: NDArray[Any], rows: NDArray[np.intp]) -> NDArray[Any]:
     """Rows of an array, any shape; NaN for those that it does not have."""
     if not rows.size or int(rows.max()) < len(array):
         return array[rows]
-    found = np.full((*rows.shape, *array.shape[1:]), np.nan, array.dtype)
+    taken = np.full((*rows.shape, *array.shape[1:]), np.nan, array.dtype)
     inside = rows < len(array)
-    found[inside] = array[rows[inside]]
-    return found
+    taken[inside] = array[rows[inside]]
+    return taken

@@ -2,7 +2,7 @@
 
 The comment of the zip holds a BLAKE2b of 128 bits for every array, over its type, shape and values. The zip's own
 CRC-32 is not enough: a flipped bit in the header of an array can make numpy read fewer bytes than there are, and then
-the CRC is never compared. Files of earlier versions have no comment and are read with the CRC alone.
+the CRC is never compared. A file without these checksums is refused.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def _comment(checksums: Mapping[str, str]) -> bytes:
         comment = json.dumps({"blake2b": short}, separators=(",", ":")).encode()
         if len(comment) <= zipfile.ZIP_MAX_COMMENT:
             return comment
-    return b""  # the CRC alone is left
+    raise ValueError(f"{len(checksums)} arrays are too many for one file: their checksums do not fit in its comment")
 
 
 def _digest(array: NDArray[Any]) -> str:
@@ -101,15 +101,15 @@ def _begun(dtype: np.dtype[Any], shape: tuple[int, ...]) -> hashlib.blake2b:
     return hashlib.blake2b(f"{dtype.str} {tuple(shape)}".encode(), digest_size=DIGEST)
 
 
-def _checksums(archive: zipfile.ZipFile) -> dict[str, str] | None:
-    """Checksums by array; None in a file of an earlier version."""
+def _checksums(archive: zipfile.ZipFile) -> dict[str, str]:
+    """Checksums by array."""
     if not archive.comment:
-        return None
-    found: dict[str, str] = json.loads(archive.comment)["blake2b"]
+        raise ValueError("it has no checksums")
+    kept: dict[str, str] = json.loads(archive.comment)["blake2b"]
     names = {name.removesuffix(".npy") for name in archive.namelist()}
-    if names != found.keys():
+    if names != kept.keys():
         raise ValueError("its arrays are not those that were written")
-    return found
+    return kept
 
 
 def sync_folder(folder: Path) -> None:
@@ -152,12 +152,11 @@ def read_npz(path: Path, names: Sequence[str] | None = None, optional: Sequence[
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             checksums = _checksums(file.zip)
             wanted = file.files if names is None else [*names, *(name for name in optional if name in file.files)]
-            found = {name: np.asarray(file[member(name)]) for name in wanted}
-            if checksums is not None:
-                for name, array in found.items():
-                    if not _agrees(checksums[name], _digest(array)):
-                        raise ValueError(f"{name} fails its checksum")
-            return found
+            arrays = {name: np.asarray(file[member(name)]) for name in wanted}
+            for name, array in arrays.items():
+                if not _agrees(checksums[name], _digest(array)):
+                    raise ValueError(f"{name} fails its checksum")
+            return arrays
     except FileNotFoundError:
         raise
     except DAMAGE as error:
@@ -178,7 +177,7 @@ def verified(path: Path) -> Iterator[int]:
                 with archive.open(member) as file:
                     digest = yield from _streamed(file)
                 name = member.filename.removesuffix(".npy")
-                if checksums is not None and not _agrees(checksums[name], digest):
+                if not _agrees(checksums[name], digest):
                     raise ValueError(f"{name} fails its checksum")
     except FileNotFoundError:
         raise

@@ -33,13 +33,13 @@ def surplus(
     candidates = indices[1 : len(indices) - newest]
     most = 0 if last is None else max(0, len(indices) - 1 - last)
     excess = 0 if size_bytes is None else sum(map(size_of, indices)) - size_bytes
-    found: list[int] = []
+    deleted: list[int] = []
     for group in _groups(candidates, go_with):
-        if len(found) + len(group) > most and excess <= 0:
+        if len(deleted) + len(group) > most and excess <= 0:
             break
         excess -= sum(map(size_of, group))
-        found += group
-    return sorted(found)
+        deleted += group
+    return sorted(deleted)
 
 
 def _groups(candidates: Sequence[int], go_with: GoWith | None) -> Iterator[list[int]]:

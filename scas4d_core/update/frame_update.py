@@ -42,7 +42,7 @@ class FrameUpdate:
         neighbours: of the moving Gaussians; None: no term needs them.
 
     Attributes:
-        hierarchy: of the moving Gaussians.
+        plan: of its updates. hierarchy: of the moving Gaussians.
         curve: whether loss terms that the report alone needs are computed; state and evidence are the same without.
 
     Raises:
@@ -53,10 +53,10 @@ class FrameUpdate:
 
     def __init__(self, engine: UpdateEngine, built: PlanBuilder, neighbours: Neighbours | None) -> None:
         self.settings, self.hierarchy = built.update, built.hierarchy
-        self._engine, self._plan, self._parts, self._factory = engine, built.plan, built.parts, built.factory
+        self._engine, self.plan, self._parts, self._factory = engine, built.plan, built.parts, built.factory
         rates = Rates.of(self.settings, len(self.hierarchy.sizes), self._factory.rig.reach)
-        self._rates = rates.freed(self._plan.freedom)
-        engine.bind(self._plan, structure_of(self.hierarchy, neighbours, built.first))
+        self._rates = rates.freed(self.plan.freedom)
+        engine.bind(self.plan, structure_of(self.hierarchy, neighbours, built.first))
 
     def run(
         self,
@@ -76,7 +76,7 @@ class FrameUpdate:
             options: of this attempt. carried: arrays that the effects left, by effect.
         """
         settings, engine = self.settings, self._engine
-        motion = predicted(motion, self._plan.freedom)
+        motion = predicted(motion, self.plan.freedom)
         stopping = options.stopping or Stopping(settings.iterations)
         rng = np.random.default_rng([settings.seed, seed])
         watch, trace = Stopwatch(), UpdateTrace()
@@ -93,7 +93,7 @@ class FrameUpdate:
             part.begin(attempt)
         engine.set_tables(attempt.tables)
         engine.begin(self._start(rates, samples, attempt.gains, watch))
-        if not self._plan.always_updates and best.stands(options.enough, options.confirm):
+        if not self.plan.always_updates and best.stands(options.enough, options.confirm):
             stopping = Stopping(0)
         watch.lap("start")
         rendered: set[int] = set()
@@ -144,7 +144,7 @@ class FrameUpdate:
     def _start(
         self, rates: Rates, samples: Sequence[NDArray[np.int64]], gains: Array | None, watch: Stopwatch
     ) -> AttemptStart:
-        moving, standing = rates.of_colours(self._plan.colours)
+        moving, standing = rates.of_colours(self.plan.colours)
         return AttemptStart(
             layers=rates.layers, position=rates.position, rotation=rates.rotation, scale=rates.scale,
             colour=moving, colour_standing=standing, beta1=rates.beta1, beta2=rates.beta2,
@@ -158,8 +158,8 @@ class FrameUpdate:
             planned: iterations in all. fade: the same as it was planned one iteration before.
             samples: number of samples of neighbourhoods.
         """
-        rigidity = self._plan.rigidity
-        if self._plan.rigidity_fades:  # at the end of an update positions are better known than turns
+        rigidity = self.plan.rigidity
+        if self.plan.rigidity_fades:  # at the end of an update positions are better known than turns
             rigidity *= 0.5 * (1 + cos(pi * min(1.0, iteration / fade)))
         return StepScalars(
             resting=rates.resting(iteration, planned),
@@ -178,7 +178,7 @@ class FrameUpdate:
 
     def _exposed(self, views: Sequence[TrainingView]) -> Sequence[TrainingView]:
         """The views with the exposures that their cameras have now."""
-        if not self._plan.camera_gains:
+        if not self.plan.camera_gains:
             return views
         exposures = self._engine.exposures()
         return [replace(view, exposure=exposures[view.name]) for view in views]

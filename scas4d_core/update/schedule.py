@@ -207,6 +207,11 @@ class TimeBudget:
         """The moment by which fits of what is born have to be over; None: no limit."""
         return None if self.milliseconds is None else began + self.milliseconds / 1000 - self.after
 
+    def saw_births(self, spent: float, put_off: Sequence[str]) -> None:
+        """Take how long fits of what was born took, and which of them there was no time for."""
+        kept = self.births  # time that was kept and was too short is not kept again
+        self.births = bool(spent or put_off) and not (kept and put_off)
+
     def learn(self, moments: Sequence[float], seconds: Mapping[str, float], commit: float) -> None:
         """Take how long a frame took.
 

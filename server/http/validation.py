@@ -133,8 +133,6 @@ def _remedy(error: Mapping[str, Any], field: str, known: list[str], schema: str)
         return f"{meant}leave it out, or take one of {', '.join(known)}" if known else f"leave it out; {schema}"
     if bounds := [f"{words} {context[bound]:g}" for bound, words in BOUNDS.items() if bound in context]:
         return f"give a number {' and '.join(bounds)}"
-    if kind == "constant":
-        return str(context["remedy"])
     if kind in ("literal_error", "enum"):
         return f"give one of {context['expected']}"
     if kind == "union_tag_invalid":

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from client.wire import FrameReportModel
-from scas4d_core.frame_outcome import outcome_of
 
 WIRE_NAMES = {"used": "used_cameras", "dropped": "dropped_cameras", "attempts": "tries", "held": "held_gaussians"}
 """Fields of a commit's record with another name on the wire; all others have the same (a test checks that)."""
@@ -18,7 +17,6 @@ def committed_fields(record: Mapping[str, Any]) -> dict[str, Any]:
     """Fields of the report on the wire from the record of a commit (`scas4d_core.frame_report.FrameReport.record`)."""
     sent = {WIRE_NAMES.get(name, name): value for name, value in record.items() if name not in NOT_SENT}
     found = {name: sent[name] for name in FrameReportModel.model_fields if sent.get(name) is not None}
-    found["outcome"] = outcome_of(record)  # records of earlier versions have it in words alone
     seconds = {name: float(value) for name, value in found.get("seconds", {}).items()}
     if "report" in seconds:  # the report before this one was published after its commit
         seconds["report"] += record.get("publish_seconds") or 0.0

@@ -120,7 +120,7 @@ def _watched(capture: Capture, variant: Variant, out: Path, updates: int) -> lis
                 )
                 curve[done] = _psnr(reconstruction, capture, now, true)
 
-        updater = reconstruction._updater
+        updater = reconstruction._prepared.updater
         updater._picture = WatchedPictures(updater._picture, look)
         reconstruction.step(capture.frame(index))
         updater._picture = updater._picture._inner

@@ -18,9 +18,8 @@ from typing import Any
 from client.cli.evaluate import Job, Report, recorded
 from client.cli.scores import Row, Store
 from scas4d_core.presets import PRESETS
-from scas4d_core.settings import Settings, UpdateSettings
+from scas4d_core.settings import Settings
 from studies.quality.quality import run_jobs
-from studies.quality.runs import completed
 from studies.quality.settings import settings_of
 
 METHODS = ("scas4d", "dynamic3dgs")
@@ -101,7 +100,7 @@ AXES: Mapping[str, tuple[Variant, ...]] = {
     "gaussians": tuple(
         _changed(f"{count:,} Gaussians", "static.max_gaussians", count) for count in (6_000, 12_000, 40_000)
     ),
-    "max-scale": (Variant("max_scale 2 m", constants=((UpdateSettings.constants["max_scale"].place, 2.0),)),),
+    "max-scale": (Variant("max_scale 2 m", constants=(("scas4d_core.engines.cpu.deformation.MAX_SCALE", 2.0),)),),
     "covariance": (_changed("separate covariance", "update.covariance", "separate", "update.own_start=0"),),
     "seeds": tuple(
         Variant(f"{name} {DEFAULT_ITERATIONS}, seed {seed}", name, seed=seed) for name in METHODS for seed in SEEDS[1:]
@@ -187,7 +186,6 @@ def row_of(rows: Iterable[Row], variant: Variant, capture: str, updates: int) ->
             continue
         given = row["given"]
         frames = row["capture_frames"] if variant.whole else min(updates + 1, row["capture_frames"])
-        filled = completed(row["settings"], settings)
-        if given == {"frames": frames, "masks": True, "points": True} and filled == settings:
+        if given == {"frames": frames, "masks": True, "points": True} and row["settings"] == settings:
             return row
     return None

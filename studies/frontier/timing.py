@@ -27,7 +27,6 @@ from scas4d_core.warm_up import warm_up_elsewhere
 from studies.constants import all_varied
 from studies.frontier.frontier import Variant
 from studies.machine import core_version, machine
-from studies.quality.runs import completed
 
 ROUNDS = 5
 """That are counted."""
@@ -146,7 +145,7 @@ def time_of(times: Row | None, variant: Variant) -> Row | None:
     """The entry of a setting, whatever its seeds; None where it was not timed."""
     today = variant.record
     for entry in times["settings"] if times else ():
-        if _unseeded(completed(entry["settings"], today)) == _unseeded(today):
+        if _unseeded(entry["settings"]) == _unseeded(today):
             found: Row = entry
             return found
     return None

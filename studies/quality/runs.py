@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from client.cli.evaluate import Job, Report
 from client.cli.scores import Row, Store
 from scas4d_core.presets import preset
-from scas4d_core.settings import Constant, LayerRates, Settings, StaticSettings, UpdateSettings, Weights
+from scas4d_core.settings import Settings
 from studies.quality.quality import OBJECT_CAPTURES, run_jobs
 from studies.quality.settings import settings_of
 
@@ -19,15 +18,6 @@ CAPTURES = (*OBJECT_CAPTURES, "stage", "basketball")
 
 CAPTURE_CHANGES: Mapping[str, tuple[str, ...]] = {}
 """What a scene itself asks for in every run of it (its budget of Gaussians, its floor), never what tunes a method."""
-
-LATER: Mapping[str, Mapping[str, Any]] = {
-    "static": {"stop_gain": 0.0, "seconds": None, "refine_calibration": False, "detail": 1.0},
-    "update": {"budget_ms": None, "stop_gain": 0.0, "cold_longer": 1.0, "views": 1, "covariance": "entangled"},
-}
-"""Settings that rows measured before do not name, by group, with the value that they had in effect."""
-
-IDLE = {"update": ("still", "judge", "patience")}
-"""Settings that rows measured before do not name and that change nothing on captures without faults: taken as today."""
 
 OTHER_MAP = "published" if preset("scas4d").update.cluster_map == "centred" else "centred"
 """The cluster map that is not the default."""
@@ -130,50 +120,8 @@ def measure_runs(
     return run_jobs(jobs, out, again=again, report=report)
 
 
-FORMER: Mapping[tuple[str, ...], Mapping[str, Constant]] = {
-    ("static",): StaticSettings.constants,
-    ("update",): UpdateSettings.constants,
-    ("update", "weights"): Weights.constants,
-    ("update", "layer_rates"): LayerRates.constants,
-}
-"""Settings that rows measured before name and that are constants today, by group."""
-
-
 FIRST_FRAME = "scas4d_core.first_frame."
 """The room of the constants that frame 0 depends on."""
-
-
-def completed(settings: Mapping[str, Any], today: Mapping[str, Any]) -> dict[str, Any]:
-    """A row's settings as a row of today would have them. ``today``: those of its run.
-
-    Settings that came later have the value that leaves all as it was. Former settings are left out; one that had
-    another value than its constant has stands among the row's ``constants``.
-    """
-    told = {
-        group: {**LATER.get(group, {}), **{name: today[group][name] for name in IDLE.get(group, ())}, **given}
-        if isinstance(given, dict)
-        else given
-        for group, given in settings.items()
-    }
-    varied = dict(told.get("constants", {}))
-    for path, constants in FORMER.items():
-        for inner in _copied(told, path):
-            for name, constant in constants.items():
-                value = inner.pop(name, constant.value)
-                if (tuple(value) if isinstance(value, list) else value) != constant.value:
-                    varied[constant.place or ".".join([*path, name])] = value
-    return told | ({"constants": varied} if varied else {})
-
-
-def _copied(told: dict[str, Any], path: Sequence[str]) -> list[dict[str, Any]]:
-    """The group at a path of a row's settings, copied into ``told`` with those above it; several where it is a list."""
-    inner = told
-    for group in path:
-        if isinstance(given := inner.get(group, {}), list):
-            inner[group] = layers = [dict(layer) for layer in given]
-            return layers
-        inner[group] = inner = dict(given)
-    return [inner]
 
 
 def measured_runs(store: Store) -> dict[tuple[str, str], Row]:
@@ -191,9 +139,9 @@ def measured_runs(store: Store) -> dict[tuple[str, str], Row]:
             for row in rows:
                 given = row["given"]
                 withheld = (given["masks"], given["points"])
-                filled = completed(row["settings"], settings)
-                same = all(filled.get(group) == settings[group] for group in groups)
-                varied = filled.get("constants", ())
+                measured = row["settings"]
+                same = all(measured.get(group) == settings[group] for group in groups)
+                varied = measured.get("constants", ())
                 same &= not any(run.frames != 1 or place.startswith(FIRST_FRAME) for place in varied)
                 if row["capture"] != capture or not same or withheld != (run.masks, run.points):
                     continue

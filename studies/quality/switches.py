@@ -15,8 +15,8 @@ from client.cli.scores import Column, Row, digest, kept_row, markdown
 from client.importers.open_source import open_source
 from scas4d_core.captures import Capture
 from scas4d_core.captures.frame import Frame
+from scas4d_core.effect_names import EFFECTS
 from scas4d_core.effects.effect import effect
-from scas4d_core.effects.registry import EFFECTS
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from studies.machine import core_version, machine

@@ -21,8 +21,8 @@ from scas4d_core.cameras import Camera, Rig
 from scas4d_core.first_frame.calibration.matches import Matches, matches_by_appearance
 from scas4d_core.first_frame.calibration.refine import refined_rig
 from scas4d_core.first_frame.calibration.residuals import residuals
-from scas4d_core.first_frame.points.posed_pictures import collect_views
 from scas4d_core.metrics.evaluation import measure_pictures
+from scas4d_core.posed_pictures import collect_views
 from scas4d_core.reconstruction import Reconstruction
 from studies.machine import core_version, machine
 from studies.quality.settings import settings_of

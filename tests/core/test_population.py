@@ -77,11 +77,11 @@ def assert_same(one: History, other: History) -> None:
 
 def test_they_come_and_go(populated: None) -> None:
     scene = start(History(), masks=True)
-    rows = [len(scene._updater.hierarchy.rows)]
+    rows = [len(scene._prepared.updater.hierarchy.rows)]
     reports = []
     for frame in FRAMES[True][1:]:
         reports.append(scene.step(frame))
-        rows.append(len(scene._updater.hierarchy.rows))
+        rows.append(len(scene._prepared.updater.hierarchy.rows))
     assert [(r.born, r.retired, r.revived) for r in reports] == [(0, 0, 0), (4, 0, 0), (2, 4, 0), (0, 1, 0), (0, 0, 2)]
     assert [r.gaussians for r in reports] == [COUNT, COUNT + 4, COUNT + 2, COUNT + 1, COUNT + 3]
     assert rows == [MOVING, MOVING, MOVING + 3, MOVING + 2, MOVING + 1, MOVING + 3]
@@ -96,14 +96,14 @@ def test_they_come_and_go(populated: None) -> None:
     born = history.gaussians(2).means[COUNT], history.gaussians(3).means[COUNT]
     assert np.linalg.norm(born[1] - born[0]) > 1e-3
     assert not any(history.report(index)["cold"] for index in (3, 4, 5))  # the motion went over to the new clusters
-    carried = scene._carried.effects[NAME]
+    carried = scene._prepared.carried.effects[NAME]
     assert len(carried["rows"]) == COUNT + 6
     assert carried["seen"].shape == ()
 
 
 def test_what_effects_carry_is_lengthened_by_the_founders(populated: None) -> None:
     scene = go_on(start(History(), masks=True), FRAMES[True][:3])
-    assert scene._carried.effects[NAME]["rows"][-4:].tolist() == [3, 0, 3, COUNT - 1]
+    assert scene._prepared.carried.effects[NAME]["rows"][-4:].tolist() == [3, 0, 3, COUNT - 1]
 
 
 @pytest.mark.parametrize("masks", [True, False])
@@ -114,8 +114,8 @@ def test_resumed_after_any_frame_it_goes_on_with_the_same_bits(populated: None, 
         whole.step(frame)
         shutil.copytree(tmp_path / "live", tmp_path / f"after {frame.index}")
     if not masks:
-        assert whole._carried.labels is not None
-        assert len(whole._carried.labels) == COUNT + 6
+        assert whole._prepared.carried.labels is not None
+        assert len(whole._prepared.carried.labels) == COUNT + 6
     for index in range(2, len(frames) - 1):
         folder = shutil.copytree(tmp_path / f"after {index}", tmp_path / f"again {index}")
         scene = Reconstruction.resume(RIG, SETTINGS, History.open(folder))
@@ -246,7 +246,7 @@ def test_births_have_their_time_in_the_budget(monkeypatch: pytest.MonkeyPatch) -
 def test_the_motion_between_two_states_goes_on_in_other_clusters(monkeypatch: pytest.MonkeyPatch) -> None:
     """A body that turns and shifts alike from frame to frame: the start of the next frame is where it will be."""
     scene = start(History(), masks=True)
-    hierarchy, deformation = scene._updater.hierarchy, scene._updater._deformation  # type: ignore[attr-defined]
+    hierarchy, deformation = scene._prepared.updater.hierarchy, scene._prepared.updater._deformation  # type: ignore[attr-defined]
     turn, shift = Rotation.from_rotvec([0.02, 0.05, -0.01]), np.array([0.02, -0.01, 0.015])
 
     def after(steps: int) -> np.ndarray:

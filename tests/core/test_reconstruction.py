@@ -288,13 +288,13 @@ def test_masks_that_weigh_nothing_or_are_not_used_are_not_rendered(monkeypatch: 
     bare = replace(FRAMES[1], masks={})
     for scene in scenes:
         seen: list[int] = []
-        run = scene._updater.run  # type: ignore[union-attr]
+        run = scene._prepared.updater.run  # type: ignore[union-attr]
 
         def spy(previous, views, *rest, run=run, seen=seen):  # type: ignore[no-untyped-def]
             seen.extend(len(view.target) for view in views)
             return run(previous, views, *rest)
 
-        monkeypatch.setattr(scene._updater, "run", spy)
+        monkeypatch.setattr(scene._prepared.updater, "run", spy)
         assert scene.step(FRAMES[1]).loss == start(shortened()).step(bare).loss
         assert set(seen) == {3}
 

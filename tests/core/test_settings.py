@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
 import re
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import pytest
 from pydantic import BaseModel, ValidationError
@@ -89,7 +87,7 @@ def test_an_unknown_preset_names_those_there_are() -> None:
         {"update": {"weights": {"image": 0}}},
         {"update": {"weights": {"rigidity": -1}}},
         {"update": {"rate_position": float("nan")}},
-        {"update": {"neighbour_falloff": float("inf")}},
+        {"update": {"max_scale": 0.02}},  # a constant of the method is no setting
         {"update": {"weights": {"mask": float("inf")}}},
         {"update": {"clusters": (64, 32)}},
         {"update": {"clusters": (0, 32)}},
@@ -117,50 +115,9 @@ def test_right_values_are_taken() -> None:
     assert read.scene.metres_per_unit == "auto"
 
 
-class Former(module.SettingsModel):
-    constants: ClassVar[Mapping[str, module.Constant]] = {
-        "length": module.Constant(0.02, "here.LENGTH"),
-        "starts": module.Constant((0.0, 0.2), "here.STARTS"),
-    }
-    kept: int = 1
-
-
-class Nested(module.SettingsModel):
-    inner: Former = Former()
-
-
-@pytest.mark.parametrize("given", [{}, {"length": 0.02}, {"starts": [0, 0.2]}, {"starts": (0.0, 0.2), "length": 0.02}])
-def test_a_former_setting_is_taken_at_the_value_of_its_constant_and_dropped(given: dict[str, Any]) -> None:
-    assert Nested.model_validate({"inner": {**given, "kept": 2}}) == Nested(inner=Former(kept=2))
-    assert "length" not in Nested.model_validate({"inner": given}).model_dump()["inner"]
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "said"),
-    [
-        ("length", 2.0, "length cannot be 2.0: it is no setting any more, it is the constant here.LENGTH = 0.02 now"),
-        ("length", True, "length cannot be True"),
-        ("starts", [0.0, 0.3], r"starts cannot be \[0.0, 0.3\]: .* here.STARTS = \[0.0, 0.2\] now"),
-    ],
-)
-def test_a_former_setting_with_another_value_is_refused_by_name(name: str, value: object, said: str) -> None:
-    with pytest.raises(ValidationError, match=said) as refused:
-        Nested.model_validate({"inner": {name: value, "other": 1}})
-    assert refused.value.errors()[0]["loc"] == ("inner", name)
-    assert refused.value.errors()[0]["type"] == "constant"
-
-
-CONSTANTS = [(model, name) for model in (module.SettingsModel, *models()) for name in model.constants]
-
-
-@pytest.mark.parametrize(("model", "name"), CONSTANTS, ids=lambda v: v if isinstance(v, str) else v.__name__)
-def test_the_constant_of_a_former_setting_is_where_it_is_said_to_be(
-    model: type[module.SettingsModel], name: str
-) -> None:
-    constant = model.constants[name]
-    assert name not in model.model_fields
-    owner, _, attribute = constant.place.rpartition(".")
-    assert not owner or getattr(importlib.import_module(owner), attribute) == constant.value
+def test_a_constant_of_the_method_is_refused_as_an_unknown_setting() -> None:
+    with pytest.raises(SettingError, match=r"update\.max_scale=0\.02: there is no setting of this name"):
+        preset("scas4d", {"update": {"max_scale": 0.02}})
 
 
 def test_changes_go_over_the_preset_later_ones_over_earlier_ones() -> None:

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from scas4d_core.settings import UpdateSettings
 from scas4d_core.update import deformation
 from studies.constants import all_varied, varied
 
 
 def test_a_constant_has_another_value_for_a_while() -> None:
-    place, usual = UpdateSettings.constants["max_scale"].place, deformation.MAX_SCALE
+    place, usual = "scas4d_core.engines.cpu.deformation.MAX_SCALE", deformation.MAX_SCALE
     with varied(place, 2.0):
         assert deformation.MAX_SCALE == 2.0
     assert usual == deformation.MAX_SCALE

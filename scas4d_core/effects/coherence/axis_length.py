@@ -1,4 +1,7 @@
-"""Limit of the axes' lengths (paper, scale loss). Kernel: ``kernels.deltas``; twin: ``losses.scale_loss``."""
+"""Limit of the axes' lengths (paper, scale loss).
+
+Kernel: ``kernels.deltas``; reference: ``engines.torch.losses.scale_loss``.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Isometry of neighbours (Dynamic3DGaussians). Kernel: ``kernels.neighbour_terms``; twin: ``losses.isometry_loss``."""
+"""Isometry of neighbours (Dynamic3DGaussians).
+
+Kernel: ``kernels.neighbour_terms``; reference: ``engines.torch.losses.isometry_loss``.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Rigidity of neighbours (Dynamic3DGaussians). Kernel: ``kernels.neighbour_terms``; twin: ``losses.rigidity_loss``."""
+"""Rigidity of neighbours (Dynamic3DGaussians).
+
+Kernel: ``kernels.neighbour_terms``; reference: ``engines.torch.losses.rigidity_loss``.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Rotation of neighbours (Dynamic3DGaussians). Kernel: ``kernels.neighbour_terms``; twin: ``losses.rotation_loss``."""
+"""Rotation of neighbours (Dynamic3DGaussians).
+
+Kernel: ``kernels.neighbour_terms``; reference: ``engines.torch.losses.rotation_loss``.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Rotation of clusters, r (paper, equation 6). Kernel: ``kernels.cascade``; twin: ``torch_backend.deformation``."""
+"""Rotation of clusters, r (paper, equation 6).
+
+Kernel: ``kernels.cascade``; reference: ``engines.torch.deformation``.
+"""
 
 from __future__ import annotations
 

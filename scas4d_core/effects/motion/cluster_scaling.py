@@ -1,6 +1,6 @@
 """Position-dependent scaling of clusters, c and s (paper, equation 6).
 
-Kernel: ``kernels.cascade``; twin: ``torch_backend.deformation``.
+Kernel: ``kernels.cascade``; reference: ``engines.torch.deformation``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Translation of clusters, t (paper, equation 6). Kernel: ``kernels.cascade``; twin: ``torch_backend.deformation``."""
+"""Translation of clusters, t (paper, equation 6).
+
+Kernel: ``kernels.cascade``; reference: ``engines.torch.deformation``.
+"""
 
 from __future__ import annotations
 

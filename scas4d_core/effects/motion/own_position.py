@@ -1,4 +1,4 @@
-"""Δp of each Gaussian (paper, equation 7). Kernel: ``kernels.deltas``; twin: ``torch_backend.deformation``."""
+"""Δp of each Gaussian (paper, equation 7). Kernel: ``kernels.deltas``; reference: ``engines.torch.deformation``."""
 
 from __future__ import annotations
 

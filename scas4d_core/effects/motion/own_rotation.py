@@ -1,4 +1,4 @@
-"""ΔR of each Gaussian (paper, equation 7). Kernel: ``kernels.deltas``; twin: ``torch_backend.deformation``."""
+"""ΔR of each Gaussian (paper, equation 7). Kernel: ``kernels.deltas``; reference: ``engines.torch.deformation``."""
 
 from __future__ import annotations
 

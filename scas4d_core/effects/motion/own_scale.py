@@ -1,4 +1,4 @@
-"""Δs of each Gaussian (paper, equation 7). Kernel: ``kernels.deltas``; twin: ``torch_backend.deformation``."""
+"""Δs of each Gaussian (paper, equation 7). Kernel: ``kernels.deltas``; reference: ``engines.torch.deformation``."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, distance_transform_edt, label
 
-from scas4d_core.first_frame.points.posed_pictures import front_depth, look_at_point, pixels_inside
+from scas4d_core.posed_pictures import front_depth, look_at_point, pixels_inside
 
 if TYPE_CHECKING:
     from scas4d_core.effects.presence.novelty import Novelty

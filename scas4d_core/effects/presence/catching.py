@@ -59,7 +59,7 @@ class Catching(Part):
 def _gone(state: Gaussians, arrays: Arrays, number: int) -> Float:
     """[3] metres that a young thing has gone since its frame: an attempt may start from where another ended."""
     rows = arrays["young"][arrays["thing"] == number]
-    if not len(rows) or "places" not in arrays:  # as an earlier version left them
+    if not len(rows):
         return np.zeros(3)
     gone: Float = state.means[rows].mean(axis=0) - arrays["places"][number]
     return gone

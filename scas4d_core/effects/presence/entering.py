@@ -16,7 +16,7 @@ from scas4d_core.effects.presence.carving import Hull, carve_new, footprint
 from scas4d_core.effects.presence.catching import Catching
 from scas4d_core.effects.presence.novelty import Novelty, glance, said
 from scas4d_core.effects.presence.returning import returned, revived
-from scas4d_core.first_frame.points.posed_pictures import pixels_inside
+from scas4d_core.posed_pictures import pixels_inside
 from scas4d_core.update.parts import Arrays
 
 if TYPE_CHECKING:

@@ -1,4 +1,7 @@
-"""The mask term: rendered labels look like the masks. Kernel: ``kernels.image_loss``; twin: ``losses.image_loss``."""
+"""The mask term: rendered labels look like the masks.
+
+Kernel: ``kernels.image_loss``; reference: ``engines.torch.losses.image_loss``.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Labels of what moves, learnt from changed pixels where no masks are given; all else is a background that stands.
 
-They are found by ``structure.motion_mask`` between two updates.
+They are found by ``motion_mask`` between two updates.
 """
 
 from __future__ import annotations

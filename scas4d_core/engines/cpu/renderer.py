@@ -14,7 +14,7 @@ from scas4d_core.engines.cpu.gloss import features_seen
 from scas4d_core.engines.cpu.rasterizer import CpuRasterizer, Drawing
 from scas4d_core.engines.fit import FitEngine
 from scas4d_core.engines.limits import DEFAULT, Limits
-from scas4d_core.engines.renderer import Comparison, Gradients, Picture
+from scas4d_core.engines.renderer import CHANNELS, Comparison, Gradients, Picture
 from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView, means
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import SMALLEST_SQUARE
@@ -22,9 +22,6 @@ from scas4d_core.kernels import image_loss, tiles
 
 Array = NDArray[np.float32]
 Moments = tuple[Array, Array]
-
-CHANNELS = 4
-"""Red, green, blue, label."""
 
 _moments: WeakKeyDictionary[TrainingView, Moments] = WeakKeyDictionary()
 """SSIM's windowed means of the target and of its square, by view: made once, shared by the renderers of a scene."""
@@ -70,12 +67,19 @@ class CpuRenderer:
     # The ``Renderer`` interface: states.
 
     def render(
-        self, state: Gaussians, camera: CameraArrays, features: Array | None = None, depth_channel: int = -1
+        self,
+        state: Gaussians,
+        camera: CameraArrays,
+        features: Array | None = None,
+        *,
+        depth_channel: int = -1,
+        background: Array | None = None,
     ) -> Picture:
         """See ``Renderer.render``."""
         shown = features_seen(state, camera) if features is None else features
-        background = np.zeros(shown.shape[1], np.float32)
-        background[: min(CHANNELS, len(background))] = self._background[: len(background)]
+        if background is None:
+            background = np.zeros(shown.shape[1], np.float32)
+            background[:CHANNELS] = self._background
         given = (state.means, state.factors, state.opacities, shown, camera, background)
         return self.rasterizer.forward(*given, depth_channel)
 

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Camera
 from scas4d_core.first_frame.calibration.matches import Matches
-from scas4d_core.first_frame.points.posed_pictures import Float
 from scas4d_core.first_frame.points.triangulation import grouped, triangulator
+from scas4d_core.posed_pictures import Float
 
 BOUNDS = (16.0, 6.0, 2.0)
 """Pixels that a feature may miss its point by, round after round: the first takes in cameras that are far off, the last

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures.images import resize_area
-from scas4d_core.first_frame.points.posed_pictures import Float, PosedPicture
 from scas4d_core.first_frame.points.triangulation import (
     descriptor_distances,
     features,
@@ -22,6 +21,7 @@ from scas4d_core.first_frame.points.triangulation import (
     joined,
     mutual_best,
 )
+from scas4d_core.posed_pictures import Float, PosedPicture
 
 LONGEST_SIDE = 800
 """Pixels; larger pictures are made smaller before features are found: they would tell smaller faults, at seconds a

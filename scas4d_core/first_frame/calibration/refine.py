@@ -15,8 +15,8 @@ from scas4d_core.first_frame.calibration.bundle import NOISE, adjusted, tracks_o
 from scas4d_core.first_frame.calibration.matches import Matches, epipolar_distances, matches_by_appearance
 from scas4d_core.first_frame.calibration.record import Calibration, CameraResidual, RefinedCamera, Refinement
 from scas4d_core.first_frame.calibration.residuals import FEWEST, NEAR, OFF, residuals
-from scas4d_core.first_frame.points.posed_pictures import Float, InitialPointsError, collect_views
-from scas4d_core.frame_report import Progress
+from scas4d_core.posed_pictures import Float, InitialPointsError, collect_views
+from scas4d_core.progress import Progress
 from scas4d_core.settings import StaticSettings
 
 LEAST_CAMERAS = 3

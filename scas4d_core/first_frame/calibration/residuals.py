@@ -10,7 +10,7 @@ import numpy as np
 
 from scas4d_core.first_frame.calibration.matches import Matches, Pair, epipolar_distances
 from scas4d_core.first_frame.calibration.record import CameraResidual
-from scas4d_core.first_frame.points.posed_pictures import Float
+from scas4d_core.posed_pictures import Float
 
 NEAR, FAR = 16.0, 80.0
 """Pixels. Nearer to their epipolar lines than the first are right matches, and some wrong ones; between the two are

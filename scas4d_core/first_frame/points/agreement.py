@@ -9,14 +9,6 @@ import numpy as np
 
 from scas4d_core.captures.frame import InitialPoints
 from scas4d_core.first_frame.points.merging import SPACING, merged, thinned
-from scas4d_core.first_frame.points.posed_pictures import (
-    Bool,
-    Float,
-    PosedPicture,
-    halved,
-    look_at_point,
-    pixels_inside,
-)
 from scas4d_core.first_frame.points.stereo import (
     FEWEST_NEIGHBOURS,
     DepthMap,
@@ -36,6 +28,14 @@ from scas4d_core.first_frame.points.surfaces import (
 from scas4d_core.first_frame.points.triangulation import Tracks, Triangulation, triangulate
 from scas4d_core.first_frame.points.visual_hull import MISSES, VisualHull, carve, contradicted, pixel_at
 from scas4d_core.first_frame.time_limit import TimeLimit
+from scas4d_core.posed_pictures import (
+    Bool,
+    Float,
+    PosedPicture,
+    halved,
+    look_at_point,
+    pixels_inside,
+)
 
 OnProgress = Callable[[str, int, int], None]
 """Called with a stage, the steps done and the steps in all."""

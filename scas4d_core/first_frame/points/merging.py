@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scas4d_core.captures.frame import InitialPoints
-from scas4d_core.first_frame.points.posed_pictures import (
+from scas4d_core.posed_pictures import (
     Bool,
     Float,
     InitialPointsError,

@@ -11,7 +11,8 @@ from scipy.ndimage import binary_closing, binary_opening, gaussian_filter, minim
 
 from scas4d_core.captures.frame import InitialPoints
 from scas4d_core.first_frame.points.merging import SPACING, labelled_share
-from scas4d_core.first_frame.points.posed_pictures import (
+from scas4d_core.first_frame.points.visual_hull import pixel_at
+from scas4d_core.posed_pictures import (
     Bool,
     Float,
     InitialPointsError,
@@ -20,7 +21,6 @@ from scas4d_core.first_frame.points.posed_pictures import (
     observe,
     pixels_inside,
 )
-from scas4d_core.first_frame.points.visual_hull import pixel_at
 
 Planes = NDArray[np.float32]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
 
-from scas4d_core.first_frame.points.posed_pictures import Bool, PosedPicture
+from scas4d_core.posed_pictures import Bool, PosedPicture
 
 TOLERANCE = 8
 """Difference from the background, of 255 in any channel, that still counts as background: above resampling and mild

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
 from scas4d_core.first_frame.points.patch_match import patch_match
-from scas4d_core.first_frame.points.posed_pictures import Bool, Float, PosedPicture, halved, pixels_inside
 from scas4d_core.first_frame.points.visual_hull import VisualHull
 from scas4d_core.first_frame.time_limit import STEREO, TimeLimit
+from scas4d_core.posed_pictures import Bool, Float, PosedPicture, halved, pixels_inside
 
 WIDTH = 320
 """Pixels: wider pictures are halved until they are not."""

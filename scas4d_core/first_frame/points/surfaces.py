@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
 
-from scas4d_core.first_frame.points.posed_pictures import Bool, Float, PosedPicture
+from scas4d_core.posed_pictures import Bool, Float, PosedPicture
 
 MOST = 3
 """Planes and spheres fitted to the triangulated points: walls, floor and a dome are rarely more."""

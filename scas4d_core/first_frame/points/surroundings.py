@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.captures.frame import InitialPoints
-from scas4d_core.first_frame.points.posed_pictures import Bool, Float, PosedPicture, look_at_point
+from scas4d_core.posed_pictures import Bool, Float, PosedPicture, look_at_point
 
 ACROSS = 40
 """Points along the longer side of a picture; the fit refines them."""

@@ -16,8 +16,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from scas4d_core.cameras import Camera
-from scas4d_core.first_frame.points.posed_pictures import Bool, Float, PosedPicture, halved
 from scas4d_core.first_frame.time_limit import FEATURES, MATCHES, TimeLimit
+from scas4d_core.posed_pictures import Bool, Float, PosedPicture, halved
 
 RATIO = 0.8
 """Best over second-best descriptor distance among the candidates on the epipolar line (Lowe 2004, section 7.1)."""

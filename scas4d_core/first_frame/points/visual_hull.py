@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation, binary_erosion, distance_transform_edt
 
-from scas4d_core.first_frame.points.posed_pictures import (
+from scas4d_core.posed_pictures import (
     Bool,
     Float,
     PosedPicture,

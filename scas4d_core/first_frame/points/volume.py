@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from scas4d_core.captures.frame import InitialPoints
-from scas4d_core.first_frame.points.posed_pictures import (
+from scas4d_core.posed_pictures import (
     Bool,
     Float,
     InitialPointsError,

@@ -9,7 +9,7 @@ E is the environment: RGB in a grid over directions (octahedral map, Cigolle et 
 world while things turn. What is near lies in another direction from another place: k is 1 over its distance, x₀ the
 middle of the scene. The sheen is what smooth things mirror at grazing angles, where less light comes from inside.
 
-Twin: ``torch_backend.direction``. Gradients to places and turns are left out: the direction to a camera hardly changes
+Reference: ``engines.torch.gloss``. Gradients to places and turns are left out: the direction to a camera hardly changes
 within an update, and a turn is found by texture and outline.
 """
 

@@ -315,7 +315,11 @@ def test_a_count_that_lies_fills_no_memory(tmp_path: Path) -> None:
         (b"[]", "no head"),
         (b"{}", "no head"),
         (b"\xff", "no head"),
-        (json.dumps(json.loads(HEAD.text()) | {"version": 99}).encode(), "take a later one"),
+        (
+            json.dumps(json.loads(HEAD.text()) | {"version": 99}).encode(),
+            "version 99; this scas4d reads version 1: use",
+        ),
+        (json.dumps(json.loads(HEAD.text()) | {"version": 0}).encode(), "version 0; this scas4d reads version 1: use"),
         (json.dumps(json.loads(HEAD.text()) | {"world": {"origin": [0, 0], "metres_per_unit": 1}}).encode(), "wrong"),
         (json.dumps(json.loads(HEAD.text()) | {"world": {"origin": [0] * 3, "metres_per_unit": 0}}).encode(), "wrong"),
         (json.dumps(json.loads(HEAD.text()) | {"cameras": [{"name": "a"}]}).encode(), "wrong"),

@@ -14,17 +14,17 @@ from scas4d_core.effects.appearance.colours import Colours
 from scas4d_core.engines.torch.device_update import DeviceUpdate
 
 from scas4d_core.cameras import WorldFrame
+from scas4d_core.checkpoint import CarryOver
+from scas4d_core.effect_names import EFFECTS
 from scas4d_core.effects import effect as effect_module
 from scas4d_core.effects.effect import Effect, Group
 from scas4d_core.effects.presence.catching import Catching
-from scas4d_core.effects.registry import EFFECTS
 from scas4d_core.effects.switches import Switches, contradictions, first_switches, joined
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import Preparation
 from scas4d_core.presets import SettingError, preset
 from scas4d_core.settings import Settings
-from scas4d_core.storage.checkpoint import CarryOver
 from scas4d_core.structure.neighbours import build_neighbours
 from scas4d_core.update.parts import Part, PartsBuilder, Work, not_on_devices
 

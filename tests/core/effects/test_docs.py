@@ -12,8 +12,8 @@ import pytest
 from effect_cases import UPDATE, same, updated
 from source_tree import ROOT
 
+from scas4d_core.effect_names import EFFECTS
 from scas4d_core.effects import effect as effect_module
-from scas4d_core.effects.registry import EFFECTS
 from scas4d_core.effects.switches import first_switches, names_on
 from scas4d_core.settings import Settings
 
@@ -28,7 +28,7 @@ def test_the_table_is_todays() -> None:
 
 @pytest.fixture
 def drag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """The example of the page, its file and its line in place."""
+    """The example of the page, its file and both its lines in place."""
     line = re.search(r'^    "(\w+)": "([\w.]+)",$', PAGE, re.MULTILINE)
     assert line is not None
     name, place = line.groups()

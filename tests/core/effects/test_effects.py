@@ -13,11 +13,11 @@ from scas4d_core.effects.appearance.colours import Colours
 from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
 from source_tree import ROOT
 
+from scas4d_core.effect_names import EFFECTS
 from scas4d_core.effects import effect as effect_module
 from scas4d_core.effects.coherence.floor import FloorPart
 from scas4d_core.effects.effect import Effect, Group, effect, refused_at_zero, refused_on_gpu
 from scas4d_core.effects.evidence import Evidence, Seen
-from scas4d_core.effects.registry import EFFECTS
 from scas4d_core.effects.switches import IDLE, Switch, decided, first_switches, joined, names_on
 from scas4d_core.errors import InputError
 from scas4d_core.presets import SettingError, preset

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scas4d_core.cameras import Camera, Rig
-from scas4d_core.first_frame.points.posed_pictures import PosedPicture
+from scas4d_core.posed_pictures import PosedPicture
 
 RADIUS = 0.45
 HALF = np.array([0.5, 0.35, 0.4])

@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scas4d_core.first_frame.points.posed_pictures import PosedPicture
 from scas4d_core.first_frame.points.silhouettes import plain_background, silhouette
 from scas4d_core.first_frame.points.surfaces import Plane, Sphere, fit_surfaces, sample_surfaces, settle
 from scas4d_core.first_frame.points.visual_hull import carve, contradicted
+from scas4d_core.posed_pictures import PosedPicture
 
 RADIUS = 0.45
 

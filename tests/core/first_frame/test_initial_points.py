@@ -9,7 +9,10 @@ from scipy.spatial import cKDTree
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures import InitialPoints
 from scas4d_core.first_frame.initial_points import ENOUGH, covered, initial_points, joined
-from scas4d_core.first_frame.points.posed_pictures import (
+from scas4d_core.first_frame.points.stereo import DepthMap, fused_points, looked_through
+from scas4d_core.first_frame.points.triangulation import features, fundamental_matrix, triangulate
+from scas4d_core.first_frame.time_limit import TimeLimit
+from scas4d_core.posed_pictures import (
     InitialPointsError,
     PosedPicture,
     collect_views,
@@ -19,9 +22,6 @@ from scas4d_core.first_frame.points.posed_pictures import (
     pixels_inside,
     visible_from,
 )
-from scas4d_core.first_frame.points.stereo import DepthMap, fused_points, looked_through
-from scas4d_core.first_frame.points.triangulation import features, fundamental_matrix, triangulate
-from scas4d_core.first_frame.time_limit import TimeLimit
 
 HALF = np.array([0.5, 0.35, 0.4])
 PIXEL = 2.6 / 190.0

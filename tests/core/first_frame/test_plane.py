@@ -9,9 +9,9 @@ from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures import Frame
 from scas4d_core.first_frame.initial_points import initial_points
 from scas4d_core.first_frame.points.plane import Plane, agreed_plane, plane_points
-from scas4d_core.first_frame.points.posed_pictures import InitialPointsError, PosedPicture
 from scas4d_core.first_frame.points.surroundings import Stage, surroundings
 from scas4d_core.first_frame.static_scene import first_trainer
+from scas4d_core.posed_pictures import InitialPointsError, PosedPicture
 from scas4d_core.settings import SceneSettings, StaticSettings
 from scas4d_core.update.view_factory import ViewFactory
 

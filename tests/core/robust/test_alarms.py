@@ -162,8 +162,6 @@ def test_what_alarms_are_told_from_goes_through_arrays(past: Past) -> None:
     back = Past.of_arrays(past.arrays())
     assert {name: Watch.of(back, name) for name in NAMES} == {name: Watch.of(past, name) for name in NAMES}
     assert (Watch.of(back, "c1").same, Watch.of(back, "c3").misfit) == (1, 1)
-    older = {name: array for name, array in past.arrays().items() if name not in ("watched", "watch")}
-    assert Past.of_arrays(older).watch == {}
     assert len(Watch().row()) == outliers.WATCHED
 
 

@@ -45,7 +45,7 @@ def test_the_first_update_is_longer_and_the_next_is_not() -> None:
 def test_its_motion_is_gone_on_with() -> None:
     one = scene()
     one.step(take_frame(1, 0.1, FAR, RIG))
-    motion = one._carried.motion
+    motion = one._prepared.carried.motion
     assert motion is not None
     gone = np.linalg.norm(motion.shifts[0], axis=1).mean()
     way = np.linalg.norm(FAR.means - BOX.means, axis=1)[:MOVING].mean()
@@ -67,7 +67,7 @@ def test_where_nothing_moves_there_is_nothing_to_go_on_with() -> None:
 def test_a_later_update_without_a_motion_is_longer_too() -> None:
     one = scene()
     one.step(take_frame(1, 0.1, FAR, RIG))
-    one._carried = replace(one._carried, motion=None)  # as where the motion that was found is not finite
+    one._prepared = one._prepared.carry(motion=None)  # as where the motion that was found is not finite
     assert one.step(take_frame(2, 0.2, FURTHER, RIG)).iterations == 45
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from scas4d_core.captures.frame import Frame
-from scas4d_core.effects.registry import Mode
+from scas4d_core.effect_names import Mode
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.frame_report import FrameReport
@@ -108,9 +108,6 @@ def test_the_light_is_part_of_what_is_carried_on() -> None:
     past = with_light(with_light(Past(), 1.4), 1.41)
     again = Past.of_arrays(past.arrays())
     assert (again.light, again.lit) == (1.41, 2)
-    older = {name: array[:6] if name == "scene" else array for name, array in past.arrays().items()}
-    assert (Past.of_arrays(older).light, Past.of_arrays(older).lit) == (1.0, 0)
-    assert Past.of_arrays({name: array for name, array in older.items() if name not in ("shown", "last")}).last == {}
 
 
 def test_frames_that_were_held_or_stood_are_told_as_they_are() -> None:

@@ -225,7 +225,7 @@ def test_the_past_goes_through_arrays_unchanged() -> None:
     past = replace(past, brightness={**BRIGHT, "x": nan}, out={**PAST.out, "x": 2})
     back = Past.of_arrays(past.arrays())
     assert repr(back) == repr(past)
-    assert repr(Past.of_arrays({})) == repr(Past())
+    assert repr(Past.of_arrays(Past().arrays())) == repr(Past())
     with pytest.raises(KeyError):
         Past.of_arrays({"names": np.array(["c0"])})
     broken = {**past.arrays(), "names": np.array(["c0"])}

@@ -128,13 +128,11 @@ def test_who_is_clearly_off_is_named() -> None:
     assert timing_warnings(None) == []
 
 
-def test_looks_go_through_arrays_and_older_checkpoints_have_none() -> None:
+def test_looks_go_through_arrays() -> None:
     past = past_of({"a": {0.2: 5}, "b": {0.1: 2}})
     arrays = past.arrays()
     assert Past.of_arrays(arrays).timing == past.timing
     assert Past.of_arrays(Past().arrays()).timing == {}
-    older = {name: array for name, array in arrays.items() if name not in ("timed", "timing")}
-    assert Past.of_arrays(older).timing == {}
 
 
 def play(scene: Reconstruction, indices: range, offsets: Mapping[str, float]) -> list[FrameReport]:
@@ -164,7 +162,7 @@ def test_a_scene_goes_on_with_its_looks(undisturbed: tuple[Reconstruction, list[
         again = Reconstruction.resume(FOOTAGE.rig, FOOTAGE.settings, History.open(tmp_path / "scene"))
     assert again.resumed is not None
     assert not again.resumed.cold
-    assert again._carried.past.timing
+    assert again._prepared.carried.past.timing
     assert play(again, range(9, 19), APART_BY)[-1].timing == undisturbed[1][-1].timing
 
 
@@ -215,7 +213,7 @@ def test_frames_and_cameras_that_are_not_believed_say_nothing(tmp_path: Path, mo
 
 
 def test_others_are_looked_at_in_each_frame(undisturbed: tuple[Reconstruction, list[FrameReport]]) -> None:
-    rows = undisturbed[0]._carried.past.timing
+    rows = undisturbed[0]._prepared.carried.past.timing
     assert rows.keys() == set(FOOTAGE.rig.names)
     assert min(Looks(*row).last for row in rows.values()) >= 10
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.storage.births import Life, grown_roots
-from scas4d_core.storage.frame_files import DamagedFrameError, HistoryError
+from scas4d_core.storage.faults import DamagedFrameError, HistoryError
 from scas4d_core.storage.history import History
 from scas4d_core.storage.npz import read_npz
 
@@ -108,7 +108,7 @@ def test_without_births_nothing_more_is_written(tmp_path: Path) -> None:
     assert set(read_npz(tmp_path / "frame_000004.npz")) == {
         "means", "rotations", "factors", "colours", "foreground", "time", "report",
     }  # fmt: skip
-    assert set(read_npz(tmp_path / "fixed.npz")) == {"opacities", "ids"}
+    assert set(read_npz(tmp_path / "fixed.npz")) == {"opacities", "ids", "format"}
 
 
 def test_a_copy_of_some_frames_knows_all_births() -> None:

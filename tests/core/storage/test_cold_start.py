@@ -49,13 +49,13 @@ def followed(history: History, frames: int = 3) -> Reconstruction:
 
 def assert_goes_on(again: Reconstruction, scene: Reconstruction) -> None:
     """With the switches and arrays of a scene, and what follows from them."""
-    here, there = again._carried, scene._carried
+    here, there = again._prepared.carried, scene._prepared.carried
     assert here.switches == there.switches
     for name, key in ((shadows.NAME, "c0"), (camera_gain.NAME, "gains")):
         np.testing.assert_array_equal(here.effects[name][key], there.effects[name][key], err_msg=name)
     again.step(take_frame(4, 4 / 30, shown(0.4), RIG))
-    assert again._carried.switches[shadows.NAME].on
-    assert again._carried.switches[shadows.NAME].share > 0.02
+    assert again._prepared.carried.switches[shadows.NAME].on
+    assert again._prepared.carried.switches[shadows.NAME].share > 0.02
     error = [np.abs(state.colours - shown(0.4).colours)[STANDS].mean() for state in (again.history.newest, STATE)]
     assert error[0] < 0.7 * error[1]
 
@@ -114,7 +114,7 @@ def test_what_is_damaged_costs_no_state(tmp_path: Path) -> None:
     assert len(found.gaussians(0)) == len(STATE)
 
 
-def test_scenes_of_an_earlier_version_have_none() -> None:
+def test_a_frame_without_effects_has_none() -> None:
     history = History()
     history.append(0, 0.0, STATE, {})
     assert history.effects(0) == {}

@@ -10,10 +10,10 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from scas4d_core.effect_names import EFFECTS
 from scas4d_core.effects import effect as effect_module
 from scas4d_core.effects.effect import Effect, Group
 from scas4d_core.effects.evidence import Seen
-from scas4d_core.effects.registry import EFFECTS
 from scas4d_core.update.result import UpdateResult
 
 NAME, MODULE = "planned", "planned_population"

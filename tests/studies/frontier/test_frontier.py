@@ -15,7 +15,6 @@ from client.cli.scores import Store
 from scas4d_core.captures import open_capture
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.metrics import evaluation as measures
-from scas4d_core.settings import UpdateSettings
 from studies.commands import app
 from studies.frontier import convergence, frontier, timing
 from studies.frontier.frontier import AXES, DEFAULT, Variant, measure_frontier, row_of, variants
@@ -95,10 +94,7 @@ def test_only_what_is_missing_is_measured_the_cheapest_first(tmp_path, monkeypat
     (tmp_path / "robot").mkdir()
     store = Store(tmp_path / "out")
     there = Variant("scas4d 25", "scas4d", 25)
-    row = made_row(there, "robot", 5)
-    del row["settings"]["static"]["stop_gain"]  # came later
-    del row["settings"]["update"]["views"], row["settings"]["update"]["covariance"]
-    store.put(row)
+    store.put(made_row(there, "robot", 5))
     store.put(made_row(Variant("scas4d 10", "scas4d", 10), "robot", 3))  # other updates
     store.put(made_row(Variant("scas4d 50", "scas4d", 50), "robot", 5) | {"error": "killed"})
     asked = []
@@ -120,16 +116,10 @@ def test_only_what_is_missing_is_measured_the_cheapest_first(tmp_path, monkeypat
     assert lines == ["8 rows, 1 of them measured already"]
 
 
-def test_a_constant_that_was_a_setting_makes_no_row_stale():
+def test_a_row_with_another_constant_is_another_row():
     (varied,) = AXES["max-scale"]
-    place = UpdateSettings.constants["max_scale"].place
-    assert varied.record["constants"] == {place: 2.0}
+    assert varied.record["constants"] == {"scas4d_core.engines.cpu.deformation.MAX_SCALE": 2.0}
     rows = [made_row(DEFAULT, "robot", 5), made_row(varied, "robot", 5)]
-    assert (row_of(rows, DEFAULT, "robot", 5), row_of(rows, varied, "robot", 5)) == (rows[0], rows[1])
-    for row, value in zip(rows, (0.02, 2.0), strict=True):  # as they were written before
-        row["settings"].pop("constants", None)
-        row["settings"]["update"] |= {"max_scale": value, "layer_starts": [0.0, 0.2, 0.4], "coarse_until": 0.0}
-        row["settings"]["update"]["weights"] |= {"image": 1.0}
     assert (row_of(rows, DEFAULT, "robot", 5), row_of(rows, varied, "robot", 5)) == (rows[0], rows[1])
 
 

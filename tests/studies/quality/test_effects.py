@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from scas4d_core.effects.registry import EFFECTS
+from scas4d_core.effect_names import EFFECTS
 from scas4d_core.settings import Settings
 from studies.quality import effects
 

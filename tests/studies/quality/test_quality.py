@@ -17,12 +17,10 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics import evaluation as measures
 from scas4d_core.query.parts import parts
 from scas4d_core.query.tracks import tracks_of_pixels, tracks_of_points
-from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 from studies.quality import quality
 from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
 from studies.quality.quality import with_means
-from studies.quality.runs import completed
 from studies.quality.settings import settings_of
 
 FRAMES, WIDTH, HEIGHT = 4, 48, 40
@@ -390,14 +388,3 @@ def test_digest_tells_settings_apart():
     assert digest({"a": 1, "b": 2}) == digest({"b": 2, "a": 1})
     assert digest({"a": 1}) != digest({"a": 2})
     assert len(digest()) == 8
-
-
-def test_rows_that_were_measured_before_are_told_apart_by_what_they_had() -> None:
-    today = Settings().model_dump(mode="json")
-    before = json.loads(json.dumps(today))
-    del before["static"]["detail"]
-    for layer in before["update"]["layer_rates"]:
-        layer["scaling"] = 0.002
-    assert completed(before, today) == today
-    before["update"]["layer_rates"][0]["scaling"] = 0.01
-    assert completed(before, today)["constants"] == {"scas4d_core.update.rates.RATE_SCALING": 0.01}

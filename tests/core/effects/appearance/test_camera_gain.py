@@ -63,7 +63,7 @@ def started(mode: str, gains: np.ndarray = GAINS, told: bool = False) -> Reconst
 
 def found(scene: Reconstruction) -> np.ndarray:
     """Gains of light [6, 3] as the newest frame left them."""
-    gains: np.ndarray = scene._carried.effects[NAME]["gains"] ** POWER
+    gains: np.ndarray = scene._prepared.carried.effects[NAME]["gains"] ** POWER
     return gains
 
 
@@ -91,11 +91,11 @@ def test_cameras_that_are_alike_leave_it_off_and_others_switch_it_on() -> None:
     for scene, gains in ((alike, np.ones((6, 3))), (other, GAINS)):
         for index in (1, 2):
             scene.step(shot(index, gains))
-    assert not alike._carried.switches[NAME].on
-    assert NAME not in alike._carried.effects
-    assert other._carried.switches[NAME].on
+    assert not alike._prepared.carried.switches[NAME].on
+    assert NAME not in alike._prepared.carried.effects
+    assert other._prepared.carried.switches[NAME].on
     assert found(other).std(axis=0).min() > 0.05
-    assert other._carried.switches[NAME].text.startswith("colour gains of the cameras differ by ")
+    assert other._prepared.carried.switches[NAME].text.startswith("colour gains of the cameras differ by ")
 
 
 def test_off_changes_no_bit() -> None:
@@ -148,8 +148,8 @@ def test_evidence_is_the_same_where_no_report_is_told() -> None:
     said = []
     for tells in (True, False):
         scene = started("auto", told=True)
-        scene._updater.tells = tells  # type: ignore[attr-defined]
+        scene._prepared.updater.curve = tells  # type: ignore[attr-defined]
         scene.step(shot(1, GAINS))
-        said.append(scene._carried.switches[NAME])
+        said.append(scene._prepared.carried.switches[NAME])
     assert said[0] == said[1]
     assert said[0].on

@@ -83,7 +83,7 @@ def followed(mode: str, lamp: float) -> tuple[float, Reconstruction]:
 def test_a_lamp_that_moves_switches_it_on_and_is_followed() -> None:
     off, _ = followed("off", 0.08)
     error, scene = followed("auto", 0.08)
-    switch = scene._carried.switches["light"]
+    switch = scene._prepared.carried.switches["light"]
     assert switch.on
     assert switch.text.startswith("the light changes by ")
     assert error < 0.8 * off
@@ -91,4 +91,4 @@ def test_a_lamp_that_moves_switches_it_on_and_is_followed() -> None:
 
 def test_a_light_that_stays_leaves_it_off() -> None:
     _, scene = followed("auto", 0.0)
-    assert not scene._carried.switches["light"].on
+    assert not scene._prepared.carried.switches["light"].on

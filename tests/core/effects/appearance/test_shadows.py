@@ -53,7 +53,7 @@ def test_a_shadow_over_what_stands_is_followed() -> None:
     truth = shaded(0.3)
     off, on = followed("off", truth), followed("auto", truth)
     assert error(on, truth) < 0.4 * error(off, truth)
-    switch = on._carried.switches[NAME]
+    switch = on._prepared.carried.switches[NAME]
     assert switch.on
     assert switch.text.endswith("of what stands looks other than in frame 0")
 
@@ -66,9 +66,9 @@ def test_nothing_changes_where_nothing_does() -> None:
 
 def test_it_goes_off_where_nothing_changes_and_on_again() -> None:
     scene = followed("auto", STATE, frames=8)
-    assert not scene._carried.switches[NAME].on
+    assert not scene._prepared.carried.switches[NAME].on
     scene.step(take_frame(9, 9 / 30, shaded(0.3), RIG))
-    assert scene._carried.switches[NAME].on
+    assert scene._prepared.carried.switches[NAME].on
 
 
 def test_what_moves_keeps_its_own_colours() -> None:
@@ -85,9 +85,9 @@ def test_a_scene_in_which_all_moves_has_none() -> None:
     scene = Reconstruction.start(
         RIG, take_frame(0, 0, whole, RIG), settings("auto"), static=StaticResult(whole, {}, [])
     )
-    assert not scene._carried.switches[NAME].on
+    assert not scene._prepared.carried.switches[NAME].on
     scene.step(take_frame(1, 1 / 30, whole, RIG))
-    assert not scene._carried.switches[NAME].on
+    assert not scene._prepared.carried.switches[NAME].on
 
 
 def test_on_a_gpu_colours_follow_in_every_iteration_instead() -> None:
@@ -109,10 +109,10 @@ def test_without_masks_it_waits_until_it_is_known_what_stands() -> None:
     bare = STATE.replace(foreground=np.ones(len(BOX), np.float32))
     first = take_frame(0, 0, STATE, RIG, masks=False)
     scene = Reconstruction.start(RIG, first, settings("auto"), static=StaticResult(bare, {}, []))
-    assert not scene._carried.switches[NAME].on
-    assert scene._carried.effects[NAME]["c0"][..., 3].max() == 0  # nothing is known to hide anything
+    assert not scene._prepared.carried.switches[NAME].on
+    assert scene._prepared.carried.effects[NAME]["c0"][..., 3].max() == 0  # nothing is known to hide anything
     known = Reconstruction.start(RIG, first, settings("auto"), static=StaticResult(STATE, {}, []))
-    assert known._carried.switches[NAME].on
+    assert known._prepared.carried.switches[NAME].on
 
 
 def test_squares_are_means_of_whole_squares() -> None:

@@ -59,7 +59,7 @@ def play(scene: Reconstruction, frames: range, offsets: dict[str, np.ndarray], d
 
 
 def arrays(scene: Reconstruction) -> dict[str, Any]:
-    return dict(scene._carried.effects.get(NAME, {}))
+    return dict(scene._prepared.carried.effects.get(NAME, {}))
 
 
 def off_by(scene: Reconstruction, name: str) -> np.ndarray:
@@ -75,8 +75,8 @@ def same(one: Reconstruction, other: Reconstruction) -> bool:
 
 def test_a_camera_that_is_knocked_is_found_and_the_others_stay() -> None:
     scene = play(started("auto"), range(1, 15), OFF)
-    assert scene._carried.switches[NAME].on
-    assert scene._carried.switches[NAME].text.startswith("camera c2 is off by 0.")
+    assert scene._prepared.carried.switches[NAME].on
+    assert scene._prepared.carried.switches[NAME].text.startswith("camera c2 is off by 0.")
     np.testing.assert_allclose(off_by(scene, "c2"), OFF["c2"], atol=0.25)  # the box had taken on a part
     rows = np.flatnonzero(arrays(scene)["twists"].any(axis=1))
     assert [RIG.names[row] for row in rows] == ["c2"]
@@ -90,7 +90,7 @@ def test_it_is_worth_it_for_what_that_camera_sees() -> None:
 
 
 def out(scene: Reconstruction) -> bool:
-    return scene._carried.past.is_out("c2")
+    return scene._prepared.carried.past.is_out("c2")
 
 
 def test_a_camera_that_was_set_aside_is_looked_at_and_comes_back() -> None:
@@ -130,8 +130,8 @@ def test_a_drift_is_followed_a_frame_late() -> None:
 
 def test_cameras_that_stand_leave_it_off_and_change_no_bit() -> None:
     auto, off, on = (play(started(mode), range(1, 6), {}) for mode in ("auto", "off", "on"))
-    assert not auto._carried.switches[NAME].on
-    assert auto._carried.switches[NAME].share < effect(NAME).off_below
+    assert not auto._prepared.carried.switches[NAME].on
+    assert auto._prepared.carried.switches[NAME].share < effect(NAME).off_below
     assert same(auto, off)
     assert same(on, off)  # nothing was off: no pose is touched
     assert arrays(off) == {}
@@ -243,11 +243,11 @@ def test_residuals_that_are_told_of_a_pose_in_use_count_from_the_calibration() -
 
 def test_the_switch_stays_on_for_a_camera_that_stays_moved_and_goes_off_with_it() -> None:
     scene = play(started("auto"), range(1, 9), OFF)
-    assert scene._carried.switches[NAME].on
+    assert scene._prepared.carried.switches[NAME].on
     play(scene, range(9, 12), OFF)
-    assert scene._carried.switches[NAME].idle == 0
+    assert scene._prepared.carried.switches[NAME].idle == 0
     play(scene, range(12, 28 + IDLE), {})
-    assert not scene._carried.switches[NAME].on
+    assert not scene._prepared.carried.switches[NAME].on
     assert np.abs(off_by(scene, "c2")).max() < LEAST
 
 

@@ -188,7 +188,7 @@ def followed(mode: str, frames: list[Gaussians]) -> Reconstruction:
 def test_a_sheet_that_swings_switches_it_on_and_is_met_better() -> None:
     swings = [shown(height) for height in (0.04, 0.0, 0.04)]
     auto, off = followed("auto", swings), followed("off", swings)
-    switch = auto._carried.switches["bending"]
+    switch = auto._prepared.carried.switches["bending"]
     assert switch.on
     assert switch.since == 1
     assert switch.text.endswith("unlike each other")
@@ -201,7 +201,7 @@ def test_a_sheet_that_swings_switches_it_on_and_is_met_better() -> None:
 def test_a_sheet_that_turns_leaves_it_off_with_the_same_bits() -> None:
     turns = [shown(0.0, Rotation.from_rotvec([0.03 * index, 0.08 * index, 0])) for index in range(1, 3)]
     auto, off = followed("auto", turns), followed("off", turns)
-    switch = auto._carried.switches["bending"]
+    switch = auto._prepared.carried.switches["bending"]
     assert not switch.on
     assert switch.text != ""
     assert same(auto.history.newest.arrays(), off.history.newest.arrays())

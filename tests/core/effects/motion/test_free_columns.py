@@ -12,13 +12,13 @@ from effect_cases import BEFORE, RIG, UPDATE, builder, same
 from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
 from scas4d_core.engines.torch.device_update import DeviceUpdate
 
+from scas4d_core.checkpoint import CarryOver
 from scas4d_core.effects.motion.free_columns import MOVES
 from scas4d_core.effects.switches import first_switches, joined, names_on
 from scas4d_core.engines.cpu.deformation import CpuDeformation
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.presets import SettingError, preset
 from scas4d_core.settings import Settings, UpdateSettings
-from scas4d_core.storage.checkpoint import CarryOver
 from scas4d_core.structure.neighbours import build_neighbours
 from scas4d_core.update import frame_update
 from scas4d_core.update.frame_update import FrameUpdate

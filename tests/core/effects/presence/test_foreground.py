@@ -29,7 +29,7 @@ def test_without_the_mask_term_masks_pull_at_nothing() -> None:
 
 
 def test_a_scene_without_masks_says_that_it_has_no_mask_term() -> None:
-    with_masks, without = (start("auto", masks)._carried.switches["mask_term"] for masks in (True, False))
+    with_masks, without = (start("auto", masks)._prepared.carried.switches["mask_term"] for masks in (True, False))
     assert (with_masks.on, with_masks.text) == (True, "")
     assert (without.on, without.text) == (False, "the first frame has no masks")
     report = start("auto").history.report(0)["effects"]["mask_term"]
@@ -52,9 +52,9 @@ def start(labels: str, masks: bool = False) -> Reconstruction:
 def test_labels_are_learnt_from_motion_where_no_masks_are_given_and_the_effect_is_on() -> None:
     frame = take_frame(1, 1.0, moved(BEFORE), make_rig(), masks=False)
     learnt, held, masked = start("auto"), start("off"), start("auto", masks=True)
-    assert len(learnt._carried.seen) == len(frame.images)
-    assert list(held._carried.seen) == list(masked._carried.seen) == []
+    assert len(learnt._prepared.carried.seen) == len(frame.images)
+    assert list(held._prepared.carried.seen) == list(masked._prepared.carried.seen) == []
     assert learnt.step(frame).moving < len(BEFORE)
     assert held.step(frame).moving == len(BEFORE)
-    assert list(held._carried.seen) == []
+    assert list(held._prepared.carried.seen) == []
     assert masked.step(replace(frame, masks={})).moving == len(BEFORE)

@@ -14,8 +14,8 @@ from scas4d_core.first_frame.calibration import refine
 from scas4d_core.first_frame.calibration.matches import matches_by_appearance
 from scas4d_core.first_frame.calibration.record import in_use
 from scas4d_core.first_frame.calibration.refine import checked_calibration, refined_rig
-from scas4d_core.first_frame.points.posed_pictures import collect_views
 from scas4d_core.frame_report import FrameReport
+from scas4d_core.posed_pictures import collect_views
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History

@@ -1,7 +1,7 @@
-"""What moves: told by the masks of frame 0; in scenes without masks learnt from the pictures of two frames.
+"""The labels of moving Gaussians: by the masks of frame 0; without masks learnt from the pictures of two frames.
 
-A standing Gaussian inside the silhouettes of nearly all cameras lies within what moves, and moves with it: nothing but
-the outside of a thing teaches its label, and what is left behind inside is a ghost once the thing has gone.
+A static Gaussian inside the silhouettes of nearly all cameras lies within a moving object, and moves with it. The label
+of an object is only learnt at its outside; a Gaussian that stays behind inside is a ghost once the object has gone.
 
 Without masks, a pixel has changed where it differs from the frame before. A Gaussian moves when most of the cameras
 that see it have it in changed pixels: the background behind the new place of an object has changed for some cameras,
@@ -19,8 +19,8 @@ from scipy.ndimage import maximum_filter
 from scas4d_core.cameras import Rig
 from scas4d_core.engines.renderer import Renderer
 from scas4d_core.engines.views import TrainingView
-from scas4d_core.first_frame.points.posed_pictures import pixels_inside
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.posed_pictures import pixels_inside
 
 Array = NDArray[np.float32]
 
@@ -40,7 +40,7 @@ STANDING_SHARE = 0.1
 
 INSIDE_SHARE = 0.8
 """Share of the cameras with a mask and a Gaussian in their picture whose masks have to hold its mean, for it to lie
-within what moves. Automatic masks are ragged: with 0.7 to 0.9 the ghosts of `basketball` fade alike."""
+within a moving object. Automatic masks are ragged: with 0.7 to 0.9 the ghosts of `basketball` fade alike."""
 INSIDE_CAMERAS = 3
 """Such cameras there have to be at least: the silhouettes of two hold much that is empty."""
 
@@ -64,17 +64,17 @@ def first_labels(gaussians: Gaussians, rig: Rig, masks: Mapping[str, NDArray[np.
 
 
 def with_what_masks_hold(gaussians: Gaussians, rig: Rig, masks: Mapping[str, NDArray[np.uint8]]) -> Gaussians:
-    """Moving as well: what stands within the silhouettes of nearly all cameras, in their visual hull (Laurentini 1994).
+    """The Gaussians, with those in the visual hull of the masks moving as well (Laurentini 1994).
 
-    Where nothing stands, or nothing moves, labels say nothing of the inside, and stay.
+    Where no Gaussian is static, or none moves, labels say nothing of the inside, and stay.
 
     Args:
         gaussians, rig, masks: see ``first_labels``.
     """
-    stands = ~gaussians.moving
-    if not masks or not stands.any() or stands.all():
+    static = ~gaussians.moving
+    if not masks or not static.any() or static.all():
         return gaussians
-    rows = np.flatnonzero(stands)
+    rows = np.flatnonzero(static)
     points = gaussians.means[rows].astype(np.float64)
     held, seen = np.zeros(len(rows), np.int64), np.zeros(len(rows), np.int64)
     for camera in rig.cameras:
@@ -160,11 +160,11 @@ def labels_learnt(
         gaussians: Θ_{t−1}. known: [N] those that had been seen to move before, or None.
         before, now: see ``moving_between``.
     """
-    found = moving_between(gaussians, before, now, renderer)
+    moving = moving_between(gaussians, before, now, renderer)
     if known is None:
-        return found if found.sum() >= FIRST_LABELS else None
+        return moving if moving.sum() >= FIRST_LABELS else None
     enough = min(NEW_LABELS * len(gaussians), max(FIRST_LABELS, MORE_LABELS * known.sum()))
-    return None if (found & ~known).sum() <= enough else found | known
+    return None if (moving & ~known).sum() <= enough else moving | known
 
 
 def labelled(gaussians: Gaussians, labels: NDArray[np.bool_] | None) -> Gaussians:

@@ -10,6 +10,7 @@ from box_scene import MOVING, make_box, make_rig, moved, take_frame
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.captures.frame import Frame
+from scas4d_core.effects.presence.motion_mask import INSIDE_SHARE, changed_pixels, first_labels, with_reliable_labels
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_outcome import FrameOutcome
@@ -17,7 +18,6 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings, UpdateSettings
 from scas4d_core.structure import motion_mask
-from scas4d_core.structure.motion_mask import INSIDE_SHARE, changed_pixels, first_labels, with_reliable_labels
 from scas4d_core.update.result import camera_fit
 from scas4d_core.update.view_factory import ViewFactory
 
@@ -74,7 +74,7 @@ def test_until_something_is_seen_to_move_nothing_does() -> None:
     assert [report.outcome for report in reports] == 2 * [FrameOutcome.STOOD]
     assert [report.attempts for report in reports] == 2 * [["nothing is seen to move"]]
     np.testing.assert_array_equal(scene.history.newest.means, BOX.means)
-    assert len(scene._carried.seen) == len(RIG)
+    assert len(scene._prepared.carried.seen) == len(RIG)
 
 
 def test_a_camera_that_is_off_ends_the_rest() -> None:

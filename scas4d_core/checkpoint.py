@@ -1,12 +1,12 @@
 """Checkpoints: the state of an update beside Θ_{t−1}, on disk, and the commit from which a scene is resumed.
 
-A scene whose process died goes on as if nothing had happened.
+A scene whose process died goes on with the same bits.
 
 Beside the frames of a ``History`` lies one ``checkpoint_<index>.npz`` for each of its newest commits. It is written,
 synced and renamed *before* the frame's own rename, which is the commit: a committed frame has its checkpoint, and a
 checkpoint without its frame does not count. The checkpoint before the newest is kept as well, in case the newest state
 or checkpoint is damaged. Facts that never change (exposures, presence of masks) are in the report of the first frame;
-clusters and neighbours are built again from the first frame, and a digest tells their changes.
+clusters and neighbours are built again from the first frame, and a digest shows whether they changed.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from scas4d_core.engines.views import TrainingView
 from scas4d_core.errors import message_of
 from scas4d_core.frame_outcome import FrameOutcome
 from scas4d_core.robust.outliers import Past
+from scas4d_core.storage.faults import OtherFormatError, other_format
 from scas4d_core.storage.frame_files import checkpoint_file, checkpoint_of
 from scas4d_core.storage.history import NEWEST_KEPT, History, HistoryError
 from scas4d_core.storage.npz import read_npz, write_npz
@@ -35,7 +36,7 @@ from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import Motion
 
 FORMAT = 2
-"""Version of a checkpoint's file; others are refused."""
+"""Of a checkpoint's file; a scene with one of another format is not resumed."""
 
 
 class CheckpointError(ValueError):
@@ -88,9 +89,9 @@ class CarryOver:
         )
         if result.outcome.held:
             return carried
-        # A change of another light has not moved; and what is too little to be seen from frame to frame adds up.
-        stands = self.labels is None and result.outcome is FrameOutcome.STOOD and bool(self.seen)
-        if views is not None and result.exposure == 1.0 and not stands:
+        # A change of another light is no motion; a motion too small to be seen between two frames adds up.
+        resting = self.labels is None and result.outcome is FrameOutcome.STOOD and bool(self.seen)
+        if views is not None and result.exposure == 1.0 and not resting:
             carried = replace(carried, seen=[view for view in views if view.name not in result.trace.left_out])
         return replace(carried, shown=shown)
 
@@ -144,17 +145,18 @@ class Checkpoints:
             factory: of the scene's views; makes views of the pictures.
 
         Raises:
-            CheckpointError: it is not there, damaged, or of another format.
+            CheckpointError: it is not there, or damaged. OtherFormatError: it is of another format.
         """
         file = self._file(index)
         try:
             arrays = read_npz(file)
+            written = int(arrays["format"]) if "format" in arrays else None
+            if written != FORMAT:
+                raise other_format(f"{file.name}, a checkpoint,", written, FORMAT)
             names = {str(name) for name in arrays.pop("names")}
             missing = names ^ set(arrays)
             if missing:
                 raise ValueError(f"{file.name}: {', '.join(sorted(missing))} went missing")
-            if int(arrays["format"]) != FORMAT:
-                raise ValueError(f"{file.name}: format {int(arrays['format'])}, this version reads {FORMAT}")
             pictures = {name[5:]: array for name, array in arrays.items() if name.startswith("seen.")}
             seen = factory.views(Frame(index, 0.0, pictures, {}), {}, use_masks=False) if pictures else ()
             motion = _unpacked(arrays) if "motion.seconds" in arrays else None
@@ -165,6 +167,8 @@ class Checkpoints:
             return CarryOver(motion, labels, seen, structure, past, shown, switches, _by_effect(arrays))
         except FileNotFoundError:
             raise CheckpointError(f"{file.name} is missing") from None
+        except OtherFormatError:
+            raise
         except (ValueError, KeyError, TypeError) as error:
             raise CheckpointError(message_of(error)) from error
 
@@ -181,8 +185,8 @@ class Checkpoints:
 
     def indices(self) -> list[int]:
         """Frames that have a checkpoint, rising."""
-        found = (checkpoint_of(file.name) for file in self.directory.iterdir())
-        return sorted(index for index in found if index is not None)
+        listed = (checkpoint_of(file.name) for file in self.directory.iterdir())
+        return sorted(index for index in listed if index is not None)
 
     def _file(self, index: int) -> Path:
         return self.directory / checkpoint_file(index)
@@ -203,13 +207,13 @@ def _packed(motion: Motion) -> dict[str, Any]:
 
 def _by_effect(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Arrays]:
     """The arrays of effects, by effect and name, of those in a file."""
-    found: dict[str, Arrays] = {}
+    effects: dict[str, Arrays] = {}
     for key, array in arrays.items():
         kind, _, rest = key.partition(".")
         if kind == "effect":
             effect, _, name = rest.partition(".")
-            found.setdefault(effect, {})[name] = array
-    return found
+            effects.setdefault(effect, {})[name] = array
+    return effects
 
 
 def _unpacked(arrays: dict[str, NDArray[Any]]) -> Motion:
@@ -275,7 +279,7 @@ def find_commit(
         held: true for a committed frame whose pictures can be given again.
 
     Raises:
-        ResumeError: no state can be read.
+        ResumeError: no state can be read, or a checkpoint is of another format.
     """
     faults = list(history.damaged.values())
     whole: list[int] = []
@@ -287,6 +291,8 @@ def find_commit(
             whole.append(index)
             carry_over = checkpoints.load(index, factory)
             break
+        except OtherFormatError as error:
+            raise ResumeError(str(error)) from error
         except (HistoryError, CheckpointError) as error:
             faults.append(str(error))
             if index not in checkpoints.indices() and whole:

@@ -1,6 +1,7 @@
-"""Names of all effects, and the module of each: adding one is a file and a line here.
+"""Names of all effects with the module of each, and the modes that settings can pin them to.
 
-Names only: a module is imported when its effect is first asked for (``effect.effect``).
+Adding an effect is a file in ``effects/`` and a line here. Nothing is imported here: settings check names with it, and
+the module of an effect is imported when the effect is first asked for (``effects.effect.effect``).
 """
 
 from __future__ import annotations

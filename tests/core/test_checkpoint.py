@@ -13,10 +13,10 @@ from box_scene import SHIFT, make_box, make_rig, moved, take_frame
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.captures.frame import Frame, InitialPoints
+from scas4d_core.checkpoint import CheckpointError, Checkpoints
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.reconstruction import Reconstruction, ResumeError
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings, UpdateSettings
-from scas4d_core.storage.checkpoint import CheckpointError, Checkpoints
 from scas4d_core.storage.history import History
 from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import Motion
@@ -95,12 +95,12 @@ def assert_same(one: Reconstruction, other: Reconstruction, indices: list[int] =
             np.testing.assert_array_equal(
                 array, getattr(other.history.gaussians(index), name), err_msg=f"{index} {name}"
             )
-    assert same_motion(one._carried.motion, other._carried.motion)
-    assert one._carried.motion is not None
-    assert np.array_equal(one._carried.labels, other._carried.labels)  # type: ignore[arg-type]
-    assert one._carried.structure == other._carried.structure
-    assert [view.name for view in one._carried.seen] == [view.name for view in other._carried.seen]
-    for a, b in zip(one._carried.seen, other._carried.seen, strict=True):
+    assert same_motion(one._prepared.carried.motion, other._prepared.carried.motion)
+    assert one._prepared.carried.motion is not None
+    assert np.array_equal(one._prepared.carried.labels, other._prepared.carried.labels)  # type: ignore[arg-type]
+    assert one._prepared.carried.structure == other._prepared.carried.structure
+    assert [view.name for view in one._prepared.carried.seen] == [view.name for view in other._prepared.carried.seen]
+    for a, b in zip(one._prepared.carried.seen, other._prepared.carried.seen, strict=True):
         np.testing.assert_array_equal(a.target[:3], b.target[:3])
 
 
@@ -146,7 +146,7 @@ def test_the_scenes_are_what_they_should_be(undisturbed):
     relabelled = [scene.history.report(index).get("relabelled") for index in INDICES]
     assert relabelled[0] is None
     assert any(relabelled[1:])
-    assert 0 < scene._carried.labels.sum() < len(BOX)
+    assert 0 < scene._prepared.carried.labels.sum() < len(BOX)
     scene, _ = undisturbed("masks, floor, image scale and exposures")
     assert any((exposure != [1, 0]).any() for exposure in scene._fixed.exposures.values())
 
@@ -195,7 +195,7 @@ def test_a_whole_state_that_cannot_be_made_again_is_gone_on_from(undisturbed, tm
         SPOILS["cut"](folder / f"checkpoint_{INDICES[3]:06d}.npz")
         scene = resume(kind, folder, held=lambda index: False)
         assert (scene.resumed.index, scene.resumed.undone, scene.resumed.cold) == (INDICES[3], [], True)
-        assert (scene._carried.labels is None) == (whole._carried.labels is None)
+        assert (scene._prepared.carried.labels is None) == (whole._prepared.carried.labels is None)
         go_on(kind, scene)
         assert scene.history.indices == INDICES
         report = scene.history.report(INDICES[4])
