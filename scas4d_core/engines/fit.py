@@ -1,6 +1,6 @@
 """The interface between the loop of a fit and the device that computes it, and the values that cross it.
 
-The loop (``fit.gaussian_fit``) decides; an engine computes. ``Renderer.fit_engine`` makes an engine::
+The loop (``fit.gaussian_fit``) decides; an engine computes. ``choose.fit_engine_of`` makes an engine::
 
     engine.load_views(views, fixed)      # pictures, and the Gaussians that stay fixed in each
     engine.load_table(table, gloss)      # parameters and moments; again whenever the host has changed them
@@ -35,7 +35,7 @@ COLUMNS = 15
 
 @dataclass(eq=False)
 class RenderingStatistics:
-    """What the renderings since the last change of rows say about each Gaussian; density control reads it.
+    """Sums over the renderings since the last change of rows, for each Gaussian; density control reads them.
 
     Attributes:
         pull: [N] sum of the lengths of the screen gradients, per half picture. rendered: [N] times it was in a picture.
@@ -71,11 +71,11 @@ class FitTable:
 
 
 class FitScalars(NamedTuple):
-    """What changes from iteration to iteration.
+    """Rates of one iteration, and the figures that are asked of it.
 
     Attributes:
         rates: [15] float32, Adam's of each column; a column whose rate is 0 stays.
-        gloss: factor on the rates of the gloss. colour_shift: whether the colour shift is measured.
+        gloss: factor on the rates of the gloss. colour_shift: whether it is measured.
     """
 
     rates: Array

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.engines.views import CameraArrays, TrainingView
 from scas4d_core.gaussians import Gaussians
-
-if TYPE_CHECKING:
-    from scas4d_core.engines.fit import FitEngine
 
 Array = NDArray[np.float32]
 
@@ -109,10 +106,3 @@ class Renderer(Protocol):
 
     def reached(self, state: Gaussians, rows: NDArray[np.int64], camera: CameraArrays) -> NDArray[np.bool_]:
         """[h, w] bool, blocks of ``BLOCK`` pixels a side that the supports of some Gaussians meet; padded."""
-
-    def fit_engine(self, mask_weight: float = 0.0) -> FitEngine:
-        """A new engine for one fit, with the background and limits of this renderer and buffers of its own.
-
-        Args:
-            mask_weight: of the mask loss beside the image loss; it teaches the labels alone.
-        """

@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from scas4d_core.effect_names import Mode
 from scas4d_core.effects.effect import effect
 from scas4d_core.effects.evidence import Evidence
+from scas4d_core.engines.choose import fit_engine_of
 from scas4d_core.engines.cpu.gloss import GLOSS, Shading
 from scas4d_core.engines.fit import COLOUR, COLUMNS, MEAN, FitLoss, FitScalars
 from scas4d_core.first_frame.fit_schedule import FitProgress
@@ -119,7 +120,7 @@ class GlossTrial:
         trainer, rates = self._trainer, np.zeros(COLUMNS, np.float32)
         rates[COLOUR] = RATE
         parameters, cameras = trainer.fit.table.parameters.copy(), len(trainer.views)
-        fit = GaussianFit(trainer.fit.renderer, trainer.views, parameters, gloss=gloss)
+        fit = GaussianFit(fit_engine_of(trainer.fit.renderer), trainer.views, parameters, gloss=gloss)
         fit.run(ROUNDS * list(range(cameras)), lambda now: FitScalars(rates))
         return float(np.mean([10 ** (-psnr / 10) for psnr in fit.psnr[-cameras:]]))
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.engines.choose import renderer_of
+from scas4d_core.engines.choose import fit_engine_of, renderer_of
 from scas4d_core.engines.fit import (
     COLOUR,
     COLUMNS,
@@ -92,9 +92,8 @@ class StaticTrainer:
         self.random = np.random.default_rng(settings.seed)
         self.exposures = Exposures(views, settings.exposure is not False, RATE_EXPOSURE, BETA1, BETA2)
         renderer = renderer_of(device, scene.behind, scene_limits(scene.near, self.radius))
-        self.fit = GaussianFit(
-            renderer, views, parameters, mask_weight=WEIGHT_MASK, exposures=self.exposures, statistics=True
-        )
+        engine = fit_engine_of(renderer, WEIGHT_MASK)
+        self.fit = GaussianFit(engine, views, parameters, exposures=self.exposures, statistics=True)
         self._last = float(settings.iterations)
         self.cameras: dict[str, CameraFit] = {}
         self._start, self._until = len(parameters), int(DENSIFY_UNTIL * settings.iterations)
@@ -121,7 +120,7 @@ class StaticTrainer:
         return self.fit.losses
 
     def _after(self, now: FitStep, last: FitLoss) -> None:
-        """What follows an iteration at its time in the schedule."""
+        """Change density, remove, assess and record, where an iteration is the time for it."""
         settings, schedule, until = self.settings, self.schedule, self._until
         if last.colour_shift is not None:
             self.cameras[self.views[last.view].name] = camera_fit(last.psnr, last.colour_shift)

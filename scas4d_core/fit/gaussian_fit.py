@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.engines.fit import FitLoss, FitScalars, FitTable, RenderingStatistics
-from scas4d_core.engines.renderer import Renderer
+from scas4d_core.engines.fit import FitEngine, FitLoss, FitScalars, FitTable, RenderingStatistics
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.gaussians import Gaussians
 
@@ -60,23 +59,22 @@ def never(now: FitStep, last: FitLoss) -> bool:
 
 
 class GaussianFit:
-    """Fits the rows of a table of parameters to views, on the engine of a renderer.
+    """Fits the rows of a table of parameters to views.
 
     Args:
-        renderer: gives background, limits and device.
-        views: that are fitted. parameters: [N, 15], columns as of ``engines.fit``; changed in place.
-        mask_weight: of the mask loss, which teaches the labels alone.
+        engine: of this fit alone. views: that are fitted.
+        parameters: [N, 15], columns as of ``engines.fit``; changed in place.
         fixed: for each view, Gaussians that are drawn with the fitted ones and stay as they are; empty: none.
         gloss: with which colours depend on direction, learnt as well.
         exposures: of the views, learnt as well.
         betas: Adam's decays. statistics: whether density control will ask for ``table.statistics``.
 
     Attributes:
-        views, renderer, exposures: as given; the renderer draws in the buffers of the fit.
+        views, exposures: as given. renderer: of the engine.
         losses, psnr: of each iteration so far; dB of the view that it rendered.
 
     >>> from scas4d_core.captures import open_capture
-    >>> from scas4d_core.engines.choose import renderer_of
+    >>> from scas4d_core.engines.choose import fit_engine_of, renderer_of
     >>> from scas4d_core.engines.limits import scene_limits
     >>> from scas4d_core.engines.fit import COLOUR
     >>> from scas4d_core.fit.initial_gaussians import initial_parameters
@@ -86,7 +84,7 @@ class GaussianFit:
     >>> cloud, random = capture.points, np.random.default_rng(0)
     >>> table = initial_parameters(cloud.positions, cloud.colours, cloud.foreground, 500, random)
     >>> renderer = renderer_of("cpu", (0, 0, 0), scene_limits("auto", capture.rig.radius))
-    >>> fit, rates = GaussianFit(renderer, views, table), np.zeros(15, np.float32)
+    >>> fit, rates = GaussianFit(fit_engine_of(renderer), views, table), np.zeros(15, np.float32)
     >>> rates[COLOUR] = 0.01
     >>> fit.run([0] * 20, lambda step: FitScalars(rates))
     >>> fit.losses[-1] < fit.losses[0], len(fit.state())
@@ -95,11 +93,10 @@ class GaussianFit:
 
     def __init__(
         self,
-        renderer: Renderer,
+        engine: FitEngine,
         views: Sequence[TrainingView],
         parameters: Array,
         *,
-        mask_weight: float = 0.0,
         fixed: Sequence[Gaussians] = (),
         gloss: Shading | None = None,
         exposures: Exposures | None = None,
@@ -109,8 +106,7 @@ class GaussianFit:
         self.views, self.exposures = views, exposures
         self.losses: list[float] = []
         self.psnr: list[float] = []
-        self._engine = renderer.fit_engine(mask_weight)
-        self.renderer = self._engine.renderer
+        self._engine, self.renderer = engine, engine.renderer
         self._engine.load_views(views, fixed)
         moments = np.zeros_like(parameters), np.zeros_like(parameters)
         kept = RenderingStatistics.empty(len(parameters)) if statistics else None

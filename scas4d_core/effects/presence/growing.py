@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.effects.presence.carving import Hull, colours_of
+from scas4d_core.engines.choose import fit_engine_of
 from scas4d_core.engines.fit import COLOUR, COLUMNS, LABEL, MEAN, OPACITY, QUATERNION, SCALE, FitScalars
 from scas4d_core.fit.gaussian_fit import FitStep, GaussianFit, each_once
 from scas4d_core.fit.initial_gaussians import initial_parameters, logit
@@ -211,7 +212,7 @@ def _beside(
         if box is not None:
             fixed.append(state.rows(_reaching(state, camera, box)))
             crops.append(factory.cropped(view, *box))
-    return GaussianFit(renderer, crops, parameters, fixed=fixed, betas=(BETA1, BETA2))
+    return GaussianFit(fit_engine_of(renderer), crops, parameters, fixed=fixed, betas=(BETA1, BETA2))
 
 
 def _box(camera: Camera, points: Float) -> tuple[int, int, int, int] | None:

@@ -21,7 +21,7 @@ Array = NDArray[np.float32]
 
 
 class _Shapes(NamedTuple):
-    """What is rendered for a view: the fixed Gaussians, then the fitted ones."""
+    """Arrays that are rendered for a view: the fixed Gaussians, then the fitted ones."""
 
     means: Array
     factors: Array

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scas4d_core.engines.cpu.blocks import as_grid, tile_grid
 from scas4d_core.engines.cpu.gloss import features_seen
 from scas4d_core.engines.cpu.rasterizer import CpuRasterizer, Drawing
-from scas4d_core.engines.fit import FitEngine
 from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.engines.renderer import CHANNELS, Comparison, Gradients, Picture
 from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView, means
@@ -63,6 +62,12 @@ class CpuRenderer:
         self.image_part = 0.0
         self.mask_part = 0.0
         self.psnr = 0.0
+
+    def with_new_buffers(self, mask_weight: float) -> CpuRenderer:
+        """A renderer of whole pictures with the same background and limits; its mask loss teaches the labels alone."""
+        red, green, blue, _ = self._background.tolist()
+        limits = Limits(*self.rasterizer.limits.tolist())
+        return CpuRenderer((red, green, blue), 1.0, mask_weight, mask_weight == 0, limits)
 
     # The ``Renderer`` interface: states.
 
@@ -117,14 +122,6 @@ class CpuRenderer:
             np.take(array, rows, axis=0) for array in (state.means, state.factors, state.opacities, features)
         )
         return as_grid(blocks_of(self.rasterizer, means, factors, opacities, features, camera), camera)
-
-    def fit_engine(self, mask_weight: float = 0.0) -> FitEngine:
-        """See ``Renderer.fit_engine``."""
-        from scas4d_core.engines.cpu.fit import CpuFitEngine  # it needs this module
-
-        red, green, blue, _ = self._background.tolist()
-        limits = Limits(*self.rasterizer.limits.tolist())
-        return CpuFitEngine(CpuRenderer((red, green, blue), 1.0, mask_weight, mask_weight == 0, limits))
 
     # The loss of an iteration: arrays that change in place.
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from box_scene import make_box, make_rig, take_frame
 
-from scas4d_core.engines.choose import renderer_of
+from scas4d_core.engines.choose import fit_engine_of, renderer_of
 from scas4d_core.engines.cpu.gloss import Shading
 from scas4d_core.engines.fit import COLOUR, COLUMNS, LABEL, MEAN, OPACITY, SCALE, FitLoss, FitScalars
 from scas4d_core.engines.limits import scene_limits
@@ -35,8 +37,9 @@ def table(seed: int = 0) -> np.ndarray:
     return made
 
 
-def make_fit(parameters: np.ndarray | None = None, **more: object) -> GaussianFit:
-    return GaussianFit(RENDERER, make_views(), table() if parameters is None else parameters, **more)  # type: ignore[arg-type]
+def make_fit(parameters: np.ndarray | None = None, mask_weight: float = 0.0, **more: Any) -> GaussianFit:
+    engine = fit_engine_of(RENDERER, mask_weight)
+    return GaussianFit(engine, make_views(), table() if parameters is None else parameters, **more)
 
 
 def only(columns: slice, rate: float = 1e-2) -> FitScalars:
@@ -165,7 +168,7 @@ def test_exposures_are_learnt_where_they_are_given() -> None:
     assert all((view.exposure == (1, 0)).all() for view in fit.views)
     views = make_views()
     learnt = Exposures(views, True, 1e-3, BETA1, BETA2)
-    fit = GaussianFit(RENDERER, views, table(), exposures=learnt)
+    fit = GaussianFit(fit_engine_of(RENDERER), views, table(), exposures=learnt)
     fit.run([0, 1, 2], lambda now: FitScalars(0 * ALL))
     gains = np.array([view.exposure[:3, 0] for view in views])
     assert (gains[:3] != 1).all()
