@@ -16,6 +16,7 @@ from scas4d_core.engines.views import TrainingView
 from scas4d_core.fit.exposures import Exposures
 from scas4d_core.fit.gaussian_fit import BETA1, BETA2, FitStep, GaussianFit, each_once
 from scas4d_core.fit.initial_gaussians import initial_parameters
+from scas4d_core.kernels.appearance.direction import CELLS
 from scas4d_core.update.view_factory import ViewFactory
 
 RIG, BOX = make_rig(), make_box()
@@ -98,6 +99,19 @@ def test_fixed_gaussians_are_drawn_and_stay_as_they_are() -> None:
     for name, array in BOX.arrays().items():
         np.testing.assert_array_equal(array, before[name])
     assert beside.psnr[0] > alone.psnr[0] + 2
+
+
+def test_glossy_fixed_gaussians_are_drawn_as_each_camera_sees_them() -> None:
+    normals = BOX.means / np.linalg.norm(BOX.means, axis=1, keepdims=True)
+    environment = Shading.fresh(normals, BOX.means).environment
+    environment[:CELLS] = np.random.default_rng(0).uniform(-0.5, 1, (CELLS, 3))
+    glossy = BOX.replace(gloss=normals, environment=environment)
+    clear = table()[:1]
+    clear[:, OPACITY] = -20
+    fit = make_fit(clear, fixed=[glossy] * len(RIG.cameras))
+    fit.run(range(len(RIG.cameras)), lambda now: FitScalars(0 * ALL))
+    assert fit.psnr == [pytest.approx(RENDERER.compare(glossy, view).psnr, rel=1e-5) for view in fit.views]
+    assert abs(fit.psnr[0] - RENDERER.compare(BOX, fit.views[0]).psnr) > 1
 
 
 def test_a_fit_with_no_fixed_gaussians_in_a_view_has_the_bits_of_one_without() -> None:
