@@ -3,7 +3,7 @@
 The loop (``fit.gaussian_fit``) decides; an engine computes. ``choose.fit_engine_of`` makes an engine::
 
     engine.load_views(views, fixed)      # pictures, and the Gaussians that stay fixed in each
-    engine.load_table(table, gloss)      # parameters and moments; again whenever the host has changed them
+    engine.load_table(table)             # parameters and moments; again whenever the host has changed them
     engine.iterate(view, scalars)        # activate, render, compare, backward, Adam: once an iteration
     engine.table(), engine.state()       # what was fitted
 """
@@ -59,6 +59,7 @@ class FitTable:
     Attributes:
         parameters, first, second: [N, 15] float32, columns as above. steps: of Adam so far.
         beta1, beta2: Adam's decays. statistics: None where nobody reads them.
+        gloss: by which colours depend on direction, learnt as well; None: they do not.
     """
 
     parameters: Array
@@ -68,6 +69,7 @@ class FitTable:
     beta2: np.float32
     steps: int = 0
     statistics: RenderingStatistics | None = None
+    gloss: Shading | None = None
 
 
 class FitScalars(NamedTuple):
@@ -88,7 +90,7 @@ class FitLoss(NamedTuple):
 
     Attributes:
         view: index of the view. loss: weighted sum of image and mask loss. psnr: dB.
-        exposure_gradient: [C, 2] of the loss with respect to the camera's gain and offset.
+        exposure_gradient: [C, 2] of the loss with respect to the camera's gain and offset; valid until the next one.
         colour_shift: [3] mean of the picture minus mean of the rendering; None where it was not asked for.
     """
 
@@ -113,8 +115,8 @@ class FitEngine(Protocol):
             fixed: for each view, Gaussians that are drawn with the fitted ones and stay as they are; empty: none.
         """
 
-    def load_table(self, table: FitTable, gloss: Shading | None) -> None:
-        """Take parameters, moments and statistics, and the gloss of the fitted Gaussians where they have one.
+    def load_table(self, table: FitTable) -> None:
+        """Take parameters, moments, statistics and gloss.
 
         Raises:
             EngineError: the engine cannot learn a gloss.
@@ -124,7 +126,7 @@ class FitEngine(Protocol):
         """One iteration: render a view, compare it with its picture, carry the gradient back, step Adam."""
 
     def table(self) -> FitTable:
-        """Parameters, moments and statistics as they are now."""
+        """The table as it is now."""
 
     def state(self) -> Gaussians:
         """The fitted Gaussians, without the fixed ones; their labels are between 0 and 1."""

@@ -138,7 +138,7 @@ class GlossTrial:
             now = schedule.next()
             if now.begun - began >= estimates * every:
                 estimates += 1
-                before = trainer.fit.gloss
+                before = trainer.fit.table.gloss
                 environment = None if before is None else before.environment
                 gloss, means = gloss_seen(trainer, environment)
                 trainer.fit.set_gloss(Shading.fresh(gloss, means, environment))
@@ -162,8 +162,8 @@ class GlossyFit:
     """
 
     def __init__(self, trainer: StaticTrainer, before: StaticTrainer) -> None:
-        assert before.fit.gloss is not None
-        self._trainer, environment = trainer, before.fit.gloss.environment
+        assert before.fit.table.gloss is not None
+        self._trainer, environment = trainer, before.fit.table.gloss.environment
         gloss, means = gloss_seen(before, environment)
         self._strengths = np.linalg.norm(gloss, axis=1, keepdims=True)
         self._tree, self._normals = cKDTree(means), gloss / np.maximum(self._strengths, 1e-9)
@@ -183,11 +183,14 @@ class GlossyFit:
         return self._trainer.train(progress, self._after)
 
     def _after(self, now: FitStep) -> bool:
-        shading, share = self._trainer.fit.gloss, now.ended / self._trainer.settings.iterations
+        shading, share = self._trainer.fit.table.gloss, now.ended / self._trainer.settings.iterations
         assert shading is not None
         if share <= SETTLED and now.passes(100):
             shading.gloss[:] = self._placed(shading.gloss)
             shading.changed_from[:] = shading.gloss
         elif share > SETTLED and now.passes(SMOOTH_EVERY):
             shading.smooth(self._trainer.fit.table.parameters[:, MEAN])
+        else:
+            return False
+        self._trainer.fit.set_gloss(shading)
         return False

@@ -7,7 +7,7 @@ the schedule begins an iteration or ends the fit, and what is done after an iter
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -110,21 +110,16 @@ class GaussianFit:
         self._engine.load_views(views, fixed)
         moments = np.zeros_like(parameters), np.zeros_like(parameters)
         kept = RenderingStatistics.empty(len(parameters)) if statistics else None
-        self._gloss, self._count = gloss, len(parameters)
-        self._engine.load_table(FitTable(parameters, *moments, *betas, statistics=kept), gloss)
+        self._count = len(parameters)
+        self._engine.load_table(FitTable(parameters, *moments, *betas, statistics=kept, gloss=gloss))
 
     def __len__(self) -> int:
         return self._count
 
     @property
     def table(self) -> FitTable:
-        """Parameters, moments and statistics as they are now."""
+        """Parameters, moments, statistics and gloss as they are now."""
         return self._engine.table()
-
-    @property
-    def gloss(self) -> Shading | None:
-        """The gloss of the Gaussians, as it is learnt."""
-        return self._gloss
 
     def state(self) -> Gaussians:
         """The fitted Gaussians, without the fixed ones; their labels are between 0 and 1."""
@@ -157,9 +152,8 @@ class GaussianFit:
                 return
 
     def set_gloss(self, gloss: Shading) -> None:
-        """Go on with another gloss of the same Gaussians."""
-        self._gloss = gloss
-        self._engine.load_table(self.table, gloss)
+        """Continue with another gloss of the same Gaussians."""
+        self._engine.load_table(replace(self.table, gloss=gloss))
 
     def replace_rows(self, rows: NDArray[np.int64], added: Array, parents: NDArray[np.int64]) -> None:
         """Keep some rows with their moments, and append others without; the statistics begin anew.
@@ -168,13 +162,13 @@ class GaussianFit:
             added: [A, 15] parameters. parents: [A] rows that these come from, whose gloss they inherit.
         """
         table, fresh = self.table, np.zeros_like(added)
-        if self._gloss is not None:
-            self._gloss = self._gloss.taken(rows, parents)
+        gloss = None if table.gloss is None else table.gloss.taken(rows, parents)
         parameters, first, second = (
             np.concatenate([old[rows], new])
             for old, new in ((table.parameters, added), (table.first, fresh), (table.second, fresh))
         )
         self._count = len(parameters)
         kept = None if table.statistics is None else RenderingStatistics.empty(self._count)
-        changed = FitTable(parameters, first, second, table.beta1, table.beta2, table.steps, kept)
-        self._engine.load_table(changed, self._gloss)
+        self._engine.load_table(
+            replace(table, parameters=parameters, first=first, second=second, statistics=kept, gloss=gloss)
+        )

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.engines.cpu.gloss import Shading, features_seen, without_turn
+from scas4d_core.engines.cpu.gloss import features_seen, without_turn
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.fit import COLOUR, FitLoss, FitScalars, FitTable
 from scas4d_core.engines.renderer import Gradients
@@ -62,10 +62,9 @@ class CpuFitEngine:
         """See ``FitEngine.load_views``."""
         self._views, self._fixed = views, fixed
 
-    def load_table(self, table: FitTable, gloss: Shading | None) -> None:
+    def load_table(self, table: FitTable) -> None:
         """See ``FitEngine.load_table``."""
-        count = len(table.parameters)
-        self._table, self._gloss = table, gloss
+        self._table, count = table, len(table.parameters)
         self._gradients = np.zeros_like(table.parameters)
         if self._fixed:
             pairs = zip(self._fixed, self._views, strict=True)
@@ -79,7 +78,7 @@ class CpuFitEngine:
         fixed = len(drawn.means) - len(table.parameters)
         fitted = drawn.since(fixed)
         activation.activate(table.parameters, *fitted)
-        gloss = self._gloss
+        gloss = table.gloss
         if gloss is not None:
             turns, colours = without_turn(len(fitted.means)), fitted.features[:, :3].copy()
             gloss.show(fitted.means, turns, colours, seen.camera, fitted.features)
@@ -130,7 +129,7 @@ class CpuFitEngine:
 
     def state(self) -> Gaussians:
         """See ``FitEngine.state``."""
-        count, gloss = len(self._table.parameters), self._gloss
+        count, gloss = len(self._table.parameters), self._table.gloss
         made = _Shapes.empty(count)
         activation.activate(self._table.parameters, *made)
         return Gaussians(

@@ -160,7 +160,7 @@ def test_kept_rows_keep_their_moments_and_new_ones_have_none() -> None:
 
 def test_gloss_is_learnt_where_it_is_given_and_new_rows_inherit_it() -> None:
     plain = make_fit()
-    assert plain.gloss is None
+    assert plain.table.gloss is None
     assert plain.state().gloss is None
     normals = (BOX.means[:COUNT] / np.linalg.norm(BOX.means[:COUNT], axis=1, keepdims=True)).astype(np.float32)
     gloss = Shading.fresh(0.5 * normals, table()[:, MEAN])
@@ -172,8 +172,8 @@ def test_gloss_is_learnt_where_it_is_given_and_new_rows_inherit_it() -> None:
     assert state.environment.any()
     assert (state.gloss != 0.5 * normals).any()
     fit.replace_rows(np.arange(4), table(1)[:1], np.array([3]))
-    assert fit.gloss is not None
-    np.testing.assert_array_equal(fit.gloss.gloss[4], state.gloss[3])
+    assert fit.table.gloss is not None
+    np.testing.assert_array_equal(fit.table.gloss.gloss[4], state.gloss[3])
 
 
 def test_exposures_are_learnt_where_they_are_given() -> None:
