@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,6 @@ from numpy.typing import NDArray
 from scas4d_core.engines.renderer import Renderer
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.gaussians import Gaussians
-
-if TYPE_CHECKING:
-    from scas4d_core.engines.cpu.gloss import Shading
 
 Array = NDArray[np.float32]
 
@@ -52,6 +49,20 @@ class RenderingStatistics:
         return cls(np.zeros(count), np.zeros(count, np.int64), np.zeros((count, 3, 3), np.float32))
 
 
+class FitGloss(Protocol):
+    """Gloss of the fitted Gaussians and their environment, as one kind of engine learns them.
+
+    Attributes:
+        gloss: [N, 3] normals times strengths. environment: see ``Gaussians``.
+    """
+
+    gloss: Array
+    environment: Array
+
+    def taken(self, rows: NDArray[np.int64], parents: NDArray[np.int64]) -> Self:
+        """The same for some rows, with their moments, and for further ones like their parents, without."""
+
+
 @dataclass(eq=False)
 class FitTable:
     """The parameters of a fit with their Adam moments.
@@ -69,7 +80,7 @@ class FitTable:
     beta2: np.float32
     steps: int = 0
     statistics: RenderingStatistics | None = None
-    gloss: Shading | None = None
+    gloss: FitGloss | None = None
 
 
 class FitScalars(NamedTuple):
@@ -119,7 +130,7 @@ class FitEngine(Protocol):
         """Take parameters, moments, statistics and gloss.
 
         Raises:
-            EngineError: the engine cannot learn a gloss.
+            EngineError: the engine cannot learn this gloss.
         """
 
     def iterate(self, view: int, scalars: FitScalars) -> FitLoss:

@@ -184,7 +184,7 @@ class GlossyFit:
 
     def _after(self, now: FitStep) -> bool:
         shading, share = self._trainer.fit.table.gloss, now.ended / self._trainer.settings.iterations
-        assert shading is not None
+        assert isinstance(shading, Shading)
         if share <= SETTLED and now.passes(100):
             shading.gloss[:] = self._placed(shading.gloss)
             shading.changed_from[:] = shading.gloss

@@ -13,12 +13,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.engines.fit import FitEngine, FitLoss, FitScalars, FitTable, RenderingStatistics
+from scas4d_core.engines.fit import FitEngine, FitGloss, FitLoss, FitScalars, FitTable, RenderingStatistics
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.gaussians import Gaussians
 
 if TYPE_CHECKING:
-    from scas4d_core.engines.cpu.gloss import Shading
     from scas4d_core.fit.exposures import Exposures
 
 Array = NDArray[np.float32]
@@ -98,7 +97,7 @@ class GaussianFit:
         parameters: Array,
         *,
         fixed: Sequence[Gaussians] = (),
-        gloss: Shading | None = None,
+        gloss: FitGloss | None = None,
         exposures: Exposures | None = None,
         betas: tuple[np.float32, np.float32] = (BETA1, BETA2),
         statistics: bool = False,
@@ -151,7 +150,7 @@ class GaussianFit:
             if end(now, last):
                 return
 
-    def set_gloss(self, gloss: Shading) -> None:
+    def set_gloss(self, gloss: FitGloss) -> None:
         """Continue with another gloss of the same Gaussians."""
         self._engine.load_table(replace(self.table, gloss=gloss))
 

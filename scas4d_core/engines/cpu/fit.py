@@ -8,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.engines.cpu.gloss import features_seen, without_turn
+from scas4d_core.engines.cpu.gloss import Shading, features_seen, without_turn
 from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.engine import EngineError
 from scas4d_core.engines.fit import COLOUR, FitLoss, FitScalars, FitTable
 from scas4d_core.engines.renderer import Gradients
 from scas4d_core.engines.views import CameraArrays, TrainingView
@@ -64,7 +65,9 @@ class CpuFitEngine:
 
     def load_table(self, table: FitTable) -> None:
         """See ``FitEngine.load_table``."""
-        self._table, count = table, len(table.parameters)
+        if not isinstance(table.gloss, Shading | None):
+            raise EngineError("cpu", ["a gloss of another engine"])
+        self._table, self._gloss, count = table, table.gloss, len(table.parameters)
         self._gradients = np.zeros_like(table.parameters)
         if self._fixed:
             pairs = zip(self._fixed, self._views, strict=True)
@@ -78,7 +81,7 @@ class CpuFitEngine:
         fixed = len(drawn.means) - len(table.parameters)
         fitted = drawn.since(fixed)
         activation.activate(table.parameters, *fitted)
-        gloss = table.gloss
+        gloss = self._gloss
         if gloss is not None:
             turns, colours = without_turn(len(fitted.means)), fitted.features[:, :3].copy()
             gloss.show(fitted.means, turns, colours, seen.camera, fitted.features)
@@ -129,7 +132,7 @@ class CpuFitEngine:
 
     def state(self) -> Gaussians:
         """See ``FitEngine.state``."""
-        count, gloss = len(self._table.parameters), self._table.gloss
+        count, gloss = len(self._table.parameters), self._gloss
         made = _Shapes.empty(count)
         activation.activate(self._table.parameters, *made)
         return Gaussians(
