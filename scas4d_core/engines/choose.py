@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from scas4d_core.engines.engine import UpdateEngine
+from scas4d_core.engines.fit import FitEngine
 from scas4d_core.engines.limits import Limits
 from scas4d_core.engines.renderer import Renderer
 
@@ -40,3 +41,20 @@ def renderer_of(device: str, background: tuple[float, float, float], limits: Lim
 
         return CpuRenderer(background, limits=limits)
     raise ValueError(f"device {device!r} has no renderer; choose 'cpu'")
+
+
+def fit_engine_of(renderer: Renderer, mask_weight: float = 0.0) -> FitEngine:
+    """A new engine for one fit, with the device, background and limits of a renderer, and buffers of its own.
+
+    Args:
+        mask_weight: of the mask loss beside the image loss; it teaches the labels alone.
+
+    Raises:
+        ValueError: the device of the renderer has no engine for fits.
+    """
+    from scas4d_core.engines.cpu.fit import CpuFitEngine
+    from scas4d_core.engines.cpu.renderer import CpuRenderer
+
+    if isinstance(renderer, CpuRenderer):
+        return CpuFitEngine(renderer.with_new_buffers(mask_weight))
+    raise ValueError(f"{type(renderer).__name__} has no engine for fits; choose device 'cpu'")

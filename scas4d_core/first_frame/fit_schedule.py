@@ -16,6 +16,7 @@ from math import ceil
 import numpy as np
 
 from scas4d_core.first_frame.time_limit import TimeLimit
+from scas4d_core.fit.gaussian_fit import FitStep
 
 FEWEST = 500
 """Iterations that are made however little time there is."""
@@ -33,27 +34,6 @@ in what the seed does. The sample at half size, two seeds each: 35.33 dB, with 5
 35.24, with half of them 35.03; *cloth* at half size, one seed: 28.91 dB, with 5 and 20 % fewer 28.91 and 28.88."""
 VARIED = 1.3
 """Ratio of numbers of Gaussians from which the cost of one can be told from that of the pixels."""
-
-
-@dataclass(frozen=True)
-class FitStep:
-    """One iteration, in iterations of the full schedule: it goes on from ``begun`` to ``ended``.
-
-    >>> step = FitStep(99.0, 101.5)
-    >>> step.reaches(100), step.reaches(102), step.passes(100), step.passes(70)
-    (True, False, True, False)
-    """
-
-    begun: float
-    ended: float
-
-    def reaches(self, moment: float) -> bool:
-        """True where a moment of the schedule comes with this iteration."""
-        return self.begun < moment <= self.ended
-
-    def passes(self, every: float) -> bool:
-        """True where a multiple of ``every`` does."""
-        return self.ended // every > self.begun // every
 
 
 @dataclass(frozen=True)

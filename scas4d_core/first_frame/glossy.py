@@ -17,13 +17,15 @@ from scipy.spatial import cKDTree
 from scas4d_core.effect_names import Mode
 from scas4d_core.effects.effect import effect
 from scas4d_core.effects.evidence import Evidence
-from scas4d_core.engines.cpu.gloss import GLOSS, Shading, without_turn
-from scas4d_core.first_frame.fit_schedule import FitProgress, FitStep
+from scas4d_core.engines.choose import fit_engine_of
+from scas4d_core.engines.cpu.gloss import GLOSS, Shading
+from scas4d_core.engines.fit import COLOUR, COLUMNS, MEAN, FitLoss, FitScalars
+from scas4d_core.first_frame.fit_schedule import FitProgress
 from scas4d_core.first_frame.normals import surface_normals
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.first_frame.static_scene import StaticTrainer
 from scas4d_core.first_frame.strengths import strengths_seen
-from scas4d_core.kernels.adam import EVERY_ROW, adam
+from scas4d_core.fit.gaussian_fit import FitStep, GaussianFit
 
 Array = NDArray[np.float32]
 
@@ -38,6 +40,8 @@ HURRIED = 1.5
 surface that came about in a hurry explains less (basketball in 600 iterations: 7 % for direction, in 3000 none)."""
 ROUNDS = 8
 """Over all views, of the trial."""
+RATE = 2.5e-3
+"""Adam's rate of colours in the trial."""
 LEARNT = 0.5
 """Share of the iterations up to which the environment is learnt on the first surface; then the fit begins anew."""
 NORMALS_EVERY = 0.1
@@ -73,12 +77,11 @@ def fit_by_direction(
 
 def gloss_seen(trainer: StaticTrainer, environment: Array | None) -> tuple[Array, Array]:
     """[N, 3] normals times strengths of the surface that a fit has, and its means; without environment, the start's."""
-    means, factors, opacities, _ = trainer.shapes()
-    shape, views, rasterizer = (means, factors, opacities), trainer.views, trainer.loss.rasterizer
-    normals = surface_normals(*shape, views, rasterizer)
+    state, views, renderer = trainer.gaussians(), trainer.views, trainer.fit.renderer
+    normals = surface_normals(state, views, renderer)
     if environment is None:
-        return GLOSS * normals, means
-    return strengths_seen(normals, environment, *shape, views, rasterizer) * normals, means
+        return GLOSS * normals, state.means
+    return strengths_seen(normals, environment, state, views, renderer) * normals, state.means
 
 
 class GlossTrial:
@@ -112,46 +115,42 @@ class GlossTrial:
         self.on = self._mode == "on" or share >= effect("direction").on_above
         return self.on
 
-    def _left(self, shading: Shading | None) -> float:
-        """Mean squared error of the pictures after a few rounds of colours, and of a shading."""
-        trainer = self._trainer
-        means, factors, opacities, features = trainer.shapes()
-        colours, shown = np.ascontiguousarray(features[:, :3]), features.copy()
-        moments, turns = np.zeros((2, *colours.shape), np.float32), without_turn(len(means))
-        rates, beta1, beta2 = np.full(3, 2.5e-3, np.float32), np.float32(0.9), np.float32(0.999)
-        errors: list[float] = []
-        rasterizer = trainer.loss.rasterizer
-        for number in range(ROUNDS * len(trainer.views)):
-            view = trainer.views[number % len(trainer.views)]
-            shown[:, :3] = colours
-            if shading is not None:
-                shading.show(means, turns, colours, view.camera, shown)
-            trainer.loss.measure(means, factors, opacities, shown, view)
-            # Those of colours alone: positions and shapes stay.
-            gradients = rasterizer.feature_gradients(rasterizer.gradient_buffers()[0])
-            errors.append(10 ** (-trainer.loss.psnr / 10))
-            if shading is not None:
-                shading.saw(means, turns, colours, view.camera, gradients)
-                shading.step()
-            pull = np.ascontiguousarray(gradients[:, :3])
-            adam(colours, pull, moments[0], moments[1], rates, EVERY_ROW, beta1, beta2, number + 1)
-        return float(np.mean(errors[-len(trainer.views) :]))
+    def _left(self, gloss: Shading | None) -> float:
+        """Mean squared error of the pictures after a few rounds in which colours, and a gloss, learn alone."""
+        trainer, rates = self._trainer, np.zeros(COLUMNS, np.float32)
+        rates[COLOUR] = RATE
+        parameters, cameras = trainer.fit.table.parameters.copy(), len(trainer.views)
+        fit = GaussianFit(fit_engine_of(trainer.fit.renderer), trainer.views, parameters, gloss=gloss)
+        fit.run(ROUNDS * list(range(cameras)), lambda now: FitScalars(rates))
+        return float(np.mean([10 ** (-psnr / 10) for psnr in fit.psnr[-cameras:]]))
 
     def learnt(self) -> StaticTrainer:
         """The trainer once it has an environment, on the surface that it has."""
         trainer, whole, schedule = self._trainer, self._trainer.settings.iterations, self._trainer.schedule
-        every, began = max(1, round(NORMALS_EVERY * whole)), schedule.at
-        environment, estimates, schedule.again = None, 0, True
-        schedule.end = max(schedule.at, float(round(LEARNT * whole)))
-        while environment is None or schedule.at < round(LEARNT * whole):
+        every, began, until = max(1, round(NORMALS_EVERY * whole)), schedule.at, float(round(LEARNT * whole))
+        estimates, schedule.again = 0, True
+        schedule.end = max(schedule.at, until)
+
+        def begin(done: int) -> FitStep | None:
+            nonlocal estimates
+            if estimates and schedule.at >= until:
+                return None
             now = schedule.next()
             if now.begun - began >= estimates * every:
                 estimates += 1
+                before = trainer.fit.table.gloss
+                environment = None if before is None else before.environment
                 gloss, means = gloss_seen(trainer, environment)
-                trainer.shading = Shading.fresh(gloss, means, environment)
-                environment = trainer.shading.environment
-            trainer.step(trainer.views[int(trainer.random.integers(len(trainer.views)))], now.begun)
-            schedule.took(len(trainer.parameters))
+                trainer.fit.set_gloss(Shading.fresh(gloss, means, environment))
+            return now
+
+        def end(now: FitStep, last: FitLoss) -> bool:
+            schedule.took(len(trainer.fit))
+            return False
+
+        views = len(trainer.views)
+        without_end = iter(lambda: int(trainer.random.integers(views)), -1)
+        trainer.fit.run(without_end, trainer.scalars, begin, end)
         return trainer
 
 
@@ -163,16 +162,16 @@ class GlossyFit:
     """
 
     def __init__(self, trainer: StaticTrainer, before: StaticTrainer) -> None:
-        assert before.shading is not None
-        self._trainer = trainer
-        gloss, means = gloss_seen(before, before.shading.environment)
+        assert before.fit.table.gloss is not None
+        self._trainer, environment = trainer, before.fit.table.gloss.environment
+        gloss, means = gloss_seen(before, environment)
         self._strengths = np.linalg.norm(gloss, axis=1, keepdims=True)
         self._tree, self._normals = cKDTree(means), gloss / np.maximum(self._strengths, 1e-9)
-        trainer.shading = Shading.fresh(self._placed(None), means, before.shading.environment)
+        trainer.fit.set_gloss(Shading.fresh(self._placed(None), means, environment))
 
     def _placed(self, gloss: Array | None) -> Array:
         """[N, 3] gloss with the normals of the first surface; strengths as they are, at first those of it, too."""
-        near = self._tree.query(self._trainer.parameters[:, :3], 6)[1]
+        near = self._tree.query(self._trainer.fit.table.parameters[:, MEAN], 6)[1]
         normals = self._normals[near].mean(axis=1)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
         own = self._strengths[near].mean(axis=1) if gloss is None else np.linalg.norm(gloss, axis=1, keepdims=True)
@@ -184,11 +183,14 @@ class GlossyFit:
         return self._trainer.train(progress, self._after)
 
     def _after(self, now: FitStep) -> bool:
-        shading, share = self._trainer.shading, now.ended / self._trainer.settings.iterations
-        assert shading is not None
+        shading, share = self._trainer.fit.table.gloss, now.ended / self._trainer.settings.iterations
+        assert isinstance(shading, Shading)
         if share <= SETTLED and now.passes(100):
             shading.gloss[:] = self._placed(shading.gloss)
             shading.changed_from[:] = shading.gloss
         elif share > SETTLED and now.passes(SMOOTH_EVERY):
-            shading.smooth(self._trainer.parameters[:, :3])
+            shading.smooth(self._trainer.fit.table.parameters[:, MEAN])
+        else:
+            return False
+        self._trainer.fit.set_gloss(shading)
         return False

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion, gaussian_filter
 from scipy.spatial import cKDTree
 
-from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
+from scas4d_core.engines.renderer import Renderer
 from scas4d_core.engines.views import TrainingView
+from scas4d_core.gaussians import Gaussians
 
 Array = NDArray[np.float32]
 
@@ -31,37 +32,31 @@ SOLID = 0.5
 TINY = 1e-9
 
 
-def surface_normals(
-    means: Array, factors: Array, opacities: Array, views: Sequence[TrainingView], rasterizer: CpuRasterizer
-) -> Array:
+def surface_normals(state: Gaussians, views: Sequence[TrainingView], renderer: Renderer) -> Array:
     """[N, 3] unit normals that point outwards, to the cameras.
 
     Each pixel's normal, from the slope of the depth about it, goes to the Gaussians by their share in the pixel; then
     it is averaged over neighbours.
 
     Args:
-        means, factors, opacities: of the state. views: of it, whose cameras are looked through.
+        views: of the state, whose cameras are looked through.
     """
-    count, black = len(means), np.zeros(4, np.float32)
-    opacities = np.minimum(opacities**SKIN, OPAQUE).astype(np.float32)
+    means, count = state.means, len(state)
+    haze = state.replace(opacities=np.minimum(state.opacities**SKIN, OPAQUE).astype(np.float32))
     features = np.zeros((count, 4), np.float32)
     reach = REACH * float(np.max(np.percentile(means, 99, axis=0) - np.percentile(means, 1, axis=0)))
     total, outwards = np.zeros((count, 4)), np.zeros((count, 3))
     for view in views:
         camera = view.camera
-        picture = rasterizer.forward(means, factors, opacities, features, camera, black, depth_channel=3)
+        picture = renderer.render(haze, camera, features, depth_channel=3)
         alpha = 1 - picture.rest
         solid = alpha > SOLID
         depth = np.where(solid, picture.features[3] / np.maximum(alpha, SOLID), 0).astype(np.float64)
         normals, weights = _pixel_normals(depth, solid, camera.lens, reach)
-        rasterizer.forward(means, factors, opacities, features, camera, black)
-        g_image, g_alpha = rasterizer.gradient_buffers()
-        g_image[:], g_alpha[:] = 0, 0
-        height, width = weights.shape
-        g_image[:3, :height, :width] = np.moveaxis(normals @ camera.pose[:, :3] * weights[:, :, None], -1, 0)
-        g_image[3, :height, :width] = weights
-        seen = rasterizer.backward(g_image, g_alpha, 3).features
-        g_image[:] = 0
+        planes = np.empty((4, *weights.shape), np.float32)
+        planes[:3] = np.moveaxis(normals @ camera.pose[:, :3] * weights[:, :, None], -1, 0)
+        planes[3] = weights
+        seen = renderer.gather(haze, camera, planes)
         total += seen
         outwards += seen[:, 3:] * _unit(camera.centre - means)
     found = np.where(total[:, 3:] > 1e-3, total[:, :3], outwards)

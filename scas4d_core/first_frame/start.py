@@ -175,7 +175,7 @@ def fit_first(
         cloud, made, stage = _columns(inside), FirstCloud("given", len(points)), None
     views = factory.views(frame, {})
     result = fit_by_direction(
-        lambda: first_trainer(factory, views, *cloud, settings.scene, static, limit, stage),
+        lambda: first_trainer(factory, views, *cloud, settings.scene, static, limit, stage, settings.device),
         settings.effects.get("direction", "auto") if settings.device == "cpu" else "off",
         lambda now: on_progress(Progress("fitting frame 0", now.done, now.planned, _figures(now, limit))),
     )

@@ -7,28 +7,28 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.engines.cpu.gloss import Shading, without_turn
-from scas4d_core.engines.cpu.renderer import CpuRenderer
-from scas4d_core.engines.limits import scene_limits
-from scas4d_core.engines.views import TrainingView
-from scas4d_core.first_frame.exposures import TRIAL, Exposures
-from scas4d_core.first_frame.fit_schedule import FitProgress, FitSchedule, FitStep
-from scas4d_core.first_frame.initial_gaussians import (
+from scas4d_core.engines.choose import fit_engine_of, renderer_of
+from scas4d_core.engines.fit import (
     COLOUR,
+    COLUMNS,
     LABEL,
     MEAN,
     OPACITY,
     QUATERNION,
     SCALE,
-    budget,
-    initial_parameters,
+    FitLoss,
+    FitScalars,
 )  # fmt: skip
+from scas4d_core.engines.limits import scene_limits
+from scas4d_core.engines.views import TrainingView
+from scas4d_core.first_frame.fit_schedule import FitProgress, FitSchedule
 from scas4d_core.first_frame.points.surroundings import Stage
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.first_frame.time_limit import TimeLimit
+from scas4d_core.fit.exposures import TRIAL, Exposures
+from scas4d_core.fit.gaussian_fit import BETA1, BETA2, FitStep, GaussianFit
+from scas4d_core.fit.initial_gaussians import budget, initial_parameters
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.kernels import activation
-from scas4d_core.kernels.adam import EVERY_ROW, adam
 from scas4d_core.settings import SceneSettings, StaticSettings
 from scas4d_core.update.result import CameraFit, camera_fit
 from scas4d_core.update.schedule import view_order
@@ -36,7 +36,6 @@ from scas4d_core.update.view_factory import ViewFactory
 
 Array = NDArray[np.float32]
 
-BETA1, BETA2 = np.float32(0.9), np.float32(0.999)
 INITIAL_SHARE = 0.6
 """Share of the budget that the first cloud may take; of a larger cloud a random part is taken."""
 DENSIFY_FROM = 200
@@ -68,7 +67,12 @@ STOP_ROUNDS = 5
 
 
 class StaticTrainer:
-    """Fits Gaussians to the views of one frame."""
+    """Fits Gaussians to the views of frame 0; density control changes their number.
+
+    Attributes:
+        fit: the loop with its parameters. schedule: of it. exposures: of the views, learnt in place.
+        budget: largest number of Gaussians. cameras: by name, the fit of each camera's last picture.
+    """
 
     def __init__(
         self,
@@ -79,77 +83,57 @@ class StaticTrainer:
         settings: StaticSettings,
         limit: TimeLimit | None = None,
         stage: Stage | None = None,
+        device: str = "cpu",
     ) -> None:
-        self.settings = settings
-        self.views = views
-        self.parameters = parameters
+        self.settings, self.views, self.stage = settings, views, stage
         self.budget = budget(views, scene, settings)
-        self.shading: Shading | None = None
-        self.stage = stage
         self.radius = factory.rig.radius
-        limits = scene_limits(scene.near, self.radius)
-        self.loss = CpuRenderer(scene.behind, 1.0, WEIGHT_MASK, False, limits)
         self._masked = any(len(view.target) > 3 for view in views)
         self.random = np.random.default_rng(settings.seed)
-        self._reset_moments()
         self.exposures = Exposures(views, settings.exposure is not False, RATE_EXPOSURE, BETA1, BETA2)
-        self.psnr: list[float] = []
-        self._last, self._steps = float(settings.iterations), 0
+        renderer = renderer_of(device, scene.behind, scene_limits(scene.near, self.radius))
+        engine = fit_engine_of(renderer, WEIGHT_MASK)
+        self.fit = GaussianFit(engine, views, parameters, exposures=self.exposures, statistics=True)
+        self._last = float(settings.iterations)
         self.cameras: dict[str, CameraFit] = {}
         self._start, self._until = len(parameters), int(DENSIFY_UNTIL * settings.iterations)
         self.schedule = FitSchedule(settings.iterations, limit or TimeLimit(None), self._expected)
 
-    def shapes(self) -> tuple[Array, Array, Array, Array]:
-        """Means, factors, opacities and features of the parameters as they are."""
-        count = len(self.parameters)
-        found = [np.empty(shape, np.float32) for shape in ((count, 3), (count, 3, 3), (count,), (count, 4))]
-        activation.activate(self.parameters, *found)
-        return found[0], found[1], found[2], found[3]
-
-    def _reset_moments(self) -> None:
-        count = len(self.parameters)
-        self._first = np.zeros_like(self.parameters)
-        self._second = np.zeros_like(self.parameters)
-        self._screen = np.zeros(count)
-        self._seen = np.zeros(count, np.int64)
-
-    def _allocate(self) -> None:
-        count = len(self.parameters)
-        self._means = np.empty((count, 3), np.float32)
-        self._factors = np.empty((count, 3, 3), np.float32)
-        self._opacities = np.empty(count, np.float32)
-        self._features = np.empty((count, 4), np.float32)
-        self._gradients = np.empty_like(self.parameters)
-
     def train(
         self, progress: Callable[[FitProgress], None] | None = None, enough: Callable[[FitStep], bool] | None = None
     ) -> list[float]:
-        """Runs all iterations, or fewer by the stop rule or for want of time.
+        """Runs all iterations, or fewer by the stop rule or for want of time; returns their losses.
 
         Args:
             progress: called after each iteration. enough: called after each; True ends the fit.
         """
-        settings, schedule, until = self.settings, self.schedule, self._until
-        losses: list[float] = []
-        self._allocate()
-        for index in view_order(len(self.views), settings.iterations, self.random):
-            now = schedule.next()
-            losses.append(self.step(self.views[index], now.begun))
-            if now.ended >= DENSIFY_FROM and now.begun < until and now.passes(DENSIFY_EVERY):
-                self.control_density(self._target(now.ended))
-            if now.reaches(until) or now.reaches((until + settings.iterations) // 2):
-                self.remove_unseen()
-            if now.ended > until and self._last == settings.iterations and self._settled(losses):
-                self._last = min(self._last, now.ended + len(self.views) * schedule.stride)
-                self.remove_unseen()
-            if settings.exposure == "auto" and now.reaches(round(TRIAL * settings.iterations)):
-                self.exposures.assess()
-            schedule.took(len(self.parameters))
+        schedule = self.schedule
+
+        def end(now: FitStep, last: FitLoss) -> bool:
+            self._after(now, last)
             if progress is not None:
-                progress(FitProgress(schedule.done, schedule.total, losses[-1], schedule.seconds))
-            if now.ended >= self._last or (enough is not None and enough(now)):
-                break
-        return losses
+                progress(FitProgress(schedule.done, schedule.total, last.loss, schedule.seconds))
+            return now.ended >= self._last or (enough is not None and enough(now))
+
+        order = view_order(len(self.views), self.settings.iterations, self.random)
+        self.fit.run(order, self.scalars, lambda done: schedule.next(), end)
+        return self.fit.losses
+
+    def _after(self, now: FitStep, last: FitLoss) -> None:
+        """Change density, remove, assess and record, where an iteration is the time for it."""
+        settings, schedule, until = self.settings, self.schedule, self._until
+        if last.colour_shift is not None:
+            self.cameras[self.views[last.view].name] = camera_fit(last.psnr, last.colour_shift)
+        if now.ended >= DENSIFY_FROM and now.begun < until and now.passes(DENSIFY_EVERY):
+            self.control_density(self._target(now.ended))
+        if now.reaches(until) or now.reaches((until + settings.iterations) // 2):
+            self.remove_unseen()
+        if now.ended > until and self._last == settings.iterations and self._settled():
+            self._last = min(self._last, now.ended + len(self.views) * schedule.stride)
+            self.remove_unseen()
+        if settings.exposure == "auto" and now.reaches(round(TRIAL * settings.iterations)):
+            self.exposures.assess()
+        schedule.took(len(self.fit))
 
     def _target(self, at: float) -> int:
         """Gaussians that density control aims at, at a moment of the schedule."""
@@ -159,53 +143,27 @@ class StaticTrainer:
     def _expected(self, at: float) -> float:
         """Gaussians at a moment of the schedule: of this fit where it is to come, else of another one like it."""
         aim, now = self._target(min(at, self._until)) if at >= DENSIFY_FROM else self._start, self.schedule.at
-        return aim if at < now else len(self.parameters) if now >= self._until else max(len(self.parameters), aim)
+        return aim if at < now else len(self.fit) if now >= self._until else max(len(self.fit), aim)
 
-    def _settled(self, losses: list[float]) -> bool:
+    def _settled(self) -> bool:
         """True once rounds over all views no longer lower the loss; one more round of them follows."""
-        window = STOP_ROUNDS * len(self.views)
+        losses, window = self.fit.losses, STOP_ROUNDS * len(self.views)
         if self.settings.stop_gain == 0 or len(losses) % window or len(losses) < 2 * window:
             return False
         before, now = np.mean(losses[-2 * window : -window]), np.mean(losses[-window:])
         return bool(before - now < self.settings.stop_gain * before)
 
-    def step(self, view: TrainingView, at: float) -> float:
-        """One iteration, at a moment of the schedule: renders the view, carries the gradient back, steps Adam.
-
-        Returns the loss.
-        """
-        activation.activate(self.parameters, self._means, self._factors, self._opacities, self._features)
-        if self.shading is not None:
-            turns, colours = without_turn(len(self._means)), self._features[:, :3].copy()
-            self.shading.show(self._means, turns, colours, view.camera, self._features)
-        gradients = self.loss.evaluate(self._means, self._factors, self._opacities, self._features, view)
-        if self.shading is not None:
-            self.shading.saw(self._means, turns, colours, view.camera, gradients.features)
-            self.shading.step(1 - 0.9 * at / self.settings.iterations)
-        self.psnr.append(self.loss.psnr)
+    def scalars(self, now: FitStep) -> FitScalars:
+        """Rates of an iteration; in the last ones, each camera's colour shift is measured."""
         # A shorter fit ends somewhere in a round: two hold every view.
-        if at >= self._last - len(self.views) * (1 if self.schedule.stride == 1 else 2 * self.schedule.stride):
-            self.cameras[view.name] = camera_fit(self.loss.psnr, self.loss.colour_shift(view))
-        activation.activate_backward(
-            self.parameters, self._factors, self._opacities, self._features, gradients.means, gradients.factors,
-            gradients.opacities, gradients.features, self._gradients,
-        )  # fmt: skip
-        width = np.array([view.camera.width / 2, view.camera.height / 2], np.float32)
-        visible = self.loss.rasterizer.counts > 0
-        self._screen += np.sqrt(np.square(gradients.screen * width).sum(axis=1))
-        self._seen += visible
-        self._steps += 1
-        adam(
-            self.parameters, self._gradients, self._first, self._second, self._rates(at), EVERY_ROW, BETA1, BETA2,
-            self._steps,
-        )  # fmt: skip
-        self.exposures.step(view, self.loss.exposure_gradient, self._steps)
-        return self.loss.image_part + self.loss.mask_part
+        rounds = 1 if self.schedule.stride == 1 else 2 * self.schedule.stride
+        ending = now.begun >= self._last - len(self.views) * rounds
+        return FitScalars(self._rates(now.begun), 1 - 0.9 * now.begun / self.settings.iterations, ending)
 
     def _rates(self, at: float) -> Array:
         share = at / max(self.settings.iterations - 1, 1)
         position = RATE_POSITION ** (1 - share) * RATE_POSITION_END**share
-        rates = np.empty(activation.COLUMNS, np.float32)
+        rates = np.empty(COLUMNS, np.float32)
         rates[MEAN] = position * self.radius
         rates[QUATERNION] = RATE_ROTATION
         rates[SCALE] = RATE_SCALE
@@ -220,19 +178,22 @@ class StaticTrainer:
         Args:
             target: number of Gaussians to reach.
         """
-        opacity = 1 / (1 + np.exp(-self.parameters[:, 10]))
-        score = self._screen / np.maximum(self._seen, 1)
+        parameters, statistics = self.fit.table.parameters, self.fit.table.statistics
+        assert statistics is not None
+        opacity = 1 / (1 + np.exp(-parameters[:, OPACITY.start]))
+        score = statistics.pull / np.maximum(statistics.rendered, 1)
         keep = opacity >= min(PRUNE_OPACITY, float(np.median(opacity)))  # never more than half at once
         room = max(0, min(target, self.budget) - int(keep.sum()))
         score = np.where(keep & (score >= DENSIFY_GRADIENT), score, 0)
         chosen = np.argsort(-score, kind="stable")[: min(room, int((score > 0).sum()))]
-        largest = self.parameters[:, SCALE].max(axis=1)
+        largest = parameters[:, SCALE].max(axis=1)
         median = np.median(largest[keep])
         split = chosen[largest[chosen] > median]
         clone = chosen[largest[chosen] <= median]
-        halves = [self._half(split), self._half(split)]
+        halves = [self._half(parameters[split], statistics.factors[split]) for _ in range(2)]
         keep[split] = False
-        self._take(np.flatnonzero(keep), [self.parameters[clone], *halves], [clone, split, split])
+        added, parents = np.concatenate([parameters[clone], *halves]), np.concatenate([clone, split, split])
+        self.fit.replace_rows(np.flatnonzero(keep), added, parents)
 
     def remove_unseen(self) -> None:
         """Removes Gaussians that fewer than ``MIN_VIEWS`` cameras see.
@@ -240,61 +201,37 @@ class StaticTrainer:
         A Gaussian that no camera sees is free to be anything and shows once the scene moves; one that a single camera
         sees is a floater that explains this camera's picture and spoils all others.
         """
-        counts = np.zeros(len(self.parameters), np.int64)
+        counts = np.zeros(len(self.fit), np.int64)
         state = self.gaussians()
         for view in self.views:
             everywhere = np.ones((1, view.camera.height, view.camera.width), np.float32)
-            counts += self.loss.gather(state, view.camera, everywhere)[:, 0] > SEEN_PIXELS
+            counts += self.fit.renderer.gather(state, view.camera, everywhere)[:, 0] > SEEN_PIXELS
         needed = np.full(len(counts), min(MIN_VIEWS, len(self.views)))
         if self.stage is not None:  # surroundings hide nothing from others
-            needed[~self.stage.holds(self._means)] = 1
+            needed[~self.stage.holds(state.means)] = 1
         keep = counts >= needed
         if keep.any():
-            self._take(np.flatnonzero(keep), [], [])
+            none = np.zeros(0, np.int64)
+            self.fit.replace_rows(np.flatnonzero(keep), np.zeros((0, COLUMNS), np.float32), none)
 
-    def _take(self, rows: NDArray[np.int64], added: list[Array], parents: list[NDArray[np.int64]]) -> None:
-        """Keeps some rows with their moments and appends others with none; ``parents``: the rows these come from."""
-        if self.shading is not None:
-            self.shading = self.shading.taken(rows, np.concatenate([rows[:0], *parents]))
-        fresh = np.zeros((sum(map(len, added)), activation.COLUMNS), np.float32)
-        first = np.concatenate([self._first[rows], fresh])
-        second = np.concatenate([self._second[rows], fresh])
-        self.parameters = np.ascontiguousarray(np.concatenate([self.parameters[rows], *added]))
-        self._reset_moments()
-        self._first, self._second = first, second
-        self._allocate()
-
-    def _half(self, rows: NDArray[np.int64]) -> Array:
-        """The rows with smaller scales, each displaced by a sample of its own Gaussian."""
-        half = self.parameters[rows].copy()
-        offset = self.random.standard_normal((len(rows), 3)).astype(np.float32)
-        half[:, MEAN] += np.einsum("nij,nj->ni", self._factors[rows], offset)
+    def _half(self, half: Array, factors: Array) -> Array:
+        """Rows of parameters with smaller scales, each displaced by a sample of its own Gaussian."""
+        offset = self.random.standard_normal((len(half), 3)).astype(np.float32)
+        half = half.copy()
+        half[:, MEAN] += np.einsum("nij,nj->ni", factors, offset)
         half[:, SCALE] -= np.log(SPLIT_SHRINK)
         return half
 
     def gaussians(self) -> Gaussians:
         """The state Θ_0; without masks every Gaussian may move."""
-        shading = self.shading
-        self._allocate()
-        activation.activate(self.parameters, self._means, self._factors, self._opacities, self._features)
-        count = len(self.parameters)
-        return Gaussians(
-            means=self._means.copy(),
-            factors=self._factors.copy(),
-            rotations=np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1)),
-            opacities=self._opacities.copy(),
-            colours=self._features[:, :3].copy(),
-            foreground=self._features[:, 3].copy() if self._masked else np.ones(count, np.float32),
-            ids=np.arange(count, dtype=np.int64),
-            gloss=None if shading is None else shading.gloss.copy(),
-            environment=None if shading is None else shading.environment.copy(),
-        )
+        state = self.fit.state()
+        return state if self._masked else state.replace(foreground=np.ones(len(state), np.float32))
 
     def result(self, losses: list[float]) -> StaticResult:
         """Of the iterations so far."""
-        found, planned = self.exposures.found(), self.schedule.record
+        exposures, planned, shortened = self.exposures.found(), self.schedule.record, self.schedule.shortened
         return StaticResult(
-            self.gaussians(), found, losses, self.psnr, self.cameras, planned=planned, hurried=self.schedule.shortened
+            self.gaussians(), exposures, losses, self.fit.psnr, self.cameras, planned=planned, hurried=shortened
         )
 
 
@@ -308,6 +245,7 @@ def first_trainer(
     settings: StaticSettings,
     limit: TimeLimit | None = None,
     stage: Stage | None = None,
+    device: str = "cpu",
 ) -> StaticTrainer:
     """The trainer of ``start.fit_static_scene``, before its first iteration; arguments and errors are the same.
 
@@ -318,4 +256,4 @@ def first_trainer(
     rng = np.random.default_rng(settings.seed)
     most = max(1, int(INITIAL_SHARE * budget(views, scene, settings)))
     parameters = initial_parameters(positions, colours, foreground, most, rng)
-    return StaticTrainer(factory, views, parameters, scene, settings, limit, stage)
+    return StaticTrainer(factory, views, parameters, scene, settings, limit, stage, device)

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scas4d_core.engines.cpu.gloss import SAME_SIDE, without_turn
-from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
+from scas4d_core.engines.renderer import Renderer
 from scas4d_core.engines.views import TrainingView
+from scas4d_core.gaussians import Gaussians
 
 Array = NDArray[np.float32]
 Float = NDArray[np.float64]
@@ -41,13 +42,7 @@ TINY = 1e-12
 
 
 def strengths_seen(
-    normals: Array,
-    environment: Array,
-    means: Array,
-    factors: Array,
-    opacities: Array,
-    views: Sequence[TrainingView],
-    rasterizer: CpuRasterizer,
+    normals: Array, environment: Array, state: Gaussians, views: Sequence[TrainingView], renderer: Renderer
 ) -> Array:
     """[N, 1] strengths of unit normals [N, 3] in an environment.
 
@@ -56,30 +51,25 @@ def strengths_seen(
     of what is clear about it, or near 0 where nothing is.
 
     Args:
-        means, factors, opacities: of the state. views: of it.
+        views: of the state.
     """
     from scas4d_core.kernels.appearance.direction import DARK, FALL, OVER, shade
 
-    count, black = len(means), np.zeros(4, np.float32)
-    features, shown = np.zeros((count, 4), np.float32), np.zeros((count, 4), np.float32)
+    means, count = state.means, len(state)
+    shown = np.zeros((count, 4), np.float32)
     sums = np.zeros((6, count, 3))  # of weights, light, mirrored, mirrored × light, mirrored², light²
     for view in views:
-        rasterizer.forward(means, factors, opacities, features, view.camera, black)
-        g_image, g_alpha = rasterizer.gradient_buffers()
-        g_image[:], g_alpha[:] = 0, 0
-        height, width = view.target.shape[1:]
         gain, offset = view.exposure[:3, :1, None], view.exposure[:3, 1:, None]
-        g_image[:3, :height, :width] = (view.target[:3] - offset) / gain
-        g_image[3, :height, :width] = 1
-        found = rasterizer.backward(g_image, g_alpha, 3).features
-        g_image[:] = 0
-        colours = found[:, :3] / np.maximum(found[:, 3:], 1e-6)
+        planes = np.ones((4, *view.target.shape[1:]), np.float32)
+        planes[:3] = (view.target[:3] - offset) / gain
+        blended = renderer.gather(state, view.camera, planes)
+        colours = blended[:, :3] / np.maximum(blended[:, 3:], 1e-6)
         centre = view.camera.centre
         ahead = centre - means
         facing = np.einsum("nc,nc->n", ahead, normals) / np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)
-        counts = (found[:, 3] > ENOUGH) & (facing > FLATTEST)
+        counts = (blended[:, 3] > ENOUGH) & (facing > FLATTEST)
         white = colours * gain[:, 0, 0] + offset[:, 0, 0] >= WHITE
-        weight = np.where(counts[:, None] & ~white, np.minimum(found[:, 3:], 1), 0).astype(np.float64)
+        weight = np.where(counts[:, None] & ~white, np.minimum(blended[:, 3:], 1), 0).astype(np.float64)
         shade(means, normals, without_turn(count), np.zeros((count, 3), np.float32), environment, centre, shown)
         value = np.where(shown[:, :3] > 1, 1 + (shown[:, :3] - 1) / OVER, shown[:, :3])
         seen = value * np.maximum(np.abs(value), np.sqrt(DARK))

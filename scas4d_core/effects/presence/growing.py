@@ -8,19 +8,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from time import perf_counter
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.effects.presence.carving import Hull, colours_of
+from scas4d_core.engines.choose import fit_engine_of
+from scas4d_core.engines.fit import COLOUR, COLUMNS, LABEL, MEAN, OPACITY, QUATERNION, SCALE, FitScalars
+from scas4d_core.fit.gaussian_fit import FitStep, GaussianFit, each_once
+from scas4d_core.fit.initial_gaussians import initial_parameters, logit
+from scas4d_core.update import schedule
+from scas4d_core.update.view_factory import ViewFactory
 
 if TYPE_CHECKING:
     from scas4d_core.cameras import Camera, Rig
     from scas4d_core.effects.evidence import FitTime
     from scas4d_core.effects.presence.novelty import Novelty
-    from scas4d_core.engines.cpu.renderer import CpuRenderer
+    from scas4d_core.engines.renderer import Renderer
     from scas4d_core.engines.views import TrainingView
     from scas4d_core.gaussians import Gaussians
 
@@ -37,7 +43,7 @@ FEWEST = 0.25
 and the next frame finds it as well."""
 SHORTEST = 1e-6
 """Metres, of an axis."""
-OPACITY = 0.6
+FIRST_OPACITY = 0.6
 """Of a Gaussian when it is born: on a surface that is known, more than the 0.1 of a cloud of which half is wrong."""
 CONFIRMED = 2
 """Cameras that must see the colour of a point."""
@@ -45,7 +51,7 @@ MARGIN = 8
 """Pixels about what is rendered: the window of SSIM, and the Gaussians' widths."""
 WIDTHS = 3.5
 """Standard deviations that a Gaussian reaches."""
-POSITION, COLOUR, LOGIT, SCALE, ROTATION = 3.2e-4, 1e-2, 5e-2, 1e-2, 4e-3
+RATE_POSITION, RATE_COLOUR, RATE_OPACITY, RATE_SCALE, RATE_ROTATION = 3.2e-4, 1e-2, 5e-2, 1e-2, 4e-3
 """Adam's rates of means (per metre of the rig's radius), RGB, logits of opacity, log scales, quaternions: one to four
 times those of frame 0, for an eighth of its iterations."""
 END = 0.05
@@ -70,7 +76,7 @@ def grown(
     colours: Array,
     views: Sequence[TrainingView],
     rig: Rig,
-    picture: CpuRenderer,
+    renderer: Renderer,
     rng: np.random.Generator,
     *,
     moves: bool,
@@ -80,19 +86,16 @@ def grown(
 
     Args:
         state: Θ_t, all of whose Gaussians stay as they are. points: [P, 3] inside. colours: [P, 3].
-        views: of the frame. rig: the cameras inside. picture: has background and limits of the scene.
+        views: of the frame. rig: the cameras inside. renderer: has background and limits of the scene.
         rng: of the order of views. moves: whether they do, or stand. time: for the fit.
     """
-    from scas4d_core.first_frame import initial_gaussians as made
-
-    parameters = made.initial_parameters(points, colours, None, len(points), rng)
-    parameters[:, made.OPACITY] = made.logit(np.array(OPACITY))
-    parameters[:, made.LABEL] = made.logit(np.array(float(moves)))
-    fit = _Fit(state, parameters, views, rig, picture)
-    if not fit.run(ITERATIONS, rng, time):
+    parameters = initial_parameters(points, colours, None, len(points), rng)
+    parameters[:, OPACITY] = logit(np.array(FIRST_OPACITY))
+    parameters[:, LABEL] = logit(np.array(float(moves)))
+    born = _fit_crops(state, parameters, views, rig, renderer, rng, time, iterations=ITERATIONS)
+    if born is None:
         time.put_off.append(f"{len(points)} Gaussians that {'move' if moves else 'stand'} were not born")
-        return None
-    return fit.gaussians()
+    return born
 
 
 def settled(
@@ -100,7 +103,7 @@ def settled(
     rows: Int,
     views: Sequence[TrainingView],
     rig: Rig,
-    picture: CpuRenderer,
+    renderer: Renderer,
     rng: np.random.Generator,
     time: FitTime,
 ) -> Gaussians:
@@ -111,8 +114,6 @@ def settled(
             itself, is left as it is: more is seen of it than its colours, which alone are fitted.
         time: for the fit; without enough of it they stay as they are.
     """
-    from scas4d_core.first_frame import initial_gaussians as made
-
     if state.gloss is not None:  # those born later have none
         rows = rows[rows >= len(state.gloss)]
     if not len(rows):
@@ -122,133 +123,96 @@ def settled(
     handed = np.sign(np.linalg.det(sides))
     sides[:, :, 2] *= handed[:, None]
     axes[:, 2] *= handed[:, None]
-    parameters = np.zeros((len(rows), 15), np.float32)
-    parameters[:, made.MEAN] = mine.means
-    parameters[:, made.QUATERNION] = Rotation.from_matrix(sides).as_quat()[:, [3, 0, 1, 2]]
-    parameters[:, made.SCALE] = np.log(np.maximum(lengths, SHORTEST))
-    parameters[:, made.OPACITY] = made.logit(mine.opacities[:, None])
-    parameters[:, made.COLOUR] = mine.colours
-    parameters[:, made.LABEL] = made.logit(mine.foreground[:, None])
-    fit = _Fit(others, parameters, views, rig, picture)
-    if not fit.run(SETTLING, rng, time, opacities=False):
+    parameters = np.zeros((len(rows), COLUMNS), np.float32)
+    parameters[:, MEAN] = mine.means
+    parameters[:, QUATERNION] = Rotation.from_matrix(sides).as_quat()[:, [3, 0, 1, 2]]
+    parameters[:, SCALE] = np.log(np.maximum(lengths, SHORTEST))
+    parameters[:, OPACITY] = logit(mine.opacities[:, None])
+    parameters[:, COLOUR] = mine.colours
+    parameters[:, LABEL] = logit(mine.foreground[:, None])
+    given = views, rig, renderer, rng, time
+    fitted = _fit_crops(others, parameters, *given, iterations=SETTLING, opacities=False)
+    if fitted is None:
         time.put_off.append(f"{len(rows)} young Gaussians were not settled")
         return state
-    found = fit.gaussians()
     means, factors, colours = state.means.copy(), state.factors.copy(), state.colours.copy()
-    means[rows], colours[rows] = found.means, found.colours
-    factors[rows] = found.factors @ axes.astype(np.float32)  # the axes that were transported stay the same ones
+    means[rows], colours[rows] = fitted.means, fitted.colours
+    factors[rows] = fitted.factors @ axes.astype(np.float32)  # the axes that were transported stay the same ones
     return state.replace(means=means, factors=factors, colours=colours)
 
 
-class _Crop(NamedTuple):
-    """The part of a view that is rendered, the others that reach into it, and the arrays that hold them all."""
+class _Schedule:
+    """The iterations of a fit: as many as are planned, or as there is time for; rates fall along half a cosine.
 
-    view: TrainingView
-    others: int
-    means: Array
-    factors: Array
-    opacities: Array
-    features: Array
+    Attributes:
+        whole: False where there was time for too few steps: what was fitted so far is of no use.
+    """
 
-    @property
-    def born(self) -> tuple[Array, Array, Array, Array]:
-        n = self.others
-        return self.means[n:], self.factors[n:], self.opacities[n:], self.features[n:]
+    def __init__(self, iterations: int, end: float | None, rates: Array) -> None:
+        self._iterations, self._end, self._rates = iterations, end, rates
+        self._stopping, self._planned = schedule.Stopping(iterations, end=end), iterations
+        self.whole = True
+
+    def begin(self, done: int) -> FitStep | None:
+        """See ``GaussianFit.run``."""
+        if done == 0 and self._end is not None and perf_counter() >= self._end:
+            self.whole = False
+            return None
+        self._planned = self._stopping.planned(done)
+        probed = done >= min(schedule.PROBE, self._planned)
+        self.whole = not probed or self._planned >= FEWEST * self._iterations
+        return each_once(done) if self.whole and done < self._planned else None
+
+    def scalars(self, now: FitStep) -> FitScalars:
+        """See ``GaussianFit.run``."""
+        left = END + (1 - END) * 0.5 * (1 + np.cos(np.pi * min(1.0, now.begun / max(1, self._planned - 1))))
+        return FitScalars((left * self._rates).astype(np.float32))
 
 
-class _Fit:
-    """Fits the rows of a table of parameters (``kernels.activation``) beside a state that stays as it is."""
+def _fit_crops(
+    state: Gaussians,
+    parameters: Array,
+    views: Sequence[TrainingView],
+    rig: Rig,
+    renderer: Renderer,
+    rng: np.random.Generator,
+    time: FitTime,
+    *,
+    iterations: int,
+    opacities: bool = True,
+) -> Gaussians | None:
+    """Fit parameters beside a state that stays fixed, each step to a part of one view; None where time is too short.
 
-    def __init__(
-        self, state: Gaussians, parameters: Array, views: Sequence[TrainingView], rig: Rig, picture: CpuRenderer
-    ) -> None:
-        from scas4d_core.update.view_factory import ViewFactory
+    Args:
+        opacities: whether these change.
+    """
+    fit = _beside(state, parameters, views, rig, renderer)
+    rates = np.zeros(COLUMNS, np.float32)
+    rates[MEAN], rates[COLOUR] = RATE_POSITION * rig.radius, RATE_COLOUR
+    rates[OPACITY], rates[SCALE], rates[QUATERNION] = RATE_OPACITY * opacities, RATE_SCALE, RATE_ROTATION
+    steps, began = _Schedule(iterations, time.end, rates), perf_counter()
+    if fit.views and len(fit):
+        order = schedule.view_order(len(fit.views), iterations, rng)
+        fit.run(order, steps.scalars, steps.begin)
+    time.spent += perf_counter() - began
+    if not steps.whole:
+        return None
+    fitted = fit.state()
+    return fitted.replace(foreground=np.round(fitted.foreground))
 
-        self._parameters, self._radius = parameters, rig.radius
-        factory = ViewFactory(rig)
-        self._picture = picture.apart()
-        self._crops = []
-        for view in views:
-            box = _box(rig[view.name], parameters[:, :3].astype(np.float64))
-            if box is not None:
-                rows = _reaching(state, rig[view.name], box)
-                self._crops.append(self._crop(state, rows, factory.cropped(view, *box)))
 
-    def _crop(self, state: Gaussians, rows: Int, view: TrainingView) -> _Crop:
-        from scas4d_core.engines.cpu.gloss import features_seen  # it loads the kernels
-
-        n = len(rows)
-        count = n + len(self._parameters)
-        made = _Crop(
-            view, n, np.empty((count, 3), np.float32), np.empty((count, 3, 3), np.float32),
-            np.empty(count, np.float32), np.empty((count, 4), np.float32),
-        )  # fmt: skip
-        made.means[:n], made.factors[:n] = state.means[rows], state.factors[rows]
-        made.opacities[:n] = state.opacities[rows]
-        made.features[:n] = features_seen(state.rows(rows), view.camera)
-        return made
-
-    def run(self, iterations: int, rng: np.random.Generator, time: FitTime, opacities: bool = True) -> bool:
-        """Steps the parameters so many times, each with a part of one view, or as often as there is time for.
-
-        Args:
-            opacities: whether these change.
-
-        Returns:
-            False where there is time for too few steps: what was fitted so far is of no use.
-        """
-        began = perf_counter()
-        whole = self._stepped(iterations, rng, time.end, opacities)
-        time.spent += perf_counter() - began
-        return whole
-
-    def _stepped(self, iterations: int, rng: np.random.Generator, end: float | None, opacities: bool) -> bool:
-        from scas4d_core.first_frame import initial_gaussians as columns
-        from scas4d_core.kernels import activation
-        from scas4d_core.kernels.adam import EVERY_ROW, adam
-        from scas4d_core.update.schedule import PROBE, Stopping, view_order
-
-        if not self._crops or not len(self._parameters):
-            return True
-        if end is not None and perf_counter() >= end:
-            return False
-        stopping = Stopping(iterations, end=end)
-        parameters = self._parameters
-        gradients, first, second = (np.zeros_like(parameters) for _ in range(3))
-        rates = np.zeros(activation.COLUMNS, np.float32)
-        rates[columns.MEAN], rates[columns.COLOUR] = POSITION * self._radius, COLOUR
-        rates[columns.OPACITY], rates[columns.SCALE], rates[columns.QUATERNION] = LOGIT * opacities, SCALE, ROTATION
-        for iteration, index in enumerate(view_order(len(self._crops), iterations, rng)):
-            planned = stopping.planned(iteration)
-            if iteration >= min(PROBE, planned) and planned < FEWEST * iterations:
-                return False
-            if iteration >= planned:
-                break
-            crop = self._crops[index]
-            n, born = crop.others, crop.born
-            activation.activate(parameters, *born)
-            found = self._picture.evaluate(crop.means, crop.factors, crop.opacities, crop.features, crop.view)
-            activation.activate_backward(
-                parameters, *born[1:], found.means[n:], found.factors[n:], found.opacities[n:], found.features[n:],
-                gradients,
-            )  # fmt: skip
-            left = END + (1 - END) * 0.5 * (1 + np.cos(np.pi * min(1.0, iteration / max(1, planned - 1))))
-            adam(
-                parameters, gradients, first, second, (left * rates).astype(np.float32), EVERY_ROW, BETA1, BETA2,
-                iteration + 1,
-            )  # fmt: skip
-        return True
-
-    def gaussians(self) -> Gaussians:
-        """The fitted Gaussians."""
-        from scas4d_core.gaussians import Gaussians
-        from scas4d_core.kernels import activation
-
-        count = len(self._parameters)
-        made = Gaussians.of_points(self._parameters[:, :3], 0.0)
-        features = np.empty((count, 4), np.float32)
-        activation.activate(self._parameters, made.means, made.factors, made.opacities, features)
-        return made.replace(colours=features[:, :3].copy(), foreground=np.round(features[:, 3]))
+def _beside(
+    state: Gaussians, parameters: Array, views: Sequence[TrainingView], rig: Rig, renderer: Renderer
+) -> GaussianFit:
+    """A fit to the parts of the views that show the parameters, beside the Gaussians of the state that reach there."""
+    factory, crops, fixed = ViewFactory(rig), [], []
+    for view in views:
+        camera = rig[view.name]
+        box = _box(camera, parameters[:, MEAN].astype(np.float64))
+        if box is not None:
+            fixed.append(state.rows(_reaching(state, camera, box)))
+            crops.append(factory.cropped(view, *box))
+    return GaussianFit(fit_engine_of(renderer), crops, parameters, fixed=fixed, betas=(BETA1, BETA2))
 
 
 def _box(camera: Camera, points: Float) -> tuple[int, int, int, int] | None:

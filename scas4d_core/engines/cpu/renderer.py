@@ -63,10 +63,11 @@ class CpuRenderer:
         self.mask_part = 0.0
         self.psnr = 0.0
 
-    def apart(self) -> CpuRenderer:
-        """A renderer with the same background and limits, the image loss alone, and buffers of its own."""
+    def with_new_buffers(self, mask_weight: float) -> CpuRenderer:
+        """A renderer of whole pictures with the same background and limits; its mask loss teaches the labels alone."""
         red, green, blue, _ = self._background.tolist()
-        return CpuRenderer((red, green, blue), limits=Limits(*self.rasterizer.limits.tolist()))
+        limits = Limits(*self.rasterizer.limits.tolist())
+        return CpuRenderer((red, green, blue), 1.0, mask_weight, mask_weight == 0, limits)
 
     # The ``Renderer`` interface: states.
 

@@ -9,16 +9,17 @@ import pytest
 from box_scene import held_out_camera, make_box, make_rig, photograph, take_frame
 
 from scas4d_core.captures.frame import Frame
+from scas4d_core.engines.fit import OPACITY
 from scas4d_core.first_frame import static_scene
-from scas4d_core.first_frame.exposures import SPREAD
 from scas4d_core.first_frame.fit_schedule import FitProgress
-from scas4d_core.first_frame.initial_gaussians import budget, initial_parameters, logit
 from scas4d_core.first_frame.start import fit_static_scene
 from scas4d_core.first_frame.static_scene import (
     STOP_ROUNDS,
     StaticResult,
     StaticTrainer,
 )
+from scas4d_core.fit.exposures import SPREAD
+from scas4d_core.fit.initial_gaussians import initial_parameters, logit
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.settings import SceneSettings, StaticSettings
 from scas4d_core.update.view_factory import ViewFactory
@@ -122,31 +123,20 @@ def test_the_budget_is_kept_also_where_the_cloud_exceeds_it(limit: int) -> None:
     assert len(fit(settings).gaussians) <= limit
 
 
-def test_detail_is_a_share_of_what_the_rule_gives() -> None:
-    views = ViewFactory(RIG).views(take_frame(0, 0.0, BOX, RIG, True), {})
-    rule, few, tiny = (budget(views, SceneSettings(), StaticSettings(detail=d)) for d in (1.0, 0.3, 1e-9))
-    assert rule > 100
-    assert abs(few - 0.3 * rule) < 1
-    assert tiny == 1
-    given = StaticSettings(max_gaussians=70, detail=0.3)
-    assert budget(views, SceneSettings(), given) == 70
-
-
 def test_faint_gaussians_are_removed_but_never_all() -> None:
     factory = ViewFactory(RIG)
     views = factory.views(take_frame(0, 0.0, BOX, RIG), {})
     parameters = initial_parameters(*cloud(), None, 1000, np.random.default_rng(0))
     trainer = StaticTrainer(factory, views, parameters, SceneSettings(), SETTINGS)
-    trainer._allocate()
-    trainer.step(views[0], 0)
-    count = len(trainer.parameters)
-    trainer.parameters[5:25, 10] = logit(np.array(0.5 * static_scene.PRUNE_OPACITY))
+    trainer.fit.run([0], trainer.scalars)
+    count = len(trainer.fit)
+    trainer.fit.table.parameters[5:25, OPACITY] = logit(np.array(0.5 * static_scene.PRUNE_OPACITY))
     trainer.control_density(0)  # no room: nothing is added
-    assert len(trainer.parameters) == count - 20
+    assert len(trainer.fit) == count - 20
     assert trainer.gaussians().opacities.min() >= static_scene.PRUNE_OPACITY
-    trainer.parameters[:, 10] = -9
+    trainer.fit.table.parameters[:, OPACITY] = -9
     trainer.control_density(0)
-    assert len(trainer.parameters) > 0
+    assert len(trainer.fit) > 0
 
 
 def test_exposures_of_the_cameras_are_recovered(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -176,20 +166,6 @@ def test_exposures_are_given_up_where_the_cameras_are_alike(spread: float, kept:
     trainer.exposures.assess()
     assert trainer.exposures.on == kept
     assert all((view.exposure == (1, 0)).all() for view in views) != kept
-
-
-def test_first_gaussians_are_as_wide_as_their_neighbours_are_far() -> None:
-    line = np.zeros((10, 3))
-    line[:, 0] = 0.1 * np.arange(10)
-    colours = np.full((10, 3), 0.25, np.float32)
-    table = initial_parameters(line, colours, None, 100, np.random.default_rng(0))
-    # In the middle the three nearest are at 0.1, 0.1 and 0.2 m.
-    np.testing.assert_allclose(np.exp(table[5, 7:10]), np.sqrt((0.01 + 0.01 + 0.04) / 3), rtol=1e-5)
-    np.testing.assert_allclose(table[:, 11:14], colours)
-    assert len(initial_parameters(line, colours, None, 4, np.random.default_rng(0))) == 4
-    alone = initial_parameters(line[:1], colours[:1], np.ones(1, np.float32), 4, np.random.default_rng(0))
-    assert np.isfinite(alone).all()
-    assert alone[0, 14] > 1
 
 
 def test_an_empty_cloud_is_refused() -> None:

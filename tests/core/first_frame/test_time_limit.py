@@ -12,9 +12,9 @@ from box_scene import make_box, make_rig, take_frame
 from scas4d_core.captures.frame import InitialPoints
 from scas4d_core.first_frame import fit_schedule, start, static_scene
 from scas4d_core.first_frame.fit_schedule import FEWEST, FitSchedule
-from scas4d_core.first_frame.initial_gaussians import initial_parameters
 from scas4d_core.first_frame.static_scene import StaticTrainer
 from scas4d_core.first_frame.time_limit import STEREO, TimeLimit
+from scas4d_core.fit.initial_gaussians import initial_parameters
 from scas4d_core.frame_outcome import first_warnings
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings
@@ -132,7 +132,7 @@ def trainer(monkeypatch: pytest.MonkeyPatch) -> Callable[[TimeLimit], StaticTrai
 def test_a_limit_that_does_not_bind_changes_no_bit(trainer: Callable[[TimeLimit], StaticTrainer]) -> None:
     free, bound = trainer(TimeLimit(None)), trainer(TimeLimit(1e5, clock=Clock(0.001)))
     assert free.train() == bound.train()
-    np.testing.assert_array_equal(free.parameters, bound.parameters)
+    np.testing.assert_array_equal(free.fit.table.parameters, bound.fit.table.parameters)
 
 
 def test_a_shortened_fit_goes_through_all_phases(trainer: Callable[[TimeLimit], StaticTrainer]) -> None:
@@ -145,7 +145,7 @@ def test_a_shortened_fit_goes_through_all_phases(trainer: Callable[[TimeLimit], 
         return own(at)
 
     made._rates = noted  # type: ignore[method-assign]
-    began = len(made.parameters)
+    began = len(made.fit)
     assessed: list[bool] = []
     made.exposures.assess = lambda: assessed.append(True)  # type: ignore[method-assign]
     losses = made.train()
@@ -154,7 +154,7 @@ def test_a_shortened_fit_goes_through_all_phases(trainer: Callable[[TimeLimit], 
     assert rates[0] == pytest.approx(static_scene.RATE_POSITION, rel=1e-3)
     assert rates[-1] == pytest.approx(static_scene.RATE_POSITION_END, rel=0.2)
     assert all(one >= two for one, two in pairwise(rates))
-    assert len(made.parameters) > 1.1 * began
+    assert len(made.fit) > 1.1 * began
     assert assessed == [True]
     assert set(made.cameras) == set(RIG.names)
     assert np.mean(losses[-10:]) < 0.8 * np.mean(losses[:10])

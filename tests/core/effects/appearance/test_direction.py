@@ -25,7 +25,6 @@ from scas4d_core.engines.cpu.gloss import (
     neighbourhoods,
     without_turn,
 )
-from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.views import CameraArrays
 from scas4d_core.first_frame.glossy import fit_by_direction
@@ -104,7 +103,7 @@ def test_a_gpu_is_refused() -> None:
 def test_normals_are_those_of_the_ball() -> None:
     state = sphere()
     views = ViewFactory(rig()).views(frame(state), {})
-    found = surface_normals(state.means, state.factors, state.opacities, views, CpuRasterizer())
+    found = surface_normals(state, views, CpuRenderer((0, 0, 0)))
     cosines = np.clip(np.einsum("nc,nc->n", found, state.means / RADIUS), -1, 1)
     assert np.degrees(np.arccos(cosines)).max() < 25
     assert np.degrees(np.arccos(np.median(cosines))) < 6
@@ -119,7 +118,7 @@ def test_the_surface_of_a_rough_body_in_a_haze_is_the_haze(monkeypatch: pytest.M
     views = ViewFactory(rig()).views(frame(state), {})
 
     def median_angle() -> float:
-        found = surface_normals(state.means, state.factors, state.opacities, views, CpuRasterizer())[COUNT:]
+        found = surface_normals(state, views, CpuRenderer((0, 0, 0)))[COUNT:]
         cosines = np.einsum("nc,nc->n", found, ball.means / RADIUS)
         return float(np.degrees(np.arccos(np.median(cosines))))
 
@@ -135,15 +134,14 @@ def test_strengths_tell_what_is_glossy_from_what_is_dull() -> None:
     dull = truth.means[:, 0] < 0
     half = truth.replace(gloss=np.where(dull[:, None], 0, truth.gloss).astype(np.float32))
     views = ViewFactory(rig()).views(frame(half), {})
-    shape = truth.means, truth.factors, truth.opacities
     normals = (truth.means / RADIUS).astype(np.float32)
-    found = strengths_seen(normals, truth.environment, *shape, views, CpuRasterizer())[:, 0]
+    found = strengths_seen(normals, truth.environment, truth, views, CpuRenderer((0, 0, 0)))[:, 0]
     far = np.abs(truth.means[:, 0]) > 0.05  # neighbours share a strength
     assert np.median(found[dull & far]) < 0.15
     assert 0.3 < np.median(found[~dull & far]) < 0.7
     assert np.isfinite(found).all()
     # Three cameras see few places in the light of a lamp and out of it: the rest has the strength of what is about it.
-    found = strengths_seen(normals, truth.environment, *shape, views[:3], CpuRasterizer())[:, 0]
+    found = strengths_seen(normals, truth.environment, truth, views[:3], CpuRenderer((0, 0, 0)))[:, 0]
     assert np.median(found[dull & far]) < 0.05
     assert 0.3 < np.median(found[~dull & far]) < 0.7
 

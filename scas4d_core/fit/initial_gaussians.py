@@ -6,16 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from scas4d_core.engines.fit import COLOUR, COLUMNS, LABEL, MEAN, OPACITY, SCALE
 from scas4d_core.engines.views import TrainingView
-from scas4d_core.kernels import activation
 from scas4d_core.settings import SceneSettings, StaticSettings
 
 Array = NDArray[np.float32]
-
-MEAN, QUATERNION, SCALE, OPACITY, COLOUR, LABEL = (
-    slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 11), slice(11, 14), slice(14, 15)
-)  # fmt: skip
-"""Columns of the table of parameters, a row a Gaussian (``kernels.activation``)."""
 
 INITIAL_OPACITY = 0.1
 PER_PIXEL, PER_COVERED_PIXEL, LARGEST_BUDGET = 0.34, 0.27, 100_000
@@ -62,7 +57,7 @@ def initial_parameters(
     distances = cKDTree(positions).query(positions, k=neighbours)[0]
     squared = np.square(distances).reshape(len(positions), -1)[:, 1:]
     width = np.sqrt(np.maximum(squared.mean(axis=1), 1e-7)) if neighbours > 1 else np.full(len(positions), 0.05)
-    parameters = np.zeros((len(positions), activation.COLUMNS), np.float32)
+    parameters = np.zeros((len(positions), COLUMNS), np.float32)
     parameters[:, MEAN] = positions
     parameters[:, 3] = 1
     parameters[:, SCALE] = np.log(width)[:, None]
