@@ -230,7 +230,8 @@ def twin_iteration(fused: Iteration, settings: UpdateSettings, masks: bool) -> t
     for index in fused.views:
         camera = RIG.cameras[index]
         moved_means, moved_factors = (
-            whole.index_copy(0, torch.tensor(rows), part) for whole, part in ((means, now.means), (factors, now.factors))
+            whole.index_copy(0, torch.tensor(rows), part)
+            for whole, part in ((means, now.means), (factors, now.factors))
         )
         picture = rasterizer.render(
             moved_means, moved_factors, doubles(BEFORE.opacities), features,

@@ -118,7 +118,7 @@ def test_only_what_is_missing_is_measured_the_cheapest_first(tmp_path, monkeypat
 
 def test_a_row_with_another_constant_is_another_row():
     (varied,) = AXES["max-scale"]
-    assert varied.record["constants"] == {"scas4d_core.engines.cpu.deformation.MAX_SCALE": 2.0}
+    assert varied.record["constants"] == {"scas4d_core.engines.plan.MAX_SCALE": 2.0}
     rows = [made_row(DEFAULT, "robot", 5), made_row(varied, "robot", 5)]
     assert (row_of(rows, DEFAULT, "robot", 5), row_of(rows, varied, "robot", 5)) == (rows[0], rows[1])
 

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.effects.switches import joined
-from scas4d_core.engines.cpu.blocks import as_blocks, as_grid
 from scas4d_core.engines.cpu import changed_pixels
 from scas4d_core.engines.cpu import engine as cpu_engine
+from scas4d_core.engines.cpu.blocks import as_blocks, as_grid
 from scas4d_core.engines.cpu.changed_pixels import ChangedPixels, taken
 from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
