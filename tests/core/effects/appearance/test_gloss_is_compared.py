@@ -44,8 +44,8 @@ def views(truth: Gaussians = BALL) -> list[TrainingView]:
     return FACTORY.views(frame(truth, 1), {}, use_masks=False)
 
 
-def updater(before: Gaussians, engine: CpuEngine) -> FrameUpdate:
-    hierarchy = build_hierarchy(before.means, before.moving, (2, 12), SMALLEST_CLUSTER)
+def updater(before: Gaussians, engine: CpuEngine, clusters: tuple[int, ...] = (2, 12)) -> FrameUpdate:
+    hierarchy = build_hierarchy(before.means, before.moving, clusters, SMALLEST_CLUSTER)
     built = PlanBuilder(SceneSettings(), SETTINGS, FACTORY, hierarchy, before)
     return FrameUpdate(engine, joined(built, ["moving_colour", "direction"]), None)
 
@@ -87,7 +87,7 @@ def test_the_candidates_of_an_update_have_the_gloss_that_they_are_committed_with
 
 def test_a_candidate_is_seen_with_its_normals_turned() -> None:
     engine = CpuEngine()
-    hierarchy = updater(BALL, engine).hierarchy
+    hierarchy = updater(BALL, engine, (2,)).hierarchy
     probes = ProbeViews(FACTORY, engine, views())
     engine.load_views(views(), probes.views)
     engine.load_state(BALL)

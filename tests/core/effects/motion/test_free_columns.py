@@ -179,5 +179,5 @@ def test_switches_of_an_earlier_version_are_joined_by_those_of_new_effects(prepa
     settings = Settings(update=UPDATE, effects={"own_scale": "off"})
     switches = first_switches(settings, 0)
     before = {name: switches[name] for name in ("isometry", "rigidity")}
-    _, carried = preparation(settings).again(BEFORE, CarryOver(switches=before))
-    assert dict(carried.switches) == switches
+    prepared = preparation(settings).again(BEFORE, CarryOver(switches=before))
+    assert dict(prepared.carried.switches) == switches

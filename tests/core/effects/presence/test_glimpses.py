@@ -32,7 +32,8 @@ def shown(frame: Seen, kept: Candidate = Candidate.END, most: int = KEPT_PICTURE
     """The frame with the renderings that an update leaves, of every other camera."""
     log, state = IterationLog(), frame.result.gaussians
     for number in range(0, len(frame.views), 2)[:most]:
-        log.keep(number, Thinned.of(*frame.renderer.render(state, frame.views[number].camera)))
+        frame.renderer.compare(state, frame.views[number])
+        log.keep(number, Thinned.of(*frame.renderer.shown(frame.views[number])))  # type: ignore[attr-defined]
     trace = UpdateTrace(kept=kept)
     trace.take(log, frame.views)
     return replace(frame, result=replace(frame.result, trace=trace))
@@ -145,18 +146,20 @@ def test_a_trace_keeps_the_last_views_and_thins_large_pictures() -> None:
 def test_an_update_keeps_the_renderings_of_its_last_iterations() -> None:
     built = joined(builder(update=UPDATE.model_copy(update={"iterations": KEPT_PICTURES + 2})))
     views = built.factory.views(take_frame(1, 1.0, moved(BEFORE), RIG, True), {})
-    engine = Counting()
+    engine = Noting()
     found = updater_of(built, engine).run(BEFORE, views, None, 1.0, seed=3)
-    assert engine.kept == [False] * 2 + [True] * KEPT_PICTURES
-    assert set(found.trace.shown) == {view.name for view in views}
+    assert [step.keep_pictures for _, step in engine.steps] == [False] * 2 + [True] * KEPT_PICTURES
+    last = [views[index].name for taken, _ in engine.steps[2:] for index in taken]
+    assert len(set(last)) < len(last)  # some twice: the newest counts
+    assert list(found.trace.shown) == sorted(set(last), key=lambda name: len(last) - last[::-1].index(name))
 
 
-class Counting(CpuEngine):
-    """Notes in which iterations renderings are kept."""
+class Noting(CpuEngine):
+    """Notes the views and numbers of each iteration."""
 
     def __init__(self) -> None:
-        self.kept: list[bool] = []
+        self.steps: list[tuple[Sequence[int], StepScalars]] = []
 
     def iterate(self, views: Sequence[int], step: StepScalars) -> None:
-        self.kept.append(step.keep_pictures)
+        self.steps.append((views, step))
         super().iterate(views, step)
