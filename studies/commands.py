@@ -10,7 +10,7 @@ from studies.effort.commands import effort
 from studies.exports.commands import exports
 from studies.frontier.commands import frontier
 from studies.hard_cases.commands import stability, timing
-from studies.kernels.commands import device, kernels, moving, startup
+from studies.kernels.commands import kernels, moving, startup
 from studies.paper.commands import paper
 from studies.quality.commands import (
     effects,
@@ -32,7 +32,7 @@ STUDIES = {
     "Rigs": (rigs, calibration, drift),
     "What comes out": (compact, opening, exports),
     "Accuracy against time": (frontier, effort, paper, variants),
-    "Speed of the code": (kernels, device, moving, scale, startup),
+    "Speed of the code": (kernels, moving, scale, startup),
     "Hard cases": (stability, timing),
     "The running service": (faults, ingest, views, memory, sleeping, crossing, cluster, head, simulate),
 }

@@ -1,4 +1,4 @@
-"""Varies constants of the method: those that only its author turns, in the module that uses them."""
+"""Varies constants of the method: numbers that only its author turns, each in the module that uses it."""
 
 from __future__ import annotations
 

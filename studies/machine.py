@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import math
 import os
 import platform
 from collections.abc import Mapping
@@ -45,6 +47,15 @@ def processor() -> str:
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
+
+
+def resident_mb(pid: int | None = None) -> float:
+    """Resident memory of a process, this one without ``pid``, 10⁶ bytes; NaN where it cannot be read."""
+    with contextlib.suppress(OSError):
+        for line in Path(f"/proc/{pid or 'self'}/status").read_text().splitlines():
+            if line.startswith("VmRSS"):
+                return int(line.split()[1]) * 1024 / 1e6
+    return math.nan
 
 
 def core_version() -> str:

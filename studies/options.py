@@ -16,6 +16,9 @@ FRONTIER = Path("out/frontier")
 """Folder of the study of accuracy against time, which the paper's and the effort's studies share."""
 
 Capture = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture.")]
+Repeated = Annotated[
+    Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture; a short one is played back and forth.")
+]
 Captures = Annotated[list[Path], typer.Argument(metavar="CAPTURE...", help="Folders of captures.")]
 Page = Annotated[Path | None, typer.Option(help="Also write the result to this file, as Markdown.")]
 Changes = Annotated[

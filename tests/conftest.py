@@ -1,4 +1,4 @@
-"""Kernels are compiled once for all of pytest's processes; the longest tests come first; failures are named at once."""
+"""Tests get their marks; kernels are compiled once for all processes; the longest come first; failures are named."""
 
 import os
 
@@ -9,15 +9,21 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 WITHOUT_KERNELS = (
     "tests/core/captures", "tests/client/importers", "tests/core/metrics", "tests/docker", "tests/server/connections",
-    "tests/test_docs.py", "tests/test_house.py", "tests/test_imports.py", "tests/test_wheel.py",
+    "tests/core/torch_backend/test_losses.py", "tests/core/torch_backend/test_deformation.py",
+    "tests/test_docs.py", "tests/test_imports.py", "tests/test_wheel.py",
 )  # fmt: skip
 """Tests that run no kernel, in no process: they go on while another process compiles."""
 LONGEST = (
+    "test_ray_placement.py",
+    "test_hard_frames.py",
     "test_faults.py",
     "test_damage.py",
+    "test_reproducible.py",
+    "test_operations.py",
+    "test_client_demo.py",
+    "test_soak.py",
     "test_gradients.py",
     "test_frames.py",
-    "test_hard_frames.py",
     "test_light.py",
 )
 """Files that take longest: begun last, they would have the other processes wait for them."""
@@ -26,18 +32,52 @@ LONGEST = (
 @pytest.fixture(autouse=True)
 def kernels(request: pytest.FixtureRequest) -> None:
     """Kernels are compiled once, in a process beside: of the tests' processes one asks for it, the others wait."""
-    if not request.path.relative_to(request.config.rootpath).as_posix().startswith(WITHOUT_KERNELS):
+    if not path_of(request.node).startswith(WITHOUT_KERNELS):
         from scas4d_core.warm_up import warm_up_elsewhere
 
         warm_up_elsewhere()
 
 
+SERVICE_FIXTURES = {"service", "app"}
+SERVICE_STARTERS = {"Running", "Service", "serving", "serving_with", "stub"}
+"""A test that has one of those fixtures, or whose file imports one of those helpers, gets the mark `service`."""
+SLOW = "tests/studies/"
+BROWSER = "tests/browser/"
+SECOND_PROCESSOR = (
+    "tests/core/kernels/", "tests/core/properties/", "tests/core/rasterize/", "tests/core/torch_backend/",
+    "tests/studies/hard_cases/",
+)  # fmt: skip
+"""The same folders are named in .ci/run."""
+
+
+def path_of(item: pytest.Item) -> str:
+    return item.path.relative_to(item.config.rootpath).as_posix()
+
+
+def add_marks(item: pytest.Item) -> None:
+    """Adds the marks that folders, fixtures and helpers imply; files and tests have further ones of their own."""
+    assert isinstance(item, pytest.Function)
+    path = path_of(item)
+    if path.startswith(SLOW):
+        item.add_marker("slow")
+    if path.startswith(BROWSER):
+        item.add_marker("browser")
+    if path.startswith(SECOND_PROCESSOR) and not path.startswith(WITHOUT_KERNELS):
+        item.add_marker("second_processor")
+    if SERVICE_FIXTURES & set(item.fixturenames) or SERVICE_STARTERS & vars(item.module).keys():
+        item.add_marker("service")
+
+
+@pytest.hookimpl(tryfirst=True)  # before `-m` selects
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Puts first what needs no kernels, where they may have to be compiled, then the longest."""
+    """Adds the marks; puts first what needs no kernels, where they may have to be compiled, then the longest."""
+    for item in items:
+        add_marks(item)
 
     def turn(item: pytest.Item) -> int:
-        path = item.path.relative_to(item.config.rootpath).as_posix()
-        return 0 if path.startswith("tests/server/connections") else 1 if item.path.name in LONGEST else 2
+        if path_of(item).startswith("tests/server/connections"):
+            return 0
+        return 1 + (LONGEST.index(item.path.name) if item.path.name in LONGEST else len(LONGEST))
 
     items.sort(key=turn)  # stable: files stay together
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from source_tree import PACKAGES, ROOT
+from waiting import HANG_S
 
 BUILD = "import sys; from setuptools.build_meta import build_wheel; print(build_wheel(sys.argv[1]))"
 
@@ -21,7 +22,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> zipfile.ZipFile:
     copy, out = tmp_path_factory.mktemp("tree") / "scas4d", tmp_path_factory.mktemp("wheel")
     ignored = shutil.ignore_patterns("__pycache__", ".*", "out", "data", "samples", "*.egg-info", "build", "dist")
     shutil.copytree(ROOT, copy, ignore=ignored)
-    done = subprocess.run([sys.executable, "-c", BUILD, out], cwd=copy, capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", BUILD, out], cwd=copy, capture_output=True, text=True, timeout=HANG_S)
     assert done.returncode == 0, done.stderr
     (built,) = out.glob("*.whl")
     return zipfile.ZipFile(built)

@@ -11,8 +11,8 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
-from client.cli.progress import console
 from client.importers.open_source import CaptureOptions
+from client.progress import console
 from scas4d_core.captures import Capture
 
 

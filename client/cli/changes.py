@@ -53,8 +53,8 @@ def parse_changes(changes: Sequence[str] | None) -> dict[str, Any]:
     Raises:
         ValueError: a change without a sign, or one inside another.
 
-    >>> parse_changes(["update.iterations=200", "update.clusters=[64]", "device=cuda"])
-    {'update': {'iterations': 200, 'clusters': [64]}, 'device': 'cuda'}
+    >>> parse_changes(["update.iterations=200", "update.clusters=[64]", "device=cpu"])
+    {'update': {'iterations': 200, 'clusters': [64]}, 'device': 'cpu'}
     """
     result: dict[str, Any] = {}
     for change in changes or ():

@@ -14,8 +14,8 @@ from client import rig
 from client.cli import scenes
 from client.cli.capture_options import opened, takes_capture
 from client.cli.changes import Changes, Labels, Preset, parse_changes, parse_labels
-from client.cli.progress import Bars, console
 from client.importers.open_source import CaptureOptions
+from client.progress import Bars, console
 from client.sdk import DEFAULT_URL, Client
 from client.wire import FINISHED, FrameReportModel, IngestSettings
 from scas4d_core.captures import InitialPoints

@@ -14,11 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from client import rig
-from client.cli import pictures
+from client import pictures, rig
 from client.cli.extras import need_server
-from client.cli.progress import Bars, console
 from client.errors import ServiceError, ServiceUnreachable
+from client.progress import Bars, console
 from client.sdk import Client
 from scas4d_core.captures import Capture
 

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from client.cli import pictures
+from client import pictures
 from client.cli.changes import changes_of
-from client.cli.progress import Bars
 from client.cli.reconstruct import compile_kernels, reconstruct_frames
 from client.cli.scores import Row, Store, digest, markdown, stage_table
 from client.importers.open_source import CaptureOptions
+from client.progress import Bars
 from scas4d_core.captures import Capture
 from scas4d_core.presets import preset
 from scas4d_core.settings import Settings
@@ -150,7 +150,7 @@ def evaluate(
     row = None if again else store.row(job.key)
     if row is None:
         report(f"[1/1] {job.key}")
-        compile_kernels(job.settings)
+        compile_kernels()
         _, row = measure(job, store, report)
         store.put(row)
     else:

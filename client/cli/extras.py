@@ -9,8 +9,6 @@ SERVER = (
     *("fastapi", "uvicorn", "pydantic_settings", "prometheus_client", "httptools", "blake3", "python_multipart"),
 )
 """Modules of the extra `server`."""
-CUDA = ("torch", "gsplat")
-"""Modules of the extra `cuda`."""
 EXPORTS = ("gsply", "pxr")
 """Modules of the extra `exports`."""
 RERUN = ("rerun",)
@@ -31,7 +29,7 @@ def need_server() -> None:
 def remedy(missing: ModuleNotFoundError) -> str | None:
     """Says what to install, in a sentence; None where the module belongs to no extra."""
     package = (missing.name or "").partition(".")[0]
-    extras = {"server": SERVER, "cuda": CUDA, "exports": EXPORTS, "rerun": RERUN}
+    extras = {"server": SERVER, "exports": EXPORTS, "rerun": RERUN}
     extra = next((name for name, packages in extras.items() if package in packages), None)
     if extra is None:
         return None

@@ -12,19 +12,18 @@ from typing import Annotated
 import typer
 
 from client import __version__
-from client.cli import commands, extras
+from client.cli import commands, extras, viewing
 from client.cli.capture_options import opened, takes_capture
 from client.cli.changes import Changes, Preset, parse_changes
-from client.cli.progress import console
 from client.errors import ServiceError, ServiceUnreachable
-from client.exports import commands as looks
 from client.importers.open_source import CaptureOptions
+from client.progress import console
 from client.sdk import DEFAULT_URL
 from scas4d_core.captures import CaptureError, ImageError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="Online 4D reconstruction of multi-camera rigs.")
 commands.register(app)
-looks.register(app)
+viewing.register(app)
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture.")]
 Frames = Annotated[int | None, typer.Option(min=1, help="Take only so many frames.")]
@@ -98,14 +97,13 @@ def reconstruct(
     out: Out = Path("out/reconstruct"),
     frames: Frames = None,
     preset: Preset = "scas4d",
-    device: Annotated[str | None, typer.Option(help="Device of the updates: cpu or cuda.")] = None,
     videos: Annotated[bool, typer.Option("--videos", help="Leave the pictures of each camera as an MP4, too.")] = False,
     changes: Changes = None,
 ) -> None:
     """Reconstructs a capture in this process, without a service: pictures, states, and a .ply of the last frame."""
     from client.cli.reconstruct import reconstruct as run
 
-    given = parse_changes([*(changes or []), *([f"device={device}"] if device else [])])
+    given = parse_changes(changes)
     run(opened(capture, options), out, frames=frames, preset=preset, changes=given, videos=videos)
 
 
@@ -134,7 +132,7 @@ def evaluate(
     Without test cameras (--test holds some out) the scores are those of the training cameras, and the table says so.
     """
     if states is not None:
-        from client.exports.score import evaluate_states
+        from client.cli.evaluate_states import evaluate_states
 
         evaluate_states(states, capture, out, options=options, frames=frames, rate=rate)
         return

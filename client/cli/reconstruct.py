@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from client.cli import pictures
-from client.cli.progress import Bars, console
+from client import pictures
 from client.exports.video.video_file import video_file
+from client.progress import Bars, console
 from scas4d_core.captures import Capture
 from scas4d_core.compact import CompactWriter, Head
 from scas4d_core.frame_outcome import AlarmKind
@@ -129,7 +129,7 @@ def reconstruct(
     compact = out / "states.s4d"
     compact.unlink(missing_ok=True)
     history = History(out / "states")
-    compile_kernels(settings)
+    compile_kernels()
     with Bars() as bars, ExitStack() as opened:
         writer: CompactWriter | None = None
         add: dict[str, Callable[[pictures.Picture], None]] = {}
@@ -190,10 +190,9 @@ def told(report: FrameReport | None) -> str:
     return "".join(f"\n  ! {part}" for part in parts)
 
 
-def compile_kernels(settings: Settings) -> None:
-    """Compiles the CPU kernels in a process beside, unless the cache has them; nothing for another device."""
+def compile_kernels() -> None:
+    """Compiles the kernels in a process beside, unless the cache has them."""
     from scas4d_core.warm_up import EVERY, warm_up_elsewhere
 
-    if settings.device == "cpu":
-        with Bars() as bars:
-            warm_up_elsewhere(EVERY, told=lambda done, total: bars("compiling the kernels", done, total))
+    with Bars() as bars:
+        warm_up_elsewhere(EVERY, told=lambda done, total: bars("compiling the kernels", done, total))

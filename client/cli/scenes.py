@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from client.cli.progress import console
+from client.progress import console
 from client.sdk import DEFAULT_URL, Client
 from client.wire import Retention, SceneStatus
 

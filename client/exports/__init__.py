@@ -1,1 +1,1 @@
-"""Takes states out of a scene, a folder or a file: the commands `scas4d export` and its like."""
+"""Writes states in the formats of other tools, as pages and as videos, from a scene, a folder or a file."""

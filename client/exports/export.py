@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from client.cli.progress import Bars, console
 from client.exports.sources import frame_range, opened
+from client.progress import Bars, console
 from scas4d_core.errors import InputError
 
 

@@ -14,9 +14,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from client.cli.progress import console
 from client.exports.modules import script
 from client.exports.sources import STATES, CompactStates, Source, frame_range, opened
+from client.progress import console
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.compact import CompactReader, CompactWriter
 from scas4d_core.errors import InputError

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from client.cli.progress import Bars, console
 from client.exports.sources import Source, frame_range, opened
 from client.exports.video.overlay import rows_that_move
 from client.exports.video.rig_view import RigView
+from client.progress import Bars, console
 from client.wire import part_colour
 from scas4d_core.cameras import Rig
 from scas4d_core.errors import InputError

@@ -46,6 +46,7 @@ class Calibration:
         points: a cloud that came with it, or None.
         fps: frames per second, where the file says.
         remarks: what a person should know of the reading.
+        left_out: cameras that the file has and the rig has not; a remark names them.
     """
 
     source: Path
@@ -54,6 +55,7 @@ class Calibration:
     points: InitialPoints | None = None
     fps: float | None = None
     remarks: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -92,8 +94,13 @@ def calibration(
     return Calibration(source, tuple(cameras), {name: tuple(found) for name, found in by_name.items()}, points, fps)
 
 
-def calibration_of_cameras(source: Path, cameras: Sequence[LensCamera], remarks: Sequence[str] = ()) -> Calibration:
+def calibration_of_cameras(
+    source: Path, cameras: Sequence[LensCamera], left_out: Sequence[str] = (), why: str = ""
+) -> Calibration:
     """A calibration that names its cameras and no pictures: these lie in `images/<camera>/` or `videos/<camera>.mp4`.
+
+    Args:
+        left_out: cameras that the file has and the rig has not. why: begins the remark that names them.
 
     Raises:
         CaptureError: no cameras, one name twice, or a name that cannot be.
@@ -107,7 +114,9 @@ def calibration_of_cameras(source: Path, cameras: Sequence[LensCamera], remarks:
         if names.count(name) > 1:
             raise CaptureError(f"{source}: two cameras are called {name!r}; rename one, and its pictures")
     ordered = tuple(sorted(cameras, key=lambda camera: natural(camera.name)))
-    return Calibration(source, ordered, {camera.name: () for camera in ordered}, remarks=tuple(remarks))
+    views: dict[str, tuple[CalibratedImage, ...]] = {camera.name: () for camera in ordered}
+    remarks = (f"{why}: {', '.join(left_out)}",) if left_out else ()
+    return Calibration(source, ordered, views, remarks=remarks, left_out=tuple(left_out))
 
 
 def can_be_named(name: str) -> bool:

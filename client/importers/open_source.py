@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -190,9 +189,8 @@ def uncalibrated(folder: Path, calibration: Calibration) -> list[str]:
     there = {path.name for path in images.iterdir() if path.is_dir()} if images.is_dir() else set[str]()
     if not there and videos.is_dir():
         there = {path.stem for path in videos.iterdir() if path.suffix.lower() in ENDS}
-    told = " ".join(calibration.remarks)
-    unknown = [name for name in there.difference(calibration.names) if not name.startswith(".")]
-    left = sorted(name for name in unknown if not re.search(rf"(?<!\w){re.escape(name)}(?!\w)", told))
+    unknown = there.difference(calibration.names, calibration.left_out)
+    left = sorted(name for name in unknown if not name.startswith("."))
     if not left or not there.intersection(calibration.names):  # else these are no folders of cameras
         return []
     return [f"left out, {calibration.source.name} has no such camera: {', '.join(left)}"]

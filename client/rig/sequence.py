@@ -20,6 +20,18 @@ class Files:
     masks: dict[str, bytes]
 
 
+def there_and_back(index: int, count: int) -> int:
+    """The place among so many of an index that goes to their end, back to their start, and so on.
+
+    >>> [there_and_back(index, 3) for index in range(6)]
+    [0, 1, 2, 1, 0, 1]
+    """
+    if count == 1:
+        return 0
+    turn = index % (2 * count - 2)
+    return min(turn, 2 * count - 2 - turn)
+
+
 class Sequence:
     """The frames of a capture as frames of a scene: from a start, and where it loops back and forth for ever.
 
@@ -42,12 +54,7 @@ class Sequence:
 
     def place(self, index: int) -> int:
         """The frame of the capture that is frame `index` of the scene."""
-        if index <= self._last:
-            return self.start + index
-        if self._last == 0:
-            return self.start
-        turn = index % (2 * self._last)
-        return self.start + min(turn, 2 * self._last - turn)
+        return self.start + there_and_back(index, self._last + 1)
 
     def time(self, index: int) -> float:
         """Seconds: those of the capture; beyond its end by its rate."""

@@ -238,7 +238,7 @@ class FrameReportModel(Model):
     cameras: dict[str, CameraFitModel] = Field(default_factory=dict, description="By camera that the update saw.")
     alarms: list[AlarmModel] = Field(default_factory=list, description="What a person should look at.")
     timing: dict[str, CameraTimingModel] = Field(
-        default_factory=dict, description="By camera; only where motion tells it well enough. Never on a GPU."
+        default_factory=dict, description="By camera; only where motion tells it well enough."
     )
     moving: int | None = None
     gaussians: int | None = Field(default=None, description="That are there; those retired are not counted.")

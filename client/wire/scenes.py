@@ -210,61 +210,45 @@ class SceneStatus(Model):
     first_committed: int | None
     last_committed: int | None
     gaussians: int | None
-    reconstruction: int = Field(
-        default=0, description="Number of its reconstruction: one more each time that it was begun anew."
-    )
-    first_frame: int = Field(
-        default=0, description="The reconstruction begins with this frame; those before it are set aside."
-    )
-    paused: bool = Field(
-        default=False, description="It begins no further frame, whatever `state` says: one may still be at work."
-    )
+    reconstruction: int = Field(description="Number of its reconstruction: one more each time that it was begun anew.")
+    first_frame: int = Field(description="The reconstruction begins with this frame; those before it are set aside.")
+    paused: bool = Field(description="It begins no further frame, whatever `state` says: one may still be at work.")
     asleep: bool = Field(
-        default=False,
         description="It was idle, has no processes and counts for nothing; it wakes by itself when it is asked or sent "
         "something. What `state` says holds.",
     )
-    archived: bool = Field(
-        default=False, description="It takes no frames until that is taken back; all it has can be looked at."
-    )
+    archived: bool = Field(description="It takes no frames until that is taken back; all it has can be looked at.")
     degraded: bool = Field(
-        default=False,
         description="Whatever `state` says: the last frame lost a camera, was held or met only by half, or was set "
         "aside; the worker is being restarted, the disk is full, or something on it was found damaged and is being "
         "mended. `error` says which.",
     )
-    open_frames: list[int] = Field(
-        default_factory=list, description="Frames not closed yet, whose cameras send one by one."
-    )
-    set_aside: int = Field(default=0, description="Frames that were taken and could not be reconstructed.")
-    missing: int = Field(default=0, description="Frames that were declared missing.")
-    skipped: int = Field(default=0, description="Frames that were skipped because the queue was full.")
-    worker_deaths: int = Field(default=0, description="Since the scene woke or its reconstruction began.")
-    frames_held: int = Field(default=0, description="Frames whose pictures are in the frame log.")
-    frame_bytes: int = Field(default=0, description="Of the frame log on disk.")
-    states_deleted: int = Field(default=0, description="Committed states that retention has deleted.")
+    open_frames: list[int] = Field(description="Frames not closed yet, whose cameras send one by one.")
+    set_aside: int = Field(description="Frames that were taken and could not be reconstructed.")
+    missing: int = Field(description="Frames that were declared missing.")
+    skipped: int = Field(description="Frames that were skipped because the queue was full.")
+    worker_deaths: int = Field(description="Since the scene woke or its reconstruction began.")
+    frames_held: int = Field(description="Frames whose pictures are in the frame log.")
+    frame_bytes: int = Field(description="Of the frame log on disk.")
+    states_deleted: int = Field(description="Committed states that retention has deleted.")
     effects: dict[str, EffectStatus] = Field(
-        default_factory=dict, description="The effects (docs/effects.md) for the next update, with their evidence."
+        description="The effects (docs/effects.md) for the next update, with their evidence."
     )
     damage: list[str] = Field(
-        default_factory=list,
         description="What was found damaged on disk, and what came of it, a sentence each: at the start of the service "
         "and since. The newest 100.",
     )
     warnings: list[str] = Field(
-        default_factory=list,
         description="What looks wrong and may be right, a sentence each: poses that seem to be the wrong way round; "
         "after frame 0, cameras that its pictures show to be off, what came of refining them, first points that "
         "no camera confirms, or that cover little of the pictures, what its time was too short for, and grey cameras "
         "beside colour ones; and cameras that motion shows to be out of step.",
     )
     created: str = Field(description="UTC, ISO 8601.")
-    ingest: IngestSettings = IngestSettings()
-    nodes: dict[str, str] = Field(
-        default_factory=dict, description="On a cluster: labels of the nodes on which its processes may run."
-    )
+    ingest: IngestSettings
+    nodes: dict[str, str] = Field(description="On a cluster: labels of the nodes on which its processes may run.")
     settings: dict[str, Any]
-    budget: Budget = Field(default=Budget(), description="As it was put last; nulls: as `settings` say.")
+    budget: Budget = Field(description="As it was put last; nulls: as `settings` say.")
 
 
 class SceneList(Model):
@@ -278,4 +262,4 @@ class PointsReceipt(Model):
 
     points: int
     sha256: str
-    reconstruction: int = Field(default=0, description="The number of the reconstruction that begins from them.")
+    reconstruction: int = Field(description="The number of the reconstruction that begins from them.")

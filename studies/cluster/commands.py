@@ -7,8 +7,7 @@ from typing import Annotated
 
 import typer
 
-from studies.options import Changes, Page, write_page
-from studies.service.commands import Repeated
+from studies.options import Changes, Page, Repeated, write_page
 
 
 def cluster(
@@ -32,7 +31,7 @@ def cluster(
     from client.importers.open_source import open_source
     from studies.cluster.cost import measure, told
     from studies.cluster.nodes import Nodes
-    from studies.service.study import Study, encoded_frames
+    from studies.running.study import Study, encoded_frames
 
     need_server()
     opened = open_source(capture)

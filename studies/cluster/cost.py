@@ -15,8 +15,8 @@ import numpy as np
 
 from client.wire import FrameState
 from studies.options import Echo
-from studies.service.process import Service, StudyError
-from studies.service.study import FrameSender, Study
+from studies.running.process import Service, StudyError
+from studies.running.study import FrameSender, Study
 
 PLACEMENTS = ("local", "ray")
 EVERY_S = 0.01

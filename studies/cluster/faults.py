@@ -7,19 +7,20 @@ import random
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+from client.wire import Cluster
 from server.storage.fencing import epoch_read, epochs
 from server.storage.layout import DataFolder, epoch_folder
 from studies.cluster.nodes import Nodes
 from studies.options import Echo
-from studies.service.outcome import ScenarioResult
-from studies.service.process import PATIENCE_S, Service, StudyError, wait_until
-from studies.service.study import AGAIN_S, FrameSender, Study, compare, digests, undisturbed
+from studies.running.outcome import ScenarioResult
+from studies.running.process import PATIENCE_S, Service, StudyError, wait_until
+from studies.running.study import AGAIN_S, FrameSender, Study, compare, digests, running, undisturbed
 
 Run = Callable[[Study, Sequence[str]], list[ScenarioResult]]
 
@@ -27,8 +28,8 @@ GOES_ON_S = 30.0
 """A scene works again so soon after its node is gone."""
 HEAD_GONE_S = 10.0
 """The head is away for so long."""
-NOT_PLACED = "not placed on a node yet"
-"""What the status of a scene says whose worker waits for room."""
+WAITS_S = 5.0
+"""A worker that is not placed after so long waits for room; to start takes a few seconds without."""
 SWEPT_S = 180.0
 """Folders of workers before are gone after so long."""
 
@@ -40,7 +41,7 @@ def killed_nodes(
     random_ = random.Random(seed)
     moments = [random_.randrange(1, len(study.frames)) for _ in range(count)]
     pauses: list[float] = []
-    with _running(study, "nodes") as (service, scene, sender):
+    with running(study, "nodes") as (service, scene, sender):
         for index in range(len(study.frames)):
             thread = threading.Thread(target=sender.send, args=(index,))
             thread.start()
@@ -67,7 +68,7 @@ def stopped_node(
     study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo
 ) -> ScenarioResult:
     """SIGSTOP of a node during an update; it is continued when its scene has gone on elsewhere."""
-    with _running(study, "stopped") as (service, scene, sender):
+    with running(study, "stopped") as (service, scene, sender):
         states = DataFolder(service.data).scene(scene).states
         _send(sender, _second_half(study, service, scene, sender))
         time.sleep(0.5 * update_s)
@@ -103,7 +104,7 @@ def stopped_node(
 
 def full_nodes(study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo) -> ScenarioResult:
     """The scene's node is killed while other scenes fill those that are left; then those scenes are deleted."""
-    with _running(study, "full") as (service, scene, sender):
+    with running(study, "full") as (service, scene, sender):
         left = _second_half(study, service, scene, sender)
         others = _fill(study, service)
         node, _ = _node_of(service, nodes, scene)
@@ -136,7 +137,7 @@ def restarted_head(
     study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo
 ) -> ScenarioResult:
     """`kill -9` of the cluster's head during an update; it comes back after a while, with what Redis kept."""
-    with _running(study, "head") as (service, scene, sender):
+    with running(study, "head") as (service, scene, sender):
         left = _second_half(study, service, scene, sender)
         sending = threading.Thread(target=_send, args=(sender, left))
         sending.start()
@@ -162,18 +163,6 @@ def restarted_head(
         )
         target = "0 acknowledged frames lost, final state bit-identical, scenes are placed again afterwards"
         return ScenarioResult(f"the head killed, back after {HEAD_GONE_S:g} s (Redis)", target, found, faults)
-
-
-@contextmanager
-def _running(study: Study, name: str) -> Iterator[tuple[Service, str, FrameSender]]:
-    """A service over a new folder, a scene of it, and its sender; the service ends with this."""
-    service = study.service(name)
-    service.start()
-    try:
-        scene = study.create(service)
-        yield service, scene, FrameSender(study, service, scene)
-    finally:
-        service.stop()
 
 
 def _second_half(study: Study, service: Service, scene: str, sender: FrameSender) -> range:
@@ -218,7 +207,9 @@ def _is_placed_or_waits(service: Service, scene: str) -> bool:
 
 
 def _waits(service: Service, scene: str) -> bool:
-    return NOT_PLACED in (service.status(scene).error or "")
+    """Tells whether the scene's worker finds no room on a node."""
+    waiting = Cluster.model_validate_json(service.http.get("/v1/cluster").content).waiting
+    return any(one.scene == scene and one.role == "worker" and one.seconds > WAITS_S for one in waiting)
 
 
 def _faults_of_kills(

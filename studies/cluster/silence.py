@@ -22,7 +22,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from studies.cluster.nodes import HEALTH, REDIS, STORE_BYTES, redis
-from studies.service.process import StudyError, wait_until
+from studies.running.process import StudyError, wait_until
 
 HEAD, NODE, PORT = "127.0.0.1", "127.0.0.2", 6397
 APART = ("unshare", "--pid", "--fork", "--mount-proc", "--kill-child")

@@ -22,8 +22,8 @@ from scas4d_core.metrics import psnr as image_psnr
 from scas4d_core.settings import Settings
 from studies.captures import open_measured
 from studies.effort.sequences import Shown, as_it_is, back_and_forth, repeated, slowed
-from studies.frontier.timing import started
 from studies.machine import core_version, machine
+from studies.quality.first_frame import started
 from studies.quality.settings import settings_of
 
 TOLERANCE = 0.05

@@ -22,7 +22,7 @@ from client.cli.scores import Row
 from client.importers.open_source import open_source
 from scas4d_core.engines.engine import REPORT
 from studies.effort.effort import COUNTED_FROM, changed, leave
-from studies.frontier.timing import started
+from studies.quality.first_frame import started
 from studies.quality.settings import settings_of
 
 TARGET = 0.02

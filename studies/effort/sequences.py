@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from client.rig.sequence import there_and_back
 from scas4d_core.captures import Capture, Frame
 from scas4d_core.gaussians import Gaussians
-from studies.frontier.timing import started
+from studies.quality.first_frame import started
 from studies.quality.settings import settings_of
 
 
@@ -30,8 +31,7 @@ def back_and_forth(capture: Capture, frames: int) -> Iterator[Frame]:
     first, second = capture.frame(0), capture.frame(1)
     step = second.time - first.time
     for index in range(1, frames + 1):
-        place = index % (2 * count - 2)
-        shown = capture.frame(min(place, 2 * count - 2 - place))
+        shown = capture.frame(there_and_back(index, count))
         yield Frame(index, first.time + index * step, shown.images, shown.masks)
 
 

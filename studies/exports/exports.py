@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from scipy.spatial.transform import Rotation
 
-from client.cli import pictures
+from client import pictures
 from client.importers.open_source import open_source
 from scas4d_core import metrics
 from scas4d_core.cameras import WorldFrame

@@ -23,8 +23,8 @@ from scas4d_core.settings import Settings
 from scas4d_core.warm_up import warm_up_elsewhere
 from studies.captures import open_measured
 from studies.frontier.frontier import Variant
-from studies.frontier.timing import started
 from studies.machine import core_version
+from studies.quality.first_frame import started
 
 CHECKPOINTS = (0, 1, 2, 4, 7, 10, 15, 20, 25, 30, 40, 50, 60, 70, 80, 90, 100, 125, 150, 175, 200, 225, 250, 275)
 """Iterations after which the state is looked at, as far as an update has them; its end is looked at in any case."""

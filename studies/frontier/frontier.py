@@ -31,6 +31,8 @@ SEEDS = (0, 1, 2)
 """Of the updates, on the axis "seeds"; every other row has the first."""
 DRIFT = (("scas4d", 25), ("scas4d", 100), ("scas4d", 300), ("dynamic3dgs", 100), ("dynamic3dgs", 300))
 """Preset and iterations of the rows that go through a whole capture."""
+MAX_SCALE = "scas4d_core.engines.plan.MAX_SCALE"
+"""The constant of the axis "max-scale"."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +102,7 @@ AXES: Mapping[str, tuple[Variant, ...]] = {
     "gaussians": tuple(
         _changed(f"{count:,} Gaussians", "static.max_gaussians", count) for count in (6_000, 12_000, 40_000)
     ),
-    "max-scale": (Variant("max_scale 2 m", constants=(("scas4d_core.engines.plan.MAX_SCALE", 2.0),)),),
+    "max-scale": (Variant("max_scale 2 m", constants=((MAX_SCALE, 2.0),)),),
     "covariance": (_changed("separate covariance", "update.covariance", "separate", "update.own_start=0"),),
     "seeds": tuple(
         Variant(f"{name} {DEFAULT_ITERATIONS}, seed {seed}", name, seed=seed) for name in METHODS for seed in SEEDS[1:]

@@ -22,7 +22,6 @@ from client.cli.evaluate import Report
 from client.cli.scores import Row, read_row, write_row
 from client.importers.open_source import open_source
 from scas4d_core.captures import Capture
-from scas4d_core.settings import Settings
 from scas4d_core.warm_up import warm_up_elsewhere
 from studies.constants import all_varied
 from studies.frontier.frontier import Variant
@@ -81,6 +80,7 @@ def measure_times(
     warm_up_elsewhere()
     # These bring the kernels.
     from scas4d_core.kernels.jit import threads
+    from studies.quality.first_frame import started
 
     capture = open_source(folder)
     turns = min(rounds + 1, capture.frame_count - 1)
@@ -160,28 +160,6 @@ def _distinct(variants: Sequence[Variant]) -> list[Variant]:
 
 def _unseeded(settings: Row) -> Row:
     return settings | {"update": {**settings["update"], "seed": 0}}
-
-
-def started(capture: Capture, settings: Settings, out: Path, states: Path | None = None) -> Any:
-    """A reconstruction after frame 0, which is read from the study or, the first time, fitted and kept there.
-
-    Args:
-        states: empty folder to commit to; None: in memory.
-    """
-    from scas4d_core.reconstruction import Reconstruction
-    from scas4d_core.storage.history import History
-    from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
-
-    file = out / "first" / f"{first_frame_key(capture, settings)}.npz"
-    static, _ = load_first_frame(file) or (None, 0.0)
-    began = time.perf_counter()
-    history = History() if states is None else History(states)
-    reconstruction = Reconstruction.start(
-        capture.rig, capture.frame(0), settings, points=capture.points, static=static, history=history
-    )
-    if static is None and reconstruction.static is not None:
-        save_first_frame(file, reconstruction.static, time.perf_counter() - began)
-    return reconstruction
 
 
 def _answer(one: TimedVariant, ratios: Sequence[float]) -> Row:

@@ -13,7 +13,7 @@ Values = dict[str, NDArray[Any]]
 
 REFERENCE = "float64"
 """The backend that the others are held against: the torch twins in float64."""
-CPU, TORCH, CUDA = "cpu", "torch float32", "cuda"
+CPU, TORCH = "cpu", "torch float32"
 
 
 @dataclass(frozen=True, eq=False)

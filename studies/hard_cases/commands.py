@@ -93,7 +93,7 @@ def _frame_studies(
     from studies.quality.settings import settings_of
 
     footages: list[AnyFootage] = [
-        CapturedFootage(open_measured(path), settings_of("scas4d"), QUALITY / "first") for path in captures
+        CapturedFootage(open_measured(path), settings_of("scas4d"), QUALITY) for path in captures
     ]
     failed: list[str] = []
     for footage in footages or [SyntheticFootage()]:

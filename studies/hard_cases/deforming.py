@@ -15,7 +15,6 @@ from scas4d_core.structure.hierarchy import Hierarchy
 from scas4d_core.structure.neighbours import Neighbours, build_neighbours
 from studies.hard_cases.case import (
     CPU,
-    CUDA,
     REFERENCE,
     BackendResult,
     Values,
@@ -107,12 +106,11 @@ class Deforming:
         from scas4d_core.engines.torch import deformation, losses
 
         dtype = torch.float64 if backend == REFERENCE else torch.float32
-        device = "cuda" if backend == CUDA else "cpu"
         sound = np.flatnonzero(~self.bad) if self.bad.size else np.arange(len(self.means))
 
         def tensor(values: NDArray[Any], leaf: bool = False) -> torch.Tensor:
             kind = torch.int64 if values.dtype.kind == "i" else dtype
-            return torch.tensor(values, dtype=kind, device=device, requires_grad=leaf)
+            return torch.tensor(values, dtype=kind, requires_grad=leaf)
 
         leaves = [tensor(values, True) for values in self.clusters]
         own = tensor(self.deltas, True)
@@ -128,7 +126,7 @@ class Deforming:
         moved = deformation.deform(previous, tensor(self.factors[sound]), layers, deltas, self.kind)
         by_mean, by_factor = (tensor(pull[sound]) for pull in self.weights())
         loss = (moved.means * by_mean).sum() + (moved.factors * by_factor).sum()
-        terms = torch.zeros(3, dtype=dtype, device=device)
+        terms = torch.zeros(3, dtype=dtype)
         graph = self.neighbours()
         if graph is not None:
             order = np.zeros(len(self.means), np.int64)
@@ -150,11 +148,9 @@ class Deforming:
         values = {"means": self.means.copy(), "factors": self.factors.copy(), "turns": no_turn(len(self.means))}
         for name in values:
             values[name] = values[name].astype(np.float64 if backend == REFERENCE else np.float32)
-            values[name][sound] = getattr(moved, name).detach().cpu().numpy()
-        values["terms"] = terms.detach().cpu().numpy()
-        return BackendResult(
-            values, {name: np.zeros(1) if g is None else g.cpu().numpy() for name, g in gradients.items()}
-        )
+            values[name][sound] = getattr(moved, name).detach().numpy()
+        values["terms"] = terms.detach().numpy()
+        return BackendResult(values, {name: np.zeros(1) if g is None else g.numpy() for name, g in gradients.items()})
 
     def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
         """See ``Problem``: finite, bounded, unit turns, bad rows held and apart, in agreement."""

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import Camera
 from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
-from scas4d_core.engines.limits import DEFAULT, GSPLAT, Limits
+from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.engines.views import CameraArrays
-from studies.hard_cases.case import CPU, CUDA, REFERENCE, BackendResult, apart, beyond, not_finite, unexpected_counts
+from studies.hard_cases.case import CPU, REFERENCE, BackendResult, apart, beyond, not_finite, unexpected_counts
 
 Array = NDArray[np.float32]
 
@@ -66,8 +66,8 @@ class Rendering:
         """See ``Problem``."""
         if backend == CPU:
             return self._cpu()
-        if backend in (REFERENCE, CUDA):
-            return self._torch(backend)
+        if backend == REFERENCE:
+            return self._twin()
         return None
 
     def _cpu(self) -> BackendResult:
@@ -84,28 +84,26 @@ class Rendering:
         gradients = {name: getattr(found, name).copy() for name in names}
         return BackendResult(values, gradients, dict(rasterizer.guards))
 
-    def _torch(self, backend: str) -> BackendResult:
+    def _twin(self) -> BackendResult:
         import torch
-        from scas4d_core.rasterize import cuda, twin
 
-        dtype, device = (torch.float64, "cpu") if backend == REFERENCE else (torch.float32, "cuda")
+        from scas4d_core.engines.torch import rasterizer as twin
+
+        dtype = torch.float64
         names = ("means", "factors", "opacities", "features")
-        leaves = [torch.tensor(getattr(self, name), dtype=dtype, device=device, requires_grad=True) for name in names]
+        leaves = [torch.tensor(getattr(self, name), dtype=dtype, requires_grad=True) for name in names]
         drawn = leaves[0], leaves[1], leaves[2], leaves[3]
-        camera = twin.CameraParams.of(self.camera, dtype, device)
-        background = torch.tensor(BACKGROUND, dtype=dtype, device=device)
-        if backend == REFERENCE:
-            picture = twin.render(*drawn, camera, background, self.limits)
-        else:
-            picture = cuda.render(*drawn, camera, background, GSPLAT._replace(near=self.limits.near))
-        by_feature, by_alpha = (torch.tensor(weights, dtype=dtype, device=device) for weights in self.weights())
+        camera = twin.CameraParams.of(self.camera, dtype)
+        background = torch.tensor(BACKGROUND, dtype=dtype)
+        picture = twin.render(*drawn, camera, background, self.limits)
+        by_feature, by_alpha = (torch.tensor(weights, dtype=dtype) for weights in self.weights())
         features = torch.movedim(picture.features, -1, 0)
         loss = (features * by_feature).sum() + (picture.alpha * by_alpha).sum()
         gradients = torch.autograd.grad(loss, leaves, allow_unused=True)
         return BackendResult(
-            {"features": features.detach().cpu().numpy(), "alpha": picture.alpha.detach().cpu().numpy()},
+            {"features": features.detach().numpy(), "alpha": picture.alpha.detach().numpy()},
             {
-                name: np.zeros(leaf.shape) if g is None else g.cpu().numpy()
+                name: np.zeros(leaf.shape) if g is None else g.numpy()
                 for name, leaf, g in zip(names, leaves, gradients, strict=True)
             },
         )

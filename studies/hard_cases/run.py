@@ -14,7 +14,7 @@ import numpy as np
 
 from scas4d_core.guards import CONVENTIONS, GUARDS, OBSERVED, Guard
 from studies.hard_cases import cluster_map, geometry, scenes, steps
-from studies.hard_cases.case import CPU, CUDA, REFERENCE, TORCH, HardCase
+from studies.hard_cases.case import CPU, REFERENCE, TORCH, HardCase
 from studies.machine import in_words as in_words_of
 from studies.machine import machine
 from studies.options import Echo
@@ -44,14 +44,7 @@ class CaseResult:
 
 def backends() -> list[str]:
     """Those that are here: torch twins in float64 first."""
-    found = [CPU]
-    if find_spec("torch") is not None:
-        import torch
-
-        found = [REFERENCE, CPU, TORCH]
-        if torch.cuda.is_available() and find_spec("gsplat") is not None:
-            found.append(CUDA)
-    return found
+    return [CPU] if find_spec("torch") is None else [REFERENCE, CPU, TORCH]
 
 
 def selected(names: Sequence[str] | None, slow: bool) -> list[HardCase]:

@@ -14,7 +14,7 @@ from scas4d_core.captures.frame import Frame
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.settings import Settings
 from studies.hard_cases.case import CPU, BackendResult, HardCase
-from studies.kernels.synthetic import ball_on_a_floor, moved, photograph, rig
+from studies.synthetic.ball import ball_on_a_floor, moved, photograph, rig
 
 SIZE, BALL = 32, 400
 """Pixels across a picture; Gaussians of the ball."""

@@ -16,7 +16,7 @@ from scas4d_core.kernels.adam import ACTED, EVERY_ROW, adam
 from scas4d_core.query.ply import split_factors
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.structure.neighbours import build_neighbours
-from studies.hard_cases.apart import in_a_process
+from studies.apart import in_a_process
 from studies.hard_cases.case import (
     CPU,
     REFERENCE,

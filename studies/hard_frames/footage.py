@@ -18,9 +18,9 @@ from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings, UpdateSettings
 from scas4d_core.storage.history import History
 from studies.constants import all_varied
-from studies.hard_frames.scene import BALL, cameras, first_state, gone
-from studies.kernels.synthetic import photograph
-from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
+from studies.hard_frames.scene import BALL, first_state, gone
+from studies.quality.first_frame import started
+from studies.synthetic.ball import photograph, rig
 
 Pictures = Mapping[str, NDArray[np.uint8]]
 
@@ -52,8 +52,8 @@ class SyntheticFootage:
             static=StaticSettings(iterations=600, max_gaussians=1200),
             update=UpdateSettings(iterations=60, clusters=(2, 12, 48)),
         )
-        self.rig = cameras(CAMERAS, SIZE)
-        self._others = cameras(4, SIZE, turned=0.4, names="h")
+        self.rig = rig(SIZE, CAMERAS)
+        self._others = rig(SIZE, 4, turned=0.4, names="h")
         self._true = first_state(resting_may_move=False)
         self.frame = cache(self.frame)  # type: ignore[method-assign]
         self.truth = cache(self.truth)  # type: ignore[method-assign]
@@ -111,17 +111,17 @@ class CapturedFootage:
     """A capture with test cameras; its frame 0 is fitted once and kept.
 
     Args:
-        settings: of the scene. kept: folder for frames 0, as that of ``scripts/bench quality``.
+        settings: of the scene. study: folder of a study, which keeps frame 0, as that of ``scripts/bench quality``.
     """
 
     constants = ()
 
-    def __init__(self, capture: Capture, settings: Settings, kept: Path) -> None:
+    def __init__(self, capture: Capture, settings: Settings, study: Path) -> None:
         self._capture = capture
         self.points = capture.points
         self.name, self.count, self.settings = capture.name, capture.frame_count, settings
         self.rig: Rig = capture.full_rig
-        self._kept = kept / f"{first_frame_key(capture, settings)}.npz"
+        self._study = study
 
     @property
     def held_out(self) -> tuple[Camera, ...]:
@@ -143,14 +143,7 @@ class CapturedFootage:
 
     def start(self, folder: Path) -> Reconstruction:
         """Frame 0 committed."""
-        found = load_first_frame(self._kept)
-        scene = Reconstruction.start(
-            self.rig, self.frame(0), self.settings, points=self._capture.points, history=History.open(folder),
-            static=None if found is None else found[0],
-        )  # fmt: skip
-        if found is None and scene.static is not None and scene.report is not None:
-            save_first_frame(self._kept, scene.static, scene.report.seconds["fit"])
-        return scene
+        return started(self._capture, self.settings, self._study, folder)
 
 
 AnyFootage = SyntheticFootage | CapturedFootage

@@ -26,8 +26,6 @@ WITHIN_DB = 0.5
 """Of the undisturbed run, the last good frame."""
 NEAR_DB = 1.0
 """Of the undisturbed run, a faulty frame that can be followed all the same."""
-UNMOVED = (["not moved"], ["the same pictures again"])
-"""What the report says of a frame that needs no iteration."""
 JUMPED_DB = 3.0
 """Of the undisturbed run, an object that jumped, three frames later: it is seen from other sides, with turned light."""
 

@@ -21,19 +21,19 @@ import numpy as np
 from client.cli.evaluate import Report, recorded
 from client.cli.scores import Column, Row, digest, kept_row, markdown
 from client.importers.open_source import open_source
+from client.rig.sequence import there_and_back
 from scas4d_core.cameras import Rig
 from scas4d_core.captures import Capture
 from scas4d_core.captures.frame import Frame
 from scas4d_core.frame_report import FrameReport
-from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.robust import timing
 from scas4d_core.settings import Settings
 from studies.hard_frames.footage import ANGLE, NOISE, SyntheticFootage
 from studies.hard_frames.scene import first_state, gone
-from studies.kernels.synthetic import photograph
 from studies.machine import core_version, machine
-from studies.quality.first_frame import first_of
+from studies.quality.first_frame import started
 from studies.quality.settings import settings_of
+from studies.synthetic.ball import photograph
 
 COLUMNS = (
     Column("capture", "capture"),
@@ -100,8 +100,7 @@ def _row(key: str, folder: Path, out: Path, settings: Settings, updates: int, ca
     capture = open_source(folder, use_masks=masks)
     names = capture.rig.names
     shifts = {names[2]: case.shift, names[len(names) // 2 - 1]: -case.shift} if case.shift else {}
-    first = first_of(capture, out, settings)
-    scene = Reconstruction.start(capture.rig, capture.frame(0), settings, points=capture.points, static=first)
+    scene = started(capture, settings, out)
     with clocked() as spent:
         reports = [scene.step(played(capture, index, case.step, shifts)) for index in range(1, updates + 1)]
     found = summary(reports, {name: shift / case.step for name, shift in shifts.items()})
@@ -117,10 +116,10 @@ def played(capture: Capture, index: int, step: int, shifts: Mapping[str, int]) -
     Args:
         shifts: by camera, frames of the capture after the others'.
     """
-    frame = capture.frame(_there_and_back(step * index, capture.frame_count))
+    frame = capture.frame(there_and_back(abs(step * index), capture.frame_count))
     images, masks = dict(frame.images), dict(frame.masks)
     for name, shift in shifts.items():
-        other = capture.frame(_there_and_back(step * index + shift, capture.frame_count))
+        other = capture.frame(there_and_back(abs(step * index + shift), capture.frame_count))
         images[name] = other.images[name]
         if name in masks:
             masks[name] = other.masks[name]
@@ -140,11 +139,6 @@ def clocked() -> Iterator[list[float]]:
 
     with mock.patch.object(timing, "noted", noted):
         yield spent
-
-
-def _there_and_back(place: int, count: int) -> int:
-    place = abs(place) % (2 * count - 2)
-    return place if place < count else 2 * count - 2 - place
 
 
 def shown_out_of_step(footage: SyntheticFootage, index: int, offsets: Mapping[str, float]) -> Frame:

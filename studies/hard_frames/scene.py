@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.cameras import Camera, Rig
 from scas4d_core.gaussians import Gaussians
 
 ORBIT = 0.14
@@ -14,26 +13,6 @@ BALL = 0.15
 """Metres, its radius."""
 GOES, RESTS, STANDS = 220, 160, 64
 """Gaussians of the ball that goes, of the one that lies, and of the floor; in this order."""
-
-
-def cameras(count: int, size: int, *, turned: float = 0.0, names: str = "c") -> Rig:
-    """Square cameras of ``size`` pixels around the origin, by turns above and below; y is down.
-
-    Args:
-        count: even, so that their mean is the origin. turned: radians, of all of them about the vertical.
-    """
-    lens = np.array([[1.25 * size, 0, size / 2], [0, 1.25 * size, size / 2], [0, 0, 1]])
-    found = []
-    for k in range(count):
-        angle = turned + 2 * np.pi * k / count
-        eye = np.array([1.3 * np.sin(angle), 0.45 * (-1) ** k, 1.3 * np.cos(angle)])
-        z = -eye / np.linalg.norm(eye)
-        x = np.cross([0, 1, 0], z) / np.linalg.norm(np.cross([0, 1, 0], z))
-        pose = np.eye(4)
-        pose[:3, :3] = [x, np.cross(z, x), z]
-        pose[:3, 3] = -pose[:3, :3] @ eye
-        found.append(Camera(f"{names}{k}", lens, pose, size, size))
-    return Rig(tuple(found))
 
 
 def first_state(*, resting_may_move: bool) -> Gaussians:

@@ -24,8 +24,9 @@ from scas4d_core.settings import SceneSettings, Settings, StaticSettings, Update
 from scas4d_core.storage.history import History
 from studies.constants import all_varied
 from studies.hard_frames.footage import SyntheticFootage
-from studies.hard_frames.scene import cameras, first_state, gone, rows
-from studies.kernels.synthetic import photograph
+from studies.hard_frames.scene import first_state, gone, rows
+from studies.machine import resident_mb
+from studies.synthetic.ball import photograph, rig
 
 SIZE = 48
 """Pixels, side of the six pictures."""
@@ -104,7 +105,7 @@ class Soak:
         self.folder = folder
         self.first = first_state(resting_may_move=True)
         self._goes, self._rests = rows()
-        self._rig = cameras(6, SIZE)
+        self._rig = rig(SIZE)
         history = History.open(folder / "states")
         with all_varied(SyntheticFootage.constants):
             if history.indices:
@@ -208,15 +209,6 @@ def violations(rows: Sequence[Row]) -> list[str]:
     if ended > MEMORY * began:
         found.append(f"memory grew from {began:.0f} to {ended:.0f} MB")
     return found
-
-
-def resident_mb() -> float:
-    """Of this process, MB; NaN where the system does not tell."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text().split()[1])
-    except OSError:
-        return float("nan")
-    return pages * 4096 / 1e6
 
 
 def _rms(distances: NDArray[np.float64]) -> float:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from client.cli.reconstruct import FRAME_ALARMS
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.metrics import psnr
 from scas4d_core.reconstruction import Reconstruction
@@ -163,9 +164,7 @@ def _said(step: FrameStep) -> str:
     words = [] if report.degraded is None else [report.degraded]
     if report.dropped:
         words.append("without " + ", ".join(f"{name} ({why})" for name, why in report.dropped.items()))
-    told = [
-        alarm for alarm in report.alarms if alarm.evidence != report.degraded and alarm.camera not in report.dropped
-    ]
+    told = [alarm for alarm in report.alarms if alarm.what not in FRAME_ALARMS and alarm.camera not in report.dropped]
     words += [alarm.evidence if alarm.camera is None else f"{alarm.camera}: {alarm.evidence}" for alarm in told]
     return "; ".join(words or report.attempts)
 

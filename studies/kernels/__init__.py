@@ -1,1 +1,1 @@
-"""Costs of the kernels, and the CPU against the GPU."""
+"""Costs of the kernels, and of a start."""

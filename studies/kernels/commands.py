@@ -1,4 +1,4 @@
-"""`scripts/bench kernels`, `device`, `moving` and `startup`."""
+"""`scripts/bench kernels`, `moving` and `startup`."""
 
 from __future__ import annotations
 
@@ -29,23 +29,6 @@ def kernels(
     settings = settings_of(preset, changes=changes or ())
     row = study.study(capture, settings, store, frames=frames, repeats=repeats)
     write_page(out, study.page(row))
-
-
-def device(
-    gaussians: Annotated[int, typer.Option(min=100, help="Moving Gaussians; a quarter as many stand.")] = 8000,
-    size: Annotated[int, typer.Option(min=16, help="Side of the six pictures in pixels.")] = 384,
-    iterations: Annotated[int, typer.Option(min=1, help="Iterations of the update.")] = 20,
-    repeats: Annotated[int, typer.Option(min=1, help="Repeats of each stage, after a first call that compiles.")] = 5,
-    out: Page = None,
-) -> None:
-    """Compares the GPU with the CPU stage by stage, on a synthetic scene; fails where they disagree."""
-    from studies.kernels import device as study
-
-    text, agree = study.run(gaussians=gaussians, size=size, iterations=iterations, repeats=repeats)
-    typer.echo(text)
-    write_page(out, text)
-    if not agree:
-        raise typer.Exit(1)
 
 
 def moving(

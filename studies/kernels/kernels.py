@@ -11,7 +11,6 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import time
 from collections.abc import Sequence
 from datetime import UTC, datetime
@@ -34,6 +33,7 @@ from scas4d_core.kernels.jit import threads
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from scas4d_core.warm_up import warm_up_elsewhere
+from studies.apart import in_a_process
 from studies.kernels.pairs import MicroKernel, blended_pairs
 from studies.machine import core_version, in_words, machine
 from studies.quality.first_frame import first_frame_key, load_first_frame, save_first_frame
@@ -54,24 +54,22 @@ def study(
 
     Args:
         folder: of the capture.
-        settings: of frame 0 and the updates; on the CPU.
+        settings: of frame 0 and the updates.
         store: folder of the study.
         frames: of the run; the first update compiles or loads kernels and is not counted, so at least 3.
         repeats: of the rasterizer and the micro-kernel.
 
     Raises:
-        ValueError: fewer than 3 frames, or another device.
-        RuntimeError: the run's process ended before its time.
+        ValueError: fewer than 3 frames.
+        BrokenProcessPool: the run's process ended before its time.
     """
     if frames < 3:
         raise ValueError(f"frames is {frames}; give at least 3: the first update is not counted")
-    if settings.device != "cpu":
-        raise ValueError(f"device is {settings.device!r}; this study is of the CPU kernels: give cpu")
     capture = open_source(folder)
     first_file = store / "first" / f"{first_frame_key(capture, settings)}.npz"
     report(f"a run of {min(frames, capture.frame_count)} frames, frame 0 first, in a process of its own")
     warm_up_elsewhere()
-    timed = _run_apart(folder, settings, frames, first_file)
+    timed = in_a_process(run_and_time, folder, settings, frames, first_file)
     kept = load_first_frame(first_file)
     assert kept is not None  # the run has left it there
     world = capture.rig.world_frame(settings.scene.metres_per_unit)
@@ -309,25 +307,3 @@ def run_and_time(folder: Path, settings: Settings, frames: int, first_file: Path
             updates.append({"seconds": time.perf_counter() - started, "stages": dict(done.seconds)})
             bars.advance(bar)
     return {"updates": updates, "frames": count, "peak_mb": peak_megabytes()}
-
-
-def _run_apart(folder: Path, settings: Settings, frames: int, first_file: Path) -> Row:
-    context = multiprocessing.get_context("spawn")
-    receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_child, args=(sender, folder, settings, frames, first_file))
-    process.start()
-    sender.close()
-    try:
-        answer: Row = receiver.recv()
-    except EOFError:
-        process.join()
-        raise RuntimeError(
-            f"the run of {folder} ended with exit code {process.exitcode}; its messages are above"
-        ) from None
-    process.join()
-    return answer
-
-
-def _child(sender: Any, folder: Path, settings: Settings, frames: int, first_file: Path) -> None:
-    sender.send(run_and_time(folder, settings, frames, first_file))
-    sender.close()

@@ -14,7 +14,7 @@ import numpy as np
 
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
-from studies.scale.footage import Size, known, rig, shown, wall
+from studies.synthetic.wall import Size, known, rig, shown, wall
 
 SIZE = Size(gaussians=22_500)
 """As many Gaussians as a captured object has, and as small pictures."""

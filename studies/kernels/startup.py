@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import multiprocessing
 import os
 import resource
 import signal
@@ -19,13 +18,13 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
 from client.errors import ServiceError, ServiceUnreachable
 from client.importers.open_source import open_source
 from client.sdk import Client
+from studies.apart import in_a_process
 from studies.machine import in_words, machine
 from studies.options import Echo
 
@@ -72,8 +71,8 @@ def start(capture: Path, checkout: Path) -> Start:
 
     It does so in a process of its own: that one waits for all its children, and counts their time alone.
     """
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as apart:
-        return apart.submit(_start, capture, checkout).result()
+    begun: Start = in_a_process(_start, capture, checkout)
+    return begun
 
 
 def _start(capture: Path, checkout: Path) -> Start:

@@ -30,7 +30,6 @@ def quality(
         list[int] | None, typer.Option(min=0, help="Seed of frame 0 and the updates, default 0. May be repeated.")
     ] = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Only so many frames; 1 measures frame 0 alone.")] = None,
-    device: Annotated[str | None, typer.Option(help="cpu or cuda; the preset's when left out.")] = None,
     masks: Annotated[bool, typer.Option(help="Give the method the masks; they measure in any case.")] = True,
     points: Annotated[bool, typer.Option(help="Give the method the initial cloud.")] = True,
     lpips: Annotated[bool, typer.Option("--lpips", help="Also LPIPS, where its weights are installed.")] = False,
@@ -54,7 +53,6 @@ def quality(
         iterations=iterations or (),
         seeds=seed or (0,),
         changes=changes or (),
-        device=device,
         frames=frames,
         masks=masks,
         points=points,

@@ -21,6 +21,7 @@ from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
+from scas4d_core.storage.history import History
 
 VERSION = 5
 """Raise this when frame 0 comes out different from the same pictures and settings: what is kept is then fitted anew."""
@@ -39,11 +40,7 @@ def first_frame_key(capture: Capture, settings: Settings) -> str:
         settings: those of the scene and of frame 0 count.
     """
     hasher = hashlib.sha256()
-    static = settings.static.model_dump(mode="json")
-    for name, off in (("seconds", None), ("refine_calibration", False)):
-        if static[name] == off:  # those that were kept before it was a setting have the same name
-            del static[name]
-    described = [VERSION, settings.scene.model_dump(mode="json"), static]
+    described = [VERSION, settings.scene.model_dump(mode="json"), settings.static.model_dump(mode="json")]
     hasher.update(json.dumps(described, sort_keys=True).encode())
     for camera in capture.full_rig.cameras:
         hasher.update(f"{camera.name} {camera.width} {camera.height}".encode())
@@ -65,12 +62,12 @@ def load_first_frame(path: Path) -> tuple[StaticResult, float] | None:
     if not path.exists():
         return None
     with np.load(path, allow_pickle=False) as file:
-        gaussians = Gaussians(**{name: file[name] for name in ARRAYS if name in file})
+        arrays = {name: file[name] for name in ARRAYS if name in file}  # those that are None are not kept
         names, exposures = file["exposure_names"].tolist(), file["exposures"]
         told = zip(*(file[f"evidence_{name}"].tolist() for name in ("names", "shares", "texts")), strict=True)
         evidence = {name: Evidence(share, text) for name, share, text in told}
         losses = file["losses"].tolist()
-        result = StaticResult(gaussians, dict(zip(names, exposures, strict=True)), losses, evidence=evidence)
+        result = StaticResult(Gaussians(**arrays), dict(zip(names, exposures, strict=True)), losses, evidence=evidence)
         return result, float(file["seconds"])
 
 
@@ -108,3 +105,16 @@ def first_of(capture: Capture, out: Path, settings: Settings) -> StaticResult:
         found = load_first_frame(path)
         assert found is not None
     return found[0]
+
+
+def started(capture: Capture, settings: Settings, out: Path, states: Path | None = None) -> Reconstruction:
+    """A reconstruction after frame 0, which is read from the study or, the first time, fitted and kept there.
+
+    Args:
+        states: empty folder to commit to; None: in memory.
+    """
+    static = first_of(capture, out, settings)
+    history = History() if states is None else History.open(states)
+    return Reconstruction.start(
+        capture.rig, capture.frame(0), settings, points=capture.points, static=static, history=history
+    )

@@ -8,17 +8,17 @@ was cut off begins again at its frame 0.
 
 from __future__ import annotations
 
-import multiprocessing
 import traceback
 from collections.abc import Sequence
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any
 
 from client.cli import evaluate
 from client.cli.evaluate import DEFAULT_OPTIONS, Job, Report, page
 from client.cli.scores import QUALITY, Row, Store, digest
 from client.importers.open_source import CaptureOptions
 from scas4d_core.warm_up import warm_up_elsewhere
+from studies.apart import in_a_process
 from studies.constants import all_varied
 from studies.machine import core_version, machine
 from studies.quality.settings import settings_of
@@ -37,7 +37,6 @@ def run(
     iterations: Sequence[int] = (),
     seeds: Sequence[int] = (0,),
     changes: Sequence[str] = (),
-    device: str | None = None,
     frames: int | None = None,
     masks: bool = True,
     points: bool = True,
@@ -56,7 +55,6 @@ def run(
         iterations: of an update, each tried; none: the preset's own.
         seeds: of frame 0 and of the updates, each tried.
         changes: further settings as ``"update.clusters=[64]"``, JSON behind the sign.
-        device: "cpu" or "cuda"; None: the preset's.
         frames: only so many frames of each capture; None: all.
         masks: False withholds the masks from the method.
         points: False withholds the initial cloud.
@@ -76,7 +74,7 @@ def run(
         Job(
             capture=Path(capture),
             preset=name,
-            settings=settings_of(name, count, seed, changes, device),
+            settings=settings_of(name, count, seed, changes),
             frames=frames,
             masks=masks,
             points=points,
@@ -95,7 +93,7 @@ def run(
 def run_jobs(jobs: Sequence[Job], out: Path, *, again: bool = False, report: Report = print) -> list[Row]:
     """Measures what is not on disk yet, one process a row; prints the table and leaves it in ``out/table.md``."""
     store = Store(out)
-    if any(job.settings.device == "cpu" for job in jobs):
+    if jobs:
         warm_up_elsewhere()
     rows = []
     for number, job in enumerate(jobs, 1):
@@ -172,25 +170,16 @@ def _apart(job: Job, folder: Path) -> Row:
         "preset": job.preset,
         "iterations": job.settings.update.iterations,
     }
-    context = multiprocessing.get_context("spawn")
-    receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_child, args=(sender, job, folder))
-    process.start()
-    sender.close()
     try:
-        answer: Any = receiver.recv()
-    except EOFError:
-        process.join()
-        return failed | {"error": f"its process ended with exit code {process.exitcode} (out of memory, or killed)"}
-    process.join()
-    return failed | {"error": answer} if isinstance(answer, str) else dict(answer)
+        answer: Row = in_a_process(_measured_or_failed, job, folder)
+    except BrokenProcessPool:
+        answer = {"error": "its process ended before its time (out of memory, or killed)"}
+    return failed | answer
 
 
-def _child(sender: Any, job: Job, folder: Path) -> None:
+def _measured_or_failed(job: Job, folder: Path) -> Row:
     try:
-        answer: Any = measure(job, folder, lambda line: print(line, flush=True))
+        return measure(job, folder, lambda line: print(line, flush=True))
     except Exception as error:
         traceback.print_exc()
-        answer = f"{type(error).__name__}: {error}"
-    sender.send(answer)
-    sender.close()
+        return {"error": f"{type(error).__name__}: {error}"}

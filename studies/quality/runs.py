@@ -139,9 +139,8 @@ def measured_runs(store: Store) -> dict[tuple[str, str], Row]:
             for row in rows:
                 given = row["given"]
                 withheld = (given["masks"], given["points"])
-                measured = row["settings"]
-                same = all(measured.get(group) == settings[group] for group in groups)
-                varied = measured.get("constants", ())
+                same = all(row["settings"].get(group) == settings[group] for group in groups)
+                varied = row["settings"].get("constants", ())
                 same &= not any(run.frames != 1 or place.startswith(FIRST_FRAME) for place in varied)
                 if row["capture"] != capture or not same or withheld != (run.masks, run.points):
                     continue

@@ -15,7 +15,6 @@ def settings_of(
     iterations: int | None = None,
     seed: int = 0,
     changes: Sequence[str] = (),
-    device: str | None = None,
 ) -> Settings:
     """A preset with changes; the time of frame 0 has no limit, so that a study does not depend on the machine's load.
 
@@ -24,7 +23,6 @@ def settings_of(
         iterations: of an update; the preset's where None.
         seed: of frame 0 and of the updates.
         changes: as ``"update.clusters=[64]"``; they go over all else.
-        device: "cpu" or "cuda"; the preset's where None.
 
     Raises:
         ValueError: an unknown preset or setting, or a value out of range.
@@ -32,6 +30,4 @@ def settings_of(
     own: dict[str, Any] = {"static": {"seed": seed, "seconds": None}, "update": {"seed": seed}}
     if iterations is not None:
         own["update"]["iterations"] = iterations
-    if device is not None:
-        own["device"] = device
     return preset(name, own, parse_changes(changes))

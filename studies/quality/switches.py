@@ -17,10 +17,9 @@ from scas4d_core.captures import Capture
 from scas4d_core.captures.frame import Frame
 from scas4d_core.effect_names import EFFECTS
 from scas4d_core.effects.effect import effect
-from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from studies.machine import core_version, machine
-from studies.quality.first_frame import first_of
+from studies.quality.first_frame import started
 from studies.quality.settings import settings_of
 
 COLUMNS = (
@@ -78,9 +77,7 @@ def _row(folder: Path, out: Path, key: str, settings: Settings, seed: int, updat
 
 def _played(capture: Capture, out: Path, settings: Settings, updates: int) -> Row:
     """The switches of the effects that wait for evidence."""
-    scene = Reconstruction.start(
-        capture.rig, capture.frame(0), settings, points=capture.points, static=first_of(capture, out, settings)
-    )
+    scene = started(capture, settings, out)
     auto = [name for name in EFFECTS if effect(name).auto]
     on = [{name: bool(scene.history.report(0)["effects"].get(name, {}).get("on")) for name in auto}]
     changed: dict[str, list[int]] = {}

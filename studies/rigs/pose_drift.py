@@ -29,7 +29,7 @@ from scas4d_core.metrics.evaluation import measure_pictures
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from studies.machine import core_version, machine
-from studies.quality.first_frame import first_of
+from studies.quality.first_frame import started
 from studies.quality.settings import settings_of
 
 COLUMNS = (
@@ -91,8 +91,7 @@ def _row(known: Row, folder: Path, out: Path, settings: Settings, updates: int, 
 def _played(folder: Path, out: Path, settings: Settings, updates: int, drift: tuple[float, float]) -> Row:
     capture = open_source(folder)
     tests = open_source(folder, image_scale=settings.scene.image_scale)
-    known = first_of(capture, out, settings)
-    scene = Reconstruction.start(capture.rig, capture.frame(0), settings, points=capture.points, static=known)
+    scene = started(capture, settings, out)
     names, scores, offsets = capture.rig.names, list[float](), dict[str, NDArray[np.float64]]()
     for index in range(1, min(updates, capture.frame_count - 1) + 1):
         size = min(drift[1], index * drift[0])

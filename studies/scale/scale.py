@@ -21,7 +21,7 @@ from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 from studies.options import Echo
-from studies.scale.footage import Size, known, rig, shown, wall
+from studies.synthetic.wall import Size, known, rig, shown, wall
 
 SCENE = {"metres_per_unit": 1.0, "background": (0.0, 0.0, 0.0)}
 """That of the footage: with another background, what stands would be found to be wrong, and mended."""

@@ -15,9 +15,9 @@ from server.storage.events import ReconstructionBegun
 from server.storage.journal import read_journal
 from server.storage.layout import DataFolder
 from studies.options import Echo
-from studies.service.outcome import ScenarioResult
-from studies.service.process import PATIENCE_S, Service, StudyError
-from studies.service.study import AGAIN_S, FrameSender, Study, compare, digests
+from studies.running.outcome import ScenarioResult
+from studies.running.process import PATIENCE_S, Service, StudyError
+from studies.running.study import AGAIN_S, Study, compare, digests, running
 
 SPREADS_S = (0.1, 1.0)
 """A kill comes within one of these seconds after the request: before its event, after it, or in the first frame."""
@@ -29,13 +29,9 @@ def beginnings(study: Study, expected: Mapping[int, str], count: int, seed: int,
     Half of the frames are here before the first beginning, one more comes with each.
     """
     random_ = random.Random(seed)
-    service = study.service("beginnings")
-    service.start()
-    scene = study.create(service)
-    sender = FrameSender(study, service, scene)
     sent = len(study.frames) // 2
     ended: Counter[str] = Counter()
-    try:
+    with running(study, "beginnings") as (service, scene, sender):
         for index in range(sent):
             sender.send(index)
         service.finish(scene, sent)
@@ -71,8 +67,6 @@ def beginnings(study: Study, expected: Mapping[int, str], count: int, seed: int,
         found = f"{ended['before']} ended before, {ended['after']} after; {len(expected)} states compared"
         target = "each ends wholly before or after; final state bit-identical to a run without any"
         return ScenarioResult(f"kill -9 in {count} beginnings of a reconstruction", target, found, faults)
-    finally:
-        service.stop()
 
 
 def _begin(service: Service, scene: str, number: int) -> None:

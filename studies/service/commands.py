@@ -8,11 +8,7 @@ from typing import Annotated
 
 import typer
 
-from studies.options import Changes, Page, write_page
-
-Repeated = Annotated[
-    Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture; a short one is played back and forth.")
-]
+from studies.options import Changes, Page, Repeated, write_page
 
 
 def faults(
@@ -54,9 +50,9 @@ def faults(
     from client.cli.extras import need_server
     from client.importers.open_source import open_source
     from studies.cluster import faults as of_nodes
+    from studies.running.outcome import ScenarioResult, table
+    from studies.running.study import Study, encoded_frames
     from studies.service import faults as of_faults
-    from studies.service.outcome import ScenarioResult, table
-    from studies.service.study import Study, encoded_frames
 
     need_server()
     if placement not in ("local", "ray"):

@@ -19,7 +19,7 @@ from client.sdk import Client
 from client.wire import FrameState
 from scas4d_core.captures import Capture
 from studies.captures import open_measured
-from studies.service.process import Service, wait_until
+from studies.running.process import Service, wait_until
 
 PACKAGES = ("scas4d_core", "server", "client")
 MOST_OF_A_FRAME, MOST_OF_A_RENDER = 62, 26

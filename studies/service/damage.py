@@ -24,8 +24,8 @@ from scas4d_core.storage.npz import read_npz
 from server.storage.frame_store import FrameDamage, read_pictures
 from server.storage.journal import read_journal
 from server.storage.layout import DataFolder
-from studies.service.process import Service, StudyError
-from studies.service.study import AGAIN_S, FrameSender, Study, digests
+from studies.running.process import Service, StudyError
+from studies.running.study import AGAIN_S, Study, digests, running
 
 KINDS = ("state", "checkpoint", "fixed", "journal", "frame")
 BEFORE = 6
@@ -65,30 +65,20 @@ def frames_for(count: int) -> int:
 
 def undisturbed(study: Study) -> tuple[dict[int, str], Pictures]:
     """States and views of a run that nothing disturbs."""
-    service = study.service("undisturbed_views")
-    service.start()
-    try:
-        scene = study.create(service)
-        sender = FrameSender(study, service, scene)
+    with running(study, "undisturbed_views") as (service, scene, sender):
         for index in range(len(study.frames)):
             sender.send(index)
         service.finish(scene, len(study.frames))
         views = {index: _view(service, study, scene, index).content for index in range(len(study.frames))}
         return digests(DataFolder(service.data).scene(scene).states), views
-    finally:
-        service.stop()
 
 
 def flips(study: Study, count: int, seed: int, echo: Callable[[str], None]) -> Flips:
     """Flips `count` bits, as many of each kind, half of them while the service is down."""
     random_ = random.Random(seed)
     expected, views = undisturbed(study)
-    service = study.service("flips", SCRUB)
-    service.start()
     found = Flips()
-    try:
-        scene = study.create(service, keep_frames={"last": KEPT})
-        sender = FrameSender(study, service, scene)
+    with running(study, "flips", SCRUB, keep_frames={"last": KEPT}) as (service, scene, sender):
         for index in range(BEFORE):
             sender.send(index)
         service.finish(scene, BEFORE)
@@ -111,8 +101,6 @@ def flips(study: Study, count: int, seed: int, echo: Callable[[str], None]) -> F
         if wrong:
             found.faults.append(f"states {wrong} are not bit-identical")
         return found
-    finally:
-        service.stop()
 
 
 class _Flip:

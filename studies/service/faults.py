@@ -24,12 +24,12 @@ from server.storage.events import FrameAccepted
 from server.storage.journal import read_journal
 from server.storage.layout import DataFolder, SceneFolder
 from studies.options import Echo
+from studies.running.outcome import ScenarioResult
+from studies.running.process import PATIENCE_S, Service, StudyError
+from studies.running.study import AGAIN_S, FrameSender, Study, compare, digests, encoded_frames, running, undisturbed
 from studies.service import damage
 from studies.service.beginnings import beginnings
-from studies.service.outcome import ScenarioResult
-from studies.service.process import PATIENCE_S, Service, StudyError
 from studies.service.strangers import Attack, strangers
-from studies.service.study import AGAIN_S, FrameSender, Study, compare, digests, encoded_frames, undisturbed
 
 TURN_S = 15.0
 """Of updates without strangers; with them, until the last connection is closed."""
@@ -50,12 +50,8 @@ def kills(
         index, victim = random_.randrange(len(study.frames)), random_.choice(("worker", "service"))
         moments.setdefault(index, []).append(victim)
     killed: Counter[int] = Counter()
-    service = study.service("kills")
-    service.start()
-    scene = study.create(service)
-    sender = FrameSender(study, service, scene)
     done = {"worker": 0, "service": 0}
-    try:
+    with running(study, "kills") as (service, scene, sender):
         for index in range(len(study.frames)):
             thread = threading.Thread(target=sender.send, args=(index,))
             thread.start()
@@ -83,8 +79,6 @@ def kills(
         return ScenarioResult(
             f"kill -9 at {count} random moments over {len(study.frames)} frames", target, found, faults
         )
-    finally:
-        service.stop()
 
 
 def _kill_worker(service: Service, scene: str, killed: Counter[int]) -> None:
@@ -193,12 +187,8 @@ def full_disk(study: Study, expected: Mapping[int, str], echo: Echo) -> Scenario
     The limit on the size of files is set on the running processes (RLIMIT_FSIZE), so that every write fails where a
     full disk would make it fail.
     """
-    service = study.service("full")
-    service.start()
     faults: list[str] = []
-    try:
-        scene = study.create(service)
-        sender = FrameSender(study, service, scene)
+    with running(study, "full") as (service, scene, sender):
         half = len(study.frames) // 2
         for index in range(half):
             sender.send(index)
@@ -211,10 +201,11 @@ def full_disk(study: Study, expected: Mapping[int, str], echo: Echo) -> Scenario
                 faults.append("a frame was taken that was not acknowledged")
         worker = service.worker_pid(scene)
         assert worker is not None
+        before = service.status(scene).error  # it may say still that the service had no room
         with _no_room(worker):
             sender.send(half)
             until = time.monotonic() + PATIENCE_S
-            while "room" not in (service.status(scene).error or "") and time.monotonic() < until:
+            while service.status(scene).error in (None, before) and time.monotonic() < until:
                 time.sleep(AGAIN_S)
             echo(f"while the worker has no room: {service.status(scene).error}")
             if service.frame(scene, half).state != FrameState.UPDATING:
@@ -223,8 +214,6 @@ def full_disk(study: Study, expected: Mapping[int, str], echo: Echo) -> Scenario
             sender.send(index)
         service.finish(scene, len(study.frames))
         faults += sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
-    finally:
-        service.stop()
     target = "starts, loses nothing acknowledged before the damage, says what it dropped"
     return ScenarioResult(
         "disk full while ingesting", target, "507 meanwhile; all committed once there was room", faults

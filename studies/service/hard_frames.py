@@ -33,7 +33,7 @@ from studies.hard_frames.footage import AnyFootage
 from studies.hard_frames.frames import FrameCase, FrameStep, Pictures, Sent, good, named, teleported, violations
 from studies.hard_frames.study import AT, sound
 from studies.options import Echo
-from studies.service.process import PATIENCE_S, Service, StudyError
+from studies.running.process import PATIENCE_S, Service
 
 FARTHEST = 1.0
 """Sizes that the object jumps: where it is by then, twice its size is out of the pictures."""
@@ -171,16 +171,8 @@ def _push(service: Service, footage: AnyFootage, sent: Sequence[Sent], echo: Ech
         footage.settings.model_dump(mode="json"),
         ingest={"keep_frames": {}, "minimum_cameras": 1, "exact_states": None},
     )
-    points = footage.points
-    if points is not None:
-        body = io.BytesIO()
-        arrays: dict[str, Any] = {"positions": points.positions, "colours": points.colours}
-        if points.foreground is not None:
-            arrays["foreground"] = points.foreground
-        np.savez(body, **arrays)
-        answer = service.http.put(f"/v1/scenes/{scene}/points", content=body.getvalue())
-        if answer.status_code >= 300:
-            raise StudyError(answer.text)
+    if footage.points is not None:
+        service.put_points(scene, footage.points)
     pids = set()
     for index, one in enumerate(sent):
         until = time.monotonic() + PATIENCE_S

@@ -24,7 +24,7 @@ from websockets.sync.client import connect
 
 from client.wire import FRAME_MEDIA_TYPE, IngestAnswer, frame_chunks
 from scas4d_core.cameras import Camera, Rig
-from studies.service.process import Service, StudyError
+from studies.running.process import Service, StudyError
 
 TARGET = 0.8
 UNANSWERED = 2

@@ -7,7 +7,6 @@ And memory of a service whose scenes all sleep, with the time of their listing a
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import time
 from dataclasses import replace
@@ -25,7 +24,8 @@ from server.settings import ServerSettings
 from server.storage.definition import read_definition, write_definition
 from server.storage.layout import DataFolder, SceneFolder
 from studies.constants import varied
-from studies.service.process import Service
+from studies.machine import resident_mb
+from studies.running.process import Service
 
 
 def ring(count: int, size: int) -> Rig:
@@ -104,7 +104,7 @@ def sleeping(scene: Path, count: int, views: int, work: Path) -> dict[str, float
             began = time.perf_counter()
             service.start()
             listed = service.http.get("/v1/scenes").json()["scenes"]
-            found[name] = time.perf_counter() - began, _resident_mb(service.pid), len(listed)
+            found[name] = time.perf_counter() - began, resident_mb(service.pid), len(listed)
             waited = [_first_view(service, one) for one in names[:views]] if name == "again" else []
         finally:
             service.stop()
@@ -126,9 +126,3 @@ def _first_view(service: Service, name: str) -> float:
     waited = time.perf_counter() - began
     service.http.post(f"/v1/scenes/{name}/sleep").raise_for_status()
     return waited
-
-
-def _resident_mb(pid: int) -> float:
-    match = re.search(r"VmRSS:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
-    assert match is not None
-    return int(match[1]) / 1000

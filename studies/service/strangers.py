@@ -6,7 +6,6 @@ goes on updating all the time, in the turns with the attack until its last conne
 
 from __future__ import annotations
 
-import contextlib
 import http.client
 import json
 import statistics
@@ -15,15 +14,14 @@ import sys
 import threading
 import time
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
-from client.wire import FrameState
+from studies.machine import resident_mb
 from studies.options import Echo
-from studies.service.outcome import ScenarioResult
-from studies.service.process import Service, StudyError
-from studies.service.study import Study
+from studies.running.outcome import ScenarioResult
+from studies.running.process import Service
+from studies.running.study import Study, Updates
 
 P99_MS, MEMORY_MB, CLOSED_S, SLOWER = 50.0, 50.0, 60.0, 1.1
 TOKEN = "of-the-study-and-of-nobody-else"
@@ -96,47 +94,6 @@ class Watch:
             self._side.memory = max(self._side.memory, resident_mb(self._service.pid))
 
 
-def resident_mb(pid: int) -> float:
-    """Memory of a process, MB; 0 where it cannot be read."""
-    with contextlib.suppress(OSError):
-        for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-            if line.startswith("VmRSS"):
-                return int(line.split()[1]) * 1024 / 1e6
-    return 0.0
-
-
-class Updates:
-    """Frames of the study, sent one after the other for as long as is asked."""
-
-    def __init__(self, study: Study, service: Service) -> None:
-        self._study, self._service = study, service
-        self.scene = study.create(service, queue_frames=AT_ONCE + 1)
-        self._next = 0
-
-    def run(self, count: int) -> list[float]:
-        """Sends so many frames and waits until they are committed; seconds that each took."""
-        first = self._next
-        for index in range(first, first + count):
-            # The frames of a study go back and forth: behind the last comes the last but one.
-            turn = index % max(1, 2 * len(self._study.frames) - 2)
-            files = self._study.frames[min(turn, 2 * len(self._study.frames) - 2 - turn)]
-            answer = self._service.put(self.scene, index, *files)
-            if not answer.is_success:
-                raise StudyError(answer.text)
-        self._next += count
-        self._service.finish(self.scene, self._next)
-        reports = [self._service.frame(self.scene, index) for index in range(first, self._next)]
-        for report in reports:
-            if report.state != FrameState.COMMITTED:
-                raise StudyError(f"frame {report.index} was not committed: {report.error}")
-        return [report.seconds["total"] for report in reports]
-
-    @property
-    def upload(self) -> str:
-        """The path of the next frame, to which the attack's uploads go."""
-        return f"/v1/scenes/{self.scene}/frames/{self._next + AT_ONCE}"
-
-
 def strangers(study: Study, attack: Attack, *, turns: int, seconds: float, token: bool, echo: Echo) -> ScenarioResult:
     """The attack on one service.
 
@@ -151,7 +108,8 @@ def strangers(study: Study, attack: Attack, *, turns: int, seconds: float, token
     without, attacked = AttackTimes(), AttackTimes()
     closed, left = 0.0, 0
     try:
-        updates = Updates(study, service)
+        scene = study.create(service, queue_frames=AT_ONCE + 1)
+        updates = Updates(service, scene, study.frames)
         updates.run(1)
         updates.run(WARM_UP)
         for turn in range(turns):
@@ -160,7 +118,8 @@ def strangers(study: Study, attack: Attack, *, turns: int, seconds: float, token
                 while time.monotonic() < until:
                     without.updates += updates.run(AT_ONCE)
             with Watch(service, attacked):
-                attacker = _start(service.port, updates.upload, attack)
+                upload = f"/v1/scenes/{scene}/frames/{updates.next + AT_ONCE}"  # of a frame that is never sent
+                attacker = _start(service.port, upload, attack)
                 while attacker.poll() is None:
                     attacked.updates += updates.run(AT_ONCE)
             ended = json.loads(attacker.communicate()[0])

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import io
 import shutil
 import statistics
 import threading
@@ -23,12 +22,11 @@ from typing import Any
 import httpx
 import numpy as np
 
-from client.wire import FrameState
 from scas4d_core.captures import Capture
 from studies.machine import in_words, machine
 from studies.options import Echo
-from studies.service.process import Service, StudyError
-from studies.service.study import encoded_frames
+from studies.running.process import Service
+from studies.running.study import Updates, encoded_frames
 
 TARGET_RATE, TARGET_LATENCY, TARGET_SLOWER = 5.0, 2.0, 0.25
 IDLE_S = 6.0
@@ -108,30 +106,6 @@ class Load:
         self.latencies.append(1000 * (time.perf_counter() - due))
 
 
-class CaptureSender:
-    """Frames of a capture that are sent to a scene, some at a time."""
-
-    def __init__(self, service: Service, scene: str, capture: Capture, count: int) -> None:
-        self._service, self._scene = service, scene
-        self._frames = encoded_frames(capture, count)
-        self.next = 0
-
-    def update(self, count: int) -> list[float]:
-        """Sends so many frames at once and waits until they are committed; seconds that each took."""
-        first = self.next
-        for index in range(first, first + count):
-            answer = self._service.put(self._scene, index, *self._frames[index])
-            if not answer.is_success:
-                raise StudyError(answer.text)
-        self.next += count
-        self._service.finish(self._scene, self.next)
-        reports = [self._service.frame(self._scene, index) for index in range(first, self.next)]
-        for report in reports:
-            if report.state != FrameState.COMMITTED:
-                raise StudyError(f"frame {report.index} was not committed: {report.error}")
-        return [report.seconds["total"] for report in reports]
-
-
 def measure(
     capture: Capture,
     folder: Path,
@@ -160,11 +134,11 @@ def measure(
         many = 1 + WARM_UP + 2 * updates * turns * len(rates)
         scene = service.create(capture.rig, settings, ingest={"queue_frames": updates + 1})
         if capture.points is not None:
-            put_points(service, scene, capture)
-        frames = CaptureSender(service, scene, capture, many)
+            service.put_points(scene, capture.points)
+        frames = Updates(service, scene, encoded_frames(capture, many))
         echo("frame 0 …")
-        frames.update(1)
-        frames.update(WARM_UP)
+        frames.run(1)
+        frames.run(WARM_UP)
         url = f"http://127.0.0.1:{service.port}/v1/scenes/{scene}/"
         names = capture.rig.names
         with Load(url, names, 2.0, width):  # connections, the reader's kernels
@@ -176,9 +150,9 @@ def measure(
                     time.sleep(IDLE_S)
                 row.idle += load.latencies
                 row.refused += load.refused
-                row.alone += frames.update(updates)
+                row.alone += frames.run(updates)
                 with Load(url, names, row.rate, width) as load:
-                    row.together += frames.update(updates)
+                    row.together += frames.run(updates)
                 row.loaded += load.latencies
                 row.refused += load.refused
                 echo(line(row))
@@ -187,20 +161,6 @@ def measure(
         with contextlib.suppress(Exception):
             service.stop()
         service.kill()
-
-
-def put_points(service: Service, scene: str, capture: Capture) -> None:
-    """The capture's first cloud."""
-    points = capture.points
-    assert points is not None
-    arrays: dict[str, Any] = {"positions": points.positions, "colours": points.colours}
-    if points.foreground is not None:
-        arrays["foreground"] = points.foreground
-    file = io.BytesIO()
-    np.savez(file, **arrays)
-    answer = service.http.put(f"/v1/scenes/{scene}/points", content=file.getvalue())
-    if answer.status_code != 200:
-        raise StudyError(answer.text)
 
 
 def line(row: ViewTimes) -> str:

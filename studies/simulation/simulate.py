@@ -18,7 +18,6 @@ from server.processes import worker
 from server.processes.messages import SceneSpec
 from server.settings import ServerSettings
 from server.storage.layout import DataFolder
-from studies.scale.footage import Size, rig
 from studies.simulation.clock import run_virtual
 from studies.simulation.cluster import SimulatedCluster
 from studies.simulation.delays import HEAD_S, Range
@@ -28,6 +27,7 @@ from studies.simulation.scene import ScenePlan
 from studies.simulation.service import SimulatedService
 from studies.simulation.takeover import Takeovers
 from studies.simulation.work import content, frame_file, listed, read_frame
+from studies.synthetic.wall import Size, rig
 
 RIGS = (
     (0.50, Size(cameras=4)),

@@ -9,6 +9,7 @@ import browser_engine
 import pytest
 from browser_page import FRAMES, SIZES, push, start_scene
 from running import Running, fake_settings
+from waiting import HANG_S
 
 from client.sdk import Client
 
@@ -36,7 +37,7 @@ def chromium():
 def page(chromium):
     """A page on which nothing may go wrong unseen."""
     opened = chromium.new_page(viewport=SIZE)
-    opened.set_default_timeout(20_000)
+    opened.set_default_timeout(1000 * HANG_S)
     opened.faults = []
     opened.on("pageerror", lambda error: opened.faults.append(str(error)))
     opened.on("console", lambda message: opened.faults.append(message.text) if message.type == "error" else None)
@@ -50,7 +51,7 @@ def sized(request, chromium):
     phone = request.param == "phone"
     context = chromium.new_context(viewport=SIZES[request.param], has_touch=phone, is_mobile=phone)
     page = context.new_page()
-    page.set_default_timeout(20_000)
+    page.set_default_timeout(1000 * HANG_S)
     page.size, page.faults = request.param, []
     page.on("pageerror", lambda error: page.faults.append(str(error)))
     page.on("console", lambda message: page.faults.append(message.text) if message.type == "error" else None)
@@ -69,7 +70,7 @@ def service(tmp_path_factory):
 @pytest.fixture(scope="session")
 def finished(service):
     """A scene whose frames are all committed."""
-    with Client(service.url, patience=30) as sdk:
+    with Client(service.url, patience=HANG_S) as sdk:
         id = start_scene(sdk)
         for index in range(FRAMES):
             push(sdk, id, index)

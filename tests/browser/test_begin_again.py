@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 from browser_page import opened, push, shown, start_scene, until
+from waiting import HANG_S
 
 from client.sdk import Client
 
@@ -11,7 +12,7 @@ from client.sdk import Client
 @pytest.fixture
 def five(service):
     """A scene with five committed frames."""
-    with Client(service.url, patience=30) as sdk:
+    with Client(service.url, patience=HANG_S) as sdk:
         id = start_scene(sdk, "again")
         try:
             for index in range(5):

@@ -11,6 +11,7 @@ import browser_engine
 import pytest
 from browser_engine import make_rig
 from running import Running, fake_settings
+from waiting import HANG_S
 
 from client.sdk import Client
 from client.wire.stream import STREAM_PROTOCOL
@@ -58,7 +59,7 @@ def foreign():
     thread.start()
     yield f"http://127.0.0.1:{server.server_port}"
     server.shutdown()
-    thread.join()
+    thread.join(HANG_S)
     server.server_close()
 
 

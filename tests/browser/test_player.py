@@ -11,6 +11,7 @@ import pytest
 from browser_page import canvas, until
 from export_cases import bent
 from PIL import Image
+from waiting import HANG_S
 
 from client.exports.player import VIEWER, export_player, write_player
 
@@ -28,7 +29,7 @@ def offline(chromium):
     """A page without a network, on which nothing may go wrong unseen."""
     context = chromium.new_context(viewport={"width": 900, "height": 600}, offline=True)
     page = context.new_page()
-    page.set_default_timeout(20_000)
+    page.set_default_timeout(1000 * HANG_S)
     page.faults = []
     page.on("pageerror", lambda error: page.faults.append(str(error)))
     page.on("console", lambda message: page.faults.append(message.text) if message.type == "error" else None)

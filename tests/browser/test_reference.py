@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import httpx
+from waiting import HANG_S
 
 
 def test_it_is_drawn_from_this_service_alone(page, service):
@@ -18,7 +19,7 @@ def test_it_is_drawn_from_this_service_alone(page, service):
 
 
 def test_its_files_have_a_policy_and_no_others_are_served(service):
-    with httpx.Client(base_url=service.url, follow_redirects=True) as http:
+    with httpx.Client(base_url=service.url, follow_redirects=True, timeout=HANG_S) as http:
         for path in ("/docs", "/redoc", "/docs/swagger-ui-bundle.js", "/docs/reference.js"):
             answer = http.get(path)
             assert answer.status_code == 200, path

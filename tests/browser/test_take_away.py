@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from browser_page import opened, push, start_scene, until
+from waiting import HANG_S
 
 from client.sdk import Client
 from server.processes import exporter
@@ -30,7 +31,7 @@ def ready(page):
 
 @pytest.fixture(scope="module")
 def scene(service):
-    with Client(service.url, patience=30) as sdk:
+    with Client(service.url, patience=HANG_S) as sdk:
         id = start_scene(sdk, "takeaway")
         for index in range(4):
             push(sdk, id, index)
@@ -74,7 +75,7 @@ def test_faults_are_told_in_words_and_the_phone_shows_it_all(chromium, service, 
     sdk, id = scene
     context = chromium.new_context(viewport={"width": 390, "height": 844}, has_touch=True, is_mobile=True)
     page = context.new_page()
-    page.set_default_timeout(20_000)
+    page.set_default_timeout(1000 * HANG_S)
     opened(page, service, id)
     ready(page)
     page.select_option("#take-format", "poses")

@@ -6,6 +6,7 @@ import browser_engine
 import fakes
 import pytest
 from browser_page import FRAMES, opened, push, shown, start_scene, until
+from waiting import HANG_S
 
 from client.sdk import Client
 
@@ -13,7 +14,7 @@ from client.sdk import Client
 @pytest.fixture
 def guessed(service):
     """A scene whose frame 0 is a guess, and whose calibration seems to be off; its last frame has alarms."""
-    with Client(service.url, patience=30) as sdk:
+    with Client(service.url, patience=HANG_S) as sdk:
         id = start_scene(sdk, "guessed")
         try:
             push(sdk, id, 0, red=fakes.GUESSED)

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from running import Running
+from waiting import HANG_S
 
 from client.wire import FRAME_MEDIA_TYPE, FrameFile, FrameHead, RenderRequest, SceneCreate, frame_chunks
 from client.wire.base import MAX_CAMERAS
@@ -53,7 +54,7 @@ def made(tmp_path_factory):
     environment = {**os.environ, "SCAS4D_URL": running.url, "SCAS4D_TOKEN": TOKEN, "NO_PROXY": "127.0.0.1"}
     try:
         done = subprocess.run(
-            ["sh", "-eu", "-c", said], cwd=folder, env=environment, capture_output=True, text=True, timeout=400
+            ["sh", "-eu", "-c", said], cwd=folder, env=environment, capture_output=True, text=True, timeout=HANG_S
         )
         assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
         scenes = running.app.state.scenes

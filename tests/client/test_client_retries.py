@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from datetime import UTC, datetime, timedelta
 from email.utils import format_datetime
+from types import SimpleNamespace
 
 import httpx
 import pytest
@@ -95,7 +95,20 @@ def test_making_a_scene_is_sent_again_only_where_nothing_was_sent():
     assert len(script.requests) == 2
 
 
-def test_patience_with_a_full_queue_ends():
+@pytest.fixture
+def clock(monkeypatch):
+    """Waits of the client take no time, and its clock goes on by them."""
+    now = [0.0]
+
+    def wait(seconds):
+        now[0] += seconds
+
+    for module in ("client.sdk", "client.retries"):
+        monkeypatch.setattr(f"{module}.time", SimpleNamespace(monotonic=lambda: now[0], sleep=wait))
+    return now
+
+
+def test_patience_with_a_full_queue_ends(clock):
     client, script = scripted(*[busy()] * 99, patience=0.35)
     with pytest.raises(errors.Busy, match="said 429"):
         client.put_frame("s", 0, {"c": b"x"})
@@ -123,7 +136,7 @@ def test_a_predicted_wait_is_exact_and_a_long_one_is_asked_about_again(answer, l
     assert least <= retries.after_answer(answer) <= most
 
 
-def test_an_outage_is_waited_for_until_its_limit_and_no_longer():
+def test_an_outage_is_waited_for_until_its_limit_and_no_longer(clock):
     client, script = scripted(*[httpx.ConnectError("down")] * 99, outage=0.5)
     with pytest.raises(errors.ServiceUnreachable, match=r"http://nowhere cannot be reached after \d tries: down"):
         client.frame("s", 0)
@@ -134,27 +147,25 @@ def test_an_outage_is_waited_for_until_its_limit_and_no_longer():
     assert len(script.requests) == 1
 
 
-def test_waits_grow_to_a_limit_and_are_not_all_alike(monkeypatch):
-    now = [0.0]
-    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+def test_waits_grow_to_a_limit_and_are_not_all_alike(clock):
     runs = []
     for _ in range(20):
         retries = Retries(frame("s", 0), "u", busy=0, outage=1e9)
         waits = []
         for _ in range(12):
             waits.append(retries.after_break(httpx.ReadError("cut")))
-            now[0] += waits[-1]
+            clock[0] += waits[-1]
         runs.append(waits)
         expected = [min(0.2 * 2**n, 5.0) for n in range(12)]
         assert all(0.5 * top <= wait <= top for wait, top in zip(waits, expected, strict=True))
     assert len({waits[3] for waits in runs}) > 10
 
 
-def test_a_full_queue_says_that_the_service_is_back():
+def test_a_full_queue_says_that_the_service_is_back(clock):
     """An outage is counted from its own first failure, not from that of one long over."""
     retries = Retries(put_frame("s", 0, {"c": b"x"}), "u", busy=10, outage=0.2)
     retries.after_break(httpx.ReadError("cut"))
-    time.sleep(0.25)
+    clock[0] += 0.25
     assert retries.after_answer(busy()) is not None
     assert retries.after_break(httpx.ReadError("cut")) <= 0.2
 

@@ -7,6 +7,7 @@ import time
 
 import pytest
 from running import Running, fake_settings
+from waiting import HANG_S
 
 from client.rig import Lateness, Pace, Sequence, push
 from client.sdk import Client
@@ -21,7 +22,7 @@ def capture(capture_folder):
 
 @pytest.fixture
 def client(service):
-    with Client(service.url, patience=30) as client:
+    with Client(service.url, patience=HANG_S) as client:
         yield client
         for status in client.scenes():
             client.delete_scene(status.id)
@@ -192,7 +193,7 @@ def test_a_restart_of_the_service_is_waited_out(capture, tmp_path):
             restarting.start()
 
     try:
-        with Client(running.url, outage=60, patience=60) as client:
+        with Client(running.url, outage=HANG_S, patience=HANG_S) as client:
             delivery = push(
                 capture, client, pace=Pace(fps=10), frames=20, loop=True, on_progress=told, on_message=said.append
             )

@@ -7,6 +7,7 @@ import re
 import httpx
 import numpy as np
 from running import make_rig, picture
+from waiting import HANG_S
 
 from client import calls
 from client.sdk import Client
@@ -73,7 +74,7 @@ def template(path):
 
 
 def test_every_route_has_a_method_and_every_method_a_route(service):
-    described = httpx.get(f"{service.url}/openapi.json").json()["paths"]
+    described = httpx.get(f"{service.url}/openapi.json", timeout=HANG_S).json()["paths"]
     routes = {
         (method.upper(), path)
         for path, methods in described.items()
@@ -87,7 +88,7 @@ def test_every_route_has_a_method_and_every_method_a_route(service):
 
 
 def test_pause_close_missing_and_listings(service):
-    with Client(service.url, patience=20) as client:
+    with Client(service.url, patience=HANG_S) as client:
         scene = client.create_scene(make_rig())
         try:
             assert client.rig(scene.id).names == ("c0", "c1")

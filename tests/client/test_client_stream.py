@@ -7,6 +7,7 @@ import json
 from contextlib import asynccontextmanager
 
 import pytest
+from waiting import HANG_S
 from websockets.asyncio.server import serve
 
 from client.errors import NotAuthorized, ServiceUnreachable
@@ -18,7 +19,7 @@ HEAD = BulkHead(type="render", id="v", missed=0, frame=4, media_type="image/png"
 
 
 def run(test):
-    asyncio.run(asyncio.wait_for(test, 60))
+    asyncio.run(asyncio.wait_for(test, HANG_S))
 
 
 @asynccontextmanager

@@ -11,6 +11,8 @@ from client.sdk import Client
 from scas4d_core.captures import open_capture
 from server.settings import ServerSettings
 
+pytestmark = pytest.mark.service
+
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()
 LINES = re.search(r"```python\n(.*?)```", README, re.DOTALL)[1]

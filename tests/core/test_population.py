@@ -108,6 +108,7 @@ def test_what_effects_carry_is_lengthened_by_the_founders(populated: None) -> No
     assert scene._prepared.carried.effects[NAME]["rows"][-4:].tolist() == [3, 0, 3, COUNT - 1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("masks", [True, False])
 def test_resumed_after_any_frame_it_goes_on_with_the_same_bits(populated: None, masks: bool, tmp_path: Path) -> None:
     whole = start(History(tmp_path / "live"), masks)

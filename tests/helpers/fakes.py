@@ -23,6 +23,8 @@ SLOW, SLOW_RAISES, RAISES, DIES = 200, 201, 250, 251
 HELD, LEAVES_OUT, STANDS, GUESSED, REFINES, LATE = 240, 241, 242, 243, 244, 245
 LOOKED_AT = 246
 """A frame with that red takes long enough for a browser on a busy machine to show that it is at work."""
+WAITS = 247
+"""A frame with that red is at work until the file exists that the variable FAKE_GO_ON names."""
 PICKY, PICKED = 249, 77
 """A first frame with that red fails, unless static.iterations are those."""
 ITERATIONS = 100
@@ -61,6 +63,8 @@ def obey(frame):
         time.sleep(SLOW_S)
     if red == LOOKED_AT:
         time.sleep(LOOKED_AT_S)
+    while red == WAITS and not os.path.exists(os.environ["FAKE_GO_ON"]):
+        time.sleep(0.01)
     if red in (RAISES, SLOW_RAISES):
         raise FloatingPointError("the fake was told to raise")
     if red == DIES:

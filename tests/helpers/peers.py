@@ -14,6 +14,7 @@ from starlette.applications import Starlette
 from starlette.requests import ClientDisconnect
 from starlette.responses import JSONResponse, StreamingResponse
 from starlette.routing import Route, WebSocketRoute
+from waiting import HANG_S, wait_for
 
 from server.connections.config import guarded
 from server.connections.guard import ConnectionGuard, ConnectionLimits
@@ -21,7 +22,6 @@ from server.connections.proxies import ClientLimit
 from server.connections.websocket import limit_messages
 from server.settings import ServerSettings
 
-PATIENCE_S = 30
 LARGE_MB = 16
 SHORT = dict(header_seconds=0.8, body_seconds=0.8, keep_alive_seconds=1.2, unread_seconds=0.8, header_kb=8)
 HOST = b"Host: 127.0.0.1\r\n"
@@ -33,16 +33,16 @@ def put(path, length=None, *more):
     return b"PUT %s HTTP/1.1\r\n" % path + HOST + b"".join(line + b"\r\n" for line in (kind, *more)) + b"\r\n"
 
 
-def drip(peer, piece, most=20):
-    """Sends a piece every tenth of a second; seconds until the service had enough."""
-    began = time.monotonic()
-    while time.monotonic() - began < most:
+def drip(peer, piece):
+    """Sends a piece every tenth of a second until the service has had enough."""
+    until = time.monotonic() + HANG_S
+    while True:
+        assert time.monotonic() < until
         try:
             peer.send(piece)
         except OSError:
-            break
+            return
         time.sleep(0.1)
-    return time.monotonic() - began
 
 
 class Peer:
@@ -54,7 +54,7 @@ class Peer:
             self.socket.bind((source, 0))
         if receive_buffer is not None:
             self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, receive_buffer)
-        self.socket.settimeout(PATIENCE_S)
+        self.socket.settimeout(HANG_S)
         self.socket.connect(("127.0.0.1", port))
 
     def __enter__(self):
@@ -87,12 +87,6 @@ class Peer:
             pass
         return found
 
-    def closed_after(self):
-        """Seconds until the service closes the connection."""
-        began = time.monotonic()
-        self.rest()
-        return time.monotonic() - began
-
     def answer(self):
         """One answer: status, headers, body."""
         found = b""
@@ -124,14 +118,6 @@ def refused(answer, status, field):
     assert (document["status"], document["field"]) == (status, field)
     assert document["remedy"]
     return document
-
-
-def until(true):
-    """Waits for a condition."""
-    limit = time.monotonic() + PATIENCE_S
-    while not true():
-        assert time.monotonic() < limit
-        time.sleep(0.02)
 
 
 class Stub:
@@ -212,10 +198,10 @@ def stub(uvicorn_options=None, **changes):
         server = uvicorn.Server(config)
         thread = threading.Thread(target=server.run, args=([listening],))
         thread.start()
-        until(lambda: server.started)
+        wait_for(lambda: server.started)
         try:
             yield seen
         finally:
             seen.go.set()
             server.should_exit = True
-            thread.join(PATIENCE_S)
+            thread.join(HANG_S)

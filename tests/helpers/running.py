@@ -5,12 +5,12 @@ from __future__ import annotations
 import io
 import socket
 import threading
-import time
 
 import fakes
 import numpy as np
 import uvicorn
 from PIL import Image
+from waiting import HANG_S, wait_for
 
 from scas4d_core.cameras import Camera, Rig
 from server.app import create_app
@@ -37,10 +37,7 @@ class Running:
         self.server = uvicorn.Server(config)
         self.thread = threading.Thread(target=self.server.run)
         self.thread.start()
-        until = time.monotonic() + 20
-        while not (self.server.started and self.recovered(ready)):
-            assert time.monotonic() < until
-            time.sleep(0.02)
+        wait_for(lambda: self.server.started and self.recovered(ready))
         self.url = f"http://127.0.0.1:{self.port}"
 
     def recovered(self, asked):
@@ -53,7 +50,7 @@ class Running:
 
     def stop(self):
         self.server.should_exit = True
-        self.thread.join(20)
+        self.thread.join(HANG_S)
 
 
 def fake_settings(folder, **changes):

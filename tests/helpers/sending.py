@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import asyncio
 import contextlib
 import io
 import struct
-import time
 import zlib
 
 import httpx
 from PIL import Image
 from running import HEIGHT, WIDTH, Running, fake_settings, make_rig, picture, pictures
+from waiting import HANG_S, wait_for
 
 from client.sdk import Client
 from client.wire import FRAME_MEDIA_TYPE, RigModel, frame_chunks
@@ -23,7 +22,7 @@ FRAMED = {"Content-Type": FRAME_MEDIA_TYPE}
 def serving(folder):
     running = Running(fake_settings(folder))
     try:
-        with httpx.Client(base_url=running.url, timeout=30) as http, Client(running.url, patience=20) as sdk:
+        with httpx.Client(base_url=running.url, timeout=HANG_S) as http, Client(running.url, patience=HANG_S) as sdk:
             yield http, sdk
     finally:
         running.stop()
@@ -56,37 +55,25 @@ def status(http, id):
 
 
 def finished(http, id, index):
-    until = time.monotonic() + 30
-    while True:
-        report = http.get(f"/v1/scenes/{id}/frames/{index}").json()
-        if report.get("state") in ("committed", "set_aside", "missing", "skipped"):
-            return report
-        assert time.monotonic() < until, report
-        time.sleep(0.05)
+    reports = []
+
+    def over():
+        reports.append(http.get(f"/v1/scenes/{id}/frames/{index}").json())
+        return reports[-1].get("state") in ("committed", "set_aside", "missing", "skipped")
+
+    wait_for(over)
+    return reports[-1]
 
 
 def settled(http, id):
-    until = time.monotonic() + 30
-    while (status := http.get(f"/v1/scenes/{id}").json())["queued"] and status["state"] != "paused":
-        assert time.monotonic() < until
-        time.sleep(0.05)
-    return status
+    seen = []
 
+    def rests():
+        seen.append(status(http, id))
+        return not seen[-1]["queued"] or seen[-1]["state"] == "paused"
 
-def wait_for(condition, seconds=20):
-    until = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < until
-        time.sleep(0.05)
-
-
-async def wait_for_soon(condition):
-    """The same beside an event loop."""
-    for _ in range(500):
-        if condition():
-            return
-        await asyncio.sleep(0.01)
-    raise AssertionError("it did not come")
+    wait_for(rests)
+    return seen[-1]
 
 
 def declares(width, height):
@@ -106,7 +93,7 @@ def animated():
 def serving_with(folder, **changes):
     running = Running(fake_settings(folder, **changes))
     try:
-        with httpx.Client(base_url=running.url, timeout=30) as http, Client(running.url, patience=20) as sdk:
+        with httpx.Client(base_url=running.url, timeout=HANG_S) as http, Client(running.url, patience=HANG_S) as sdk:
             yield running, http, sdk
     finally:
         running.stop()

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import time
-
 import httpx
 import pytest
 from running import Running, fake_settings, make_rig
+from waiting import HANG_S, wait_for
 
 from client.sdk import Client
 
@@ -20,13 +19,13 @@ def service(tmp_path_factory):
 
 @pytest.fixture
 def http(service):
-    with httpx.Client(base_url=service.url, timeout=30) as client:
+    with httpx.Client(base_url=service.url, timeout=HANG_S) as client:
         yield client
 
 
 @pytest.fixture
 def sdk(service):
-    with Client(service.url, patience=20) as client:
+    with Client(service.url, patience=HANG_S) as client:
         yield client
 
 
@@ -43,10 +42,8 @@ def quiet_scene(service):
     """A scene that takes nothing: what is refused must leave it as it is."""
     with Client(service.url) as client:
         status = client.create_scene(make_rig())
-        states, until = service.app.state.settings.data / "scenes" / status.id / "states", time.monotonic() + 20
-        while not states.exists():  # its worker makes the folder
-            assert time.monotonic() < until
-            time.sleep(0.02)
+        states = service.app.state.settings.data / "scenes" / status.id / "states"
+        wait_for(states.exists)  # its worker makes the folder
         yield status.id
         assert client.scene(status.id) == status
         client.delete_scene(status.id)

@@ -15,9 +15,12 @@ import time
 import fakes
 import httpx
 import pytest
+from waiting import HANG_S
 
 from server.serve import address, listen
 from server.storage.disk import FolderLock
+
+pytestmark = pytest.mark.service
 
 ENVIRONMENT = fakes.environment(SCAS4D_WARM_UP="false")
 
@@ -39,7 +42,7 @@ def command(folder, port, host="127.0.0.1"):
 
 def refused(folder, port, host="127.0.0.1"):
     done = subprocess.run(
-        command(folder, port, host), capture_output=True, text=True, timeout=60, env=ENVIRONMENT, check=False
+        command(folder, port, host), capture_output=True, text=True, timeout=HANG_S, env=ENVIRONMENT, check=False
     )
     assert done.returncode == 1
     assert done.stderr.startswith("scas4d: ")
@@ -90,10 +93,10 @@ def test_every_address_of_a_name_has_one_port():
 
 
 def answering(port):
-    until = time.monotonic() + 60
+    until = time.monotonic() + HANG_S
     while True:
         with contextlib.suppress(httpx.TransportError):
-            return httpx.get(f"http://127.0.0.1:{port}/v1/scenes")
+            return httpx.get(f"http://127.0.0.1:{port}/v1/scenes", timeout=HANG_S)
         assert time.monotonic() < until
         time.sleep(0.05)
 
@@ -112,7 +115,7 @@ def test_plain_lines_in_a_terminal_and_json_elsewhere(tmp_path, terminal):
     os.close(writing)
     try:
         assert answering(port).status_code == 200
-        assert httpx.delete(f"http://127.0.0.1:{port}/v1/scenes/none").status_code == 404
+        assert httpx.delete(f"http://127.0.0.1:{port}/v1/scenes/none", timeout=HANG_S).status_code == 404
     finally:
         process.send_signal(signal.SIGINT)
     said = b""
@@ -120,7 +123,7 @@ def test_plain_lines_in_a_terminal_and_json_elsewhere(tmp_path, terminal):
         while piece := os.read(reading, 4096):
             said += piece
     os.close(reading)
-    assert process.wait(30) == 0
+    assert process.wait(HANG_S) == 0
     lines = said.decode().splitlines()
     if terminal:
         assert f"viewer at http://127.0.0.1:{port}, scenes in {tmp_path}" in lines[0]

@@ -10,8 +10,7 @@ import pytest
 from plyfile import PlyData
 from running import Running
 
-from client import rig
-from client.cli import pictures
+from client import pictures, rig
 from client.sdk import Client
 from scas4d_core.captures import open_capture
 from server.settings import ServerSettings

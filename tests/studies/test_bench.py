@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from waiting import HANG_S
 
 ROOT = Path(__file__).parents[2]
 WITHOUT = """
@@ -31,7 +32,7 @@ def bench(*arguments: object, folder: Path, before: Path | None = None) -> subpr
     if not (ROOT / ".venv" / "bin" / "python").exists():  # installed elsewhere: the same without the shell
         environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), environment.get("PYTHONPATH", "")])
         command = [sys.executable, "-m", "studies", *map(str, arguments)]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=60, env=environment)
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=HANG_S, env=environment)
 
 
 def test_it_lists_every_study_from_any_folder(tmp_path: Path) -> None:
@@ -57,6 +58,7 @@ def test_it_says_what_to_do_where_a_package_is_missing(tmp_path: Path, missing: 
 def test_without_a_set_up_it_says_so(tmp_path: Path) -> None:
     (tmp_path / "scripts").mkdir()
     (tmp_path / "scripts" / "bench").write_text((ROOT / "scripts" / "bench").read_text())
-    done = subprocess.run(["sh", tmp_path / "scripts" / "bench", "quality"], capture_output=True, text=True, timeout=60)
+    command = ["sh", tmp_path / "scripts" / "bench", "quality"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=HANG_S)
     assert done.returncode == 1
     assert "scripts/setup dev" in done.stderr

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from client.cli.pictures import Picture, eight_bit
 from client.exports.sources import Source
 from client.exports.video.camera_path import CameraPath, by_keys, orbit, still
 from client.exports.video.moments import moments
 from client.exports.video.overlay import Trails, rows_that_move
 from client.exports.video.part_paint import painted
+from client.pictures import Picture, eight_bit
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures import Capture
 from scas4d_core.captures.images import resize_area

@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from client.cli.progress import Bars, console
 from client.exports.sources import frame_range, opened
 from client.exports.video.shot import VideoOptions, shot
 from client.exports.video.video_file import check_suffix, video_file
 from client.importers.extras import pyav
+from client.progress import Bars, console
 from scas4d_core.captures import Capture
 from scas4d_core.errors import InputError
 

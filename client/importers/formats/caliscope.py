@@ -50,9 +50,8 @@ def read_caliscope(path: Path, document: Mapping[str, Any]) -> Calibration:
                 fisheye=table.get("fisheye") is True,
             )
         )
-    listed = ", ".join(left_out)
-    remarks = [f"{path.name}: left out, ignored or without a pose there: {listed}"] if left_out else []
-    return calibration_of_cameras(path, cameras, remarks)
+    why = f"{path.name}: left out, ignored or without a pose there"
+    return calibration_of_cameras(path, cameras, left_out, why)
 
 
 def _calibrated(table: Mapping[str, Any]) -> bool:

@@ -49,10 +49,10 @@ def read_easymocap(folder: Path, capture: Path) -> Calibration:
         raise CaptureError(f"{folder / INTRINSICS}: has no list `names` of its cameras")
     texts = [name if isinstance(name, str) else f"{name:g}" for name in names if isinstance(name, str | float)]
     posed = [name for name in texts if extrinsics.get(f"T_{name}") is not None]
-    left_out = ", ".join(name for name in texts if name not in posed and name != "none")
-    remarks = [f"{INTRINSICS}: left out, without a pose in {EXTRINSICS}: {left_out}"] if left_out else []
+    left_out = [name for name in texts if name not in posed and name != "none"]
     cameras = [_camera(folder, capture, name, intrinsics, extrinsics) for name in posed]
-    return calibration_of_cameras(folder, cameras, remarks)
+    why = f"{INTRINSICS}: left out, without a pose in {EXTRINSICS}"
+    return calibration_of_cameras(folder, cameras, left_out, why)
 
 
 def _camera(

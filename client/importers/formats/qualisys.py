@@ -59,9 +59,9 @@ def read_qualisys(path: Path) -> Calibration:
     """
     found = [camera for camera in _cameras(path) if camera.own.get("active", "1") not in ("0", "false")]
     video = [camera for camera in found if _films(camera)] or found
-    markers = ", ".join(camera.own.get("serial", "?") for camera in found if camera not in video)
-    remarks = [f"{path.name}: left out, they record markers and no video: {markers}"] if markers else []
-    return calibration_of_cameras(path, [_lens(path, camera) for camera in video], remarks)
+    markers = [camera.own.get("serial", "?") for camera in found if camera not in video]
+    why = f"{path.name}: left out, they record markers and no video"
+    return calibration_of_cameras(path, [_lens(path, camera) for camera in video], markers, why)
 
 
 def _films(camera: _Camera) -> bool:

@@ -12,12 +12,13 @@ import pytest
 from PIL import Image
 from running import HEIGHT, WIDTH, Running, fake_settings, make_rig, pictures
 from typer.testing import CliRunner
+from waiting import HANG_S
 
 from client.cli.changes import parse_changes
 from client.cli.commands import frame_line, out_of_step
 from client.cli.main import app
-from client.cli.pictures import coloured, comparison, psnr
 from client.errors import ServiceError
+from client.pictures import coloured, comparison, psnr
 from client.rig import push
 from client.sdk import Client
 from client.wire import FrameReportModel, part_colour
@@ -32,7 +33,7 @@ def scas4d(*arguments, cwd=None, **environment):
         [sys.executable, "-m", "client.cli.main", *arguments],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=HANG_S,
         cwd=cwd,
         env={**os.environ, "PYTHONPATH": path, "COLUMNS": "200", "NO_COLOR": "1", "TERM": "dumb", **environment},
     )
@@ -80,7 +81,7 @@ def test_watch_prints_frames_until_the_scene_is_gone(service, capture_folder):
         push(open_capture(capture_folder), client, scene=scene.id, frames=1)
         client.declare_missing(scene.id, 1, "gone for ever")
         client.delete_scene(scene.id)
-        said, _ = watching.communicate(timeout=30)
+        said, _ = watching.communicate(timeout=HANG_S)
     assert watching.returncode == 0
     assert re.search(r"frame 0: committed .* s$", said, re.MULTILINE) or "frame 1: missing" in said
     missing = scas4d("watch", "nowhere", "--url", service.url)
@@ -231,7 +232,7 @@ def test_a_scene_begins_again(service, tmp_path):
 
     np.savez(tmp_path / "cloud.npz", positions=np.zeros((4, 3)), colours=np.zeros((4, 3)))
     np.savez(tmp_path / "bare.npz", positions=np.zeros((4, 3)))
-    with Client(service.url, patience=20) as client:
+    with Client(service.url, patience=HANG_S) as client:
         scene = client.create_scene(make_rig(2)).id
         try:
             for index in range(2):
@@ -294,10 +295,10 @@ def test_labels_where_there_is_no_cluster_are_refused(service, capture_folder):
 
 
 def test_changes_are_parsed():
-    changes = ["update.iterations=200", "device=cuda", "update.clusters=[64]", "scene.metres_per_unit=auto"]
+    changes = ["update.iterations=200", "device=cpu", "update.clusters=[64]", "scene.metres_per_unit=auto"]
     assert parse_changes(changes) == {
         "update": {"iterations": 200, "clusters": [64]},
-        "device": "cuda",
+        "device": "cpu",
         "scene": {"metres_per_unit": "auto"},
     }
     for bad in (["update"], ["a=1", "a.b=2"]):

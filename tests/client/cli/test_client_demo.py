@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from running import HEIGHT, WIDTH
+from waiting import HANG_S
 
 from client.cli.demo import _unready, running_service
 from client.errors import ServiceError
@@ -19,6 +20,8 @@ from client.sdk import Client
 from client.wire.service import ProblemDetails
 from scas4d_core.captures import open_capture
 from server.storage.disk import FolderLock
+
+pytestmark = pytest.mark.service
 
 SLOW = """
 import time
@@ -33,7 +36,7 @@ def demo(capture, out, *more, before=(), **environment):
         [sys.executable, "-m", "client.cli.main", "demo", "--capture", str(capture), "--out", str(out), *more],
         capture_output=True,
         text=True,
-        timeout=100,
+        timeout=HANG_S,
         env=fakes.environment(*before, TERM="dumb", **environment),
     )
 

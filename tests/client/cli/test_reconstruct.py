@@ -13,13 +13,15 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from client.cli.evaluate import evaluate
-from client.cli.pictures import psnr
 from client.cli.reconstruct import reconstruct
 from client.importers.open_source import CaptureOptions, open_source
+from client.pictures import psnr
 from scas4d_core.compact import CompactReader
 from scas4d_core.query.ply import read_ply
 from scas4d_core.storage.frame_aside import FrameAside, ScratchFile
 from scas4d_core.storage.history import History
+
+pytestmark = pytest.mark.slow
 
 CHANGES = {"static": {"iterations": 2}, "update": {"iterations": 2}}
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from client.cli.evaluate_states import evaluate_states
 from client.cli.main import app
 from client.exports.export import export
-from client.exports.score import evaluate_states
 from client.exports.sources import of_path
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.compact import CompactReader

@@ -13,6 +13,7 @@ from PIL import Image
 from running import make_rig as a_rig
 from running import pictures
 from typer.testing import CliRunner
+from waiting import HANG_S
 
 from client.cli.main import app
 from client.exports.video.shot import VideoOptions
@@ -184,7 +185,7 @@ def test_a_background_that_is_asked_for(source, tmp_path):
 
 
 def test_a_scene_of_the_service(service, tmp_path):
-    with Client(service.url, patience=20) as client:
+    with Client(service.url, patience=HANG_S) as client:
         scene = client.create_scene(a_rig()).id
         try:
             for index in range(2):

@@ -188,6 +188,7 @@ print(len(compiled))
 """
 
 
+@pytest.mark.slow
 def test_a_cache_that_two_processes_fill_serves_a_third(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     root = Path(__file__).parents[3]

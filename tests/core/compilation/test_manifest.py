@@ -53,6 +53,7 @@ print(json.dumps([first, update, compiled[len(first) + len(update):]]))
 QUICK = {"scene": {"image_scale": 0.25}, "static": {"iterations": 60}, "update": {"iterations": 20}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "given",
     [

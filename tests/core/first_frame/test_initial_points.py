@@ -49,6 +49,7 @@ def test_points_lie_on_the_box_and_cover_it(scene, cloud):
     assert np.percentile(gap, 95) < 3 * PIXEL
 
 
+@pytest.mark.slow
 def test_cameras_of_unlike_sizes_are_compared_by_stereo(scene, box, cloud):
     """Every second camera is cut by some pixels at the right, every fourth at the bottom: the cloud stays as dense."""
     rig, images, _ = box
@@ -82,6 +83,7 @@ def test_masks_label_the_points(box):
     assert (labelled.foreground > 0.5).mean() > 0.95
 
 
+@pytest.mark.slow
 def test_same_seed_same_points(box):
     rig, images, _ = box
     one, two = (initial_points(rig, images, {}, stereo_iterations=1, seed=4) for _ in range(2))

@@ -62,6 +62,7 @@ def cloud(views):
     return initial_points(rig, {view.camera.name: view.image for view in views}, {}, stereo=False)
 
 
+@pytest.mark.slow
 def test_the_table_is_found_that_cameras_see_from_four_sides(views):
     plane = agreed_plane(views)
     assert abs(float(plane.normal @ NORMAL)) > np.cos(0.03)

@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import scas4d_core
 from scas4d_core.kernels import cache
 
@@ -33,6 +35,7 @@ def inner(x):
 """
 
 
+@pytest.mark.slow
 def test_an_edit_in_an_imported_file_is_noticed(tmp_path):
     """What Numba alone gets wrong: `outer` holds the compiled `inner` of another file."""
     source = Path(scas4d_core.__file__).parent

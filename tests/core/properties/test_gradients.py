@@ -54,6 +54,7 @@ def with_parameters(motion: Motion, values: Sequence[Tensor]) -> Motion:
     return motion._replace(layers=layers, deltas=Deltas(*values[4 * len(layers) :]))
 
 
+@pytest.mark.slow
 @law(12)
 @given(seeds, st.sampled_from([0.1, 0.3, 1.0]))
 def test_of_the_cascade(seed: int, scale: float) -> None:
@@ -159,6 +160,7 @@ def test_of_the_neighbour_terms(seed: int) -> None:
     assert agrees(lambda q: losses.rotation_loss(q, *pairs), [g.turns])
 
 
+@pytest.mark.slow
 @law(12)
 @given(seeds)
 def test_of_the_picture_terms(seed: int) -> None:

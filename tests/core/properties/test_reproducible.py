@@ -10,7 +10,10 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
+import pytest
 from numpy._core import _multiarray_umath as numpy_core
+
+pytestmark = pytest.mark.slow
 
 PROGRAM = Path(__file__).parents[2] / "helpers" / "committed_bits.py"
 LIBRARIES = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")

@@ -23,6 +23,8 @@ from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings, UpdateSettings
 from studies.constants import varied
 
+pytestmark = pytest.mark.slow
+
 BOX = make_box()
 FRAMES = [take_frame(index, index / 30, moved(BOX) if index else BOX, RIG) for index in range(2)]
 POINTS = InitialPoints(BOX.means.astype(np.float64), BOX.colours, BOX.foreground)

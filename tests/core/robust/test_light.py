@@ -23,6 +23,8 @@ from scas4d_core.storage.history import History
 from studies.hard_frames import footage as frames_footage
 from studies.hard_frames.footage import SyntheticFootage
 
+pytestmark = pytest.mark.slow
+
 PATIENCE = 4
 FROM = 4
 """The first frame in the other light."""

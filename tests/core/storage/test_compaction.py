@@ -112,6 +112,7 @@ def test_older_states_are_read_from_chunks_by_all(tmp_path: Path, true: History)
     assert history.lives([history.ids[4]])[0].retired == (RETIRED_AT,)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # a process that stops closes nothing
 def test_a_stop_anywhere_loses_nothing_and_changes_no_byte(tmp_path: Path, true: History) -> None:
     """A stop after each write, sync and removal; what goes on with it ends with the same files."""

@@ -36,6 +36,7 @@ def small_checkpoint():
 FILES = {"state": small_state, "checkpoint": small_checkpoint, "fixed": lambda: {"ids": np.arange(3)}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", FILES)
 def test_every_flipped_byte_is_noticed_or_harmless(tmp_path, kind):
     file, written = tmp_path / "file.npz", FILES[kind]()

@@ -39,6 +39,7 @@ def test_states_are_the_same_bits_and_the_history_goes_on(tmp_path: Path) -> Non
     assert same(history.newest, state(6))
 
 
+@pytest.mark.slow
 def test_a_frame_costs_no_memory_any_more(tmp_path: Path) -> None:
     count, frames = 20_000, 12
     one = state(0, count)

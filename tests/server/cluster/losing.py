@@ -8,17 +8,23 @@ from server.cluster import membership
 
 
 class LosableCluster:
-    """Attributes: lost: the node of this machine is. refuses: so many tries to join. inits, events: what was done."""
+    """Attributes: lost: the node of this machine is. refuses: so many tries to join. looks_done: at whether it is lost.
+    inits, events: what was done.
+    """
 
     def __init__(self, monkeypatch) -> None:
         self.events: list[str] = []
         self.lost = self.joined = False
-        self.refuses = self.inits = 0
+        self.refuses = self.inits = self.looks_done = 0
         monkeypatch.setattr(membership, "EVERY_S", 0.01)
-        monkeypatch.setattr(membership, "own_node_is_lost", lambda: self.lost)
+        monkeypatch.setattr(membership, "own_node_is_lost", self._is_lost)
         monkeypatch.setattr(ray, "is_initialized", lambda: self.joined)
         monkeypatch.setattr(ray, "init", self._init)
         monkeypatch.setattr(ray, "shutdown", self._shutdown)
+
+    def _is_lost(self) -> bool:
+        self.looks_done += 1
+        return self.lost
 
     def _init(self, **options) -> None:
         self.inits += 1

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
 import gc
 import threading
 from collections.abc import Awaitable, Callable
+from typing import Any
 
 import pytest
+from waiting import HANG_S, wait_for_soon
 
 from server.cluster.calls import THREADS, Calls
+from tests.server.cluster.others import others_have_called
 
 
 def run(test: Callable[[Calls], Awaitable[None]]) -> None:
@@ -27,7 +31,7 @@ def test_what_is_asked_while_calls_are_held_begins_later_and_takes_no_thread() -
     async def test(calls: Calls) -> None:
         calls.hold()
         waiting = [calls.asked(lambda: 1) for _ in range(10 * THREADS)]
-        await asyncio.sleep(0.05)
+        await others_have_called()
         assert await calls.over(0)
         assert not any(call.done() for call in waiting)
         calls.go_on()
@@ -39,15 +43,15 @@ def test_what_is_asked_while_calls_are_held_begins_later_and_takes_no_thread() -
 def test_what_waits_for_a_thread_when_calls_are_held_begins_later() -> None:
     async def test(calls: Calls) -> None:
         busy, called = threading.Event(), threading.Event()
-        on = [calls.asked(busy.wait, 10) for _ in range(THREADS)]
+        on = [calls.asked(busy.wait, HANG_S) for _ in range(THREADS)]
         queued = calls.asked(called.set)
-        await asyncio.sleep(0.05)
+        await wait_for_soon(lambda: len(calls.begun) == THREADS + 1)
         calls.hold()
         assert not await calls.over(0)
         busy.set()
         await asyncio.gather(*on)
-        assert await calls.over(10)
-        await asyncio.sleep(0.05)
+        assert await calls.over(HANG_S)
+        await others_have_called()
         assert not called.is_set()
         calls.go_on()
         await queued
@@ -56,18 +60,28 @@ def test_what_waits_for_a_thread_when_calls_are_held_begins_later() -> None:
     run(test)
 
 
-def test_a_fault_while_they_are_waited_for_is_told_to_who_has_asked_alone(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_fault_while_they_are_waited_for_is_told_to_who_has_asked_alone(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waits = threading.Event()
+
+    def wait(*given: Any) -> Any:
+        waits.set()
+        return concurrent.futures.wait(*given)
+
+    monkeypatch.setattr("server.cluster.calls.wait", wait)
+
     async def test(calls: Calls) -> None:
         fails = threading.Event()
 
         def fail() -> None:
-            fails.wait(10)
+            fails.wait(HANG_S)
             raise ConnectionError("no head")
 
         call = calls.asked(fail)
-        await asyncio.sleep(0.05)
-        waiting = asyncio.ensure_future(calls.over(10))
-        await asyncio.sleep(0.05)
+        await wait_for_soon(lambda: calls.begun)
+        waiting = asyncio.ensure_future(calls.over(HANG_S))
+        await wait_for_soon(waits.is_set)
         fails.set()
         assert await waiting
         with pytest.raises(ConnectionError):
@@ -89,9 +103,9 @@ def test_one_that_is_cancelled_before_it_begins_is_never_called() -> None:
         calls.go_on()
         await calls.asked(called.append, 2)
         busy = threading.Event()
-        on = [calls.asked(busy.wait, 10) for _ in range(THREADS)]
+        on = [calls.asked(busy.wait, HANG_S) for _ in range(THREADS)]
         queued = calls.asked(called.append, 3)
-        await asyncio.sleep(0.05)
+        await wait_for_soon(lambda: len(calls.begun) == THREADS + 1)
         queued.cancel()
         await asyncio.sleep(0)
         busy.set()
@@ -105,15 +119,15 @@ def test_one_that_is_cancelled_before_it_begins_is_never_called() -> None:
 def test_those_that_have_begun_are_waited_for_also_where_nobody_else_does(*, cancelled: bool) -> None:
     async def test(calls: Calls) -> None:
         ends = threading.Event()
-        call = calls.asked(ends.wait, 10)
-        await asyncio.sleep(0.05)
+        call = calls.asked(ends.wait, HANG_S)
+        await wait_for_soon(lambda: calls.begun and next(iter(calls.begun)).running())
         if cancelled:
             call.cancel()
             await asyncio.sleep(0)
         calls.hold()
         assert not await calls.over(0.05)
         ends.set()
-        assert await calls.over(10)
+        assert await calls.over(HANG_S)
         assert await calls.over(0)
 
     run(test)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from waiting import HANG_S
 
 from server.cluster import host, marks
 from server.cluster.host import Host, Manner
@@ -37,7 +38,7 @@ def test_a_process_runs_as_on_the_machine_of_its_service(tmp_path: Path, monkeyp
         os.setpriority(os.PRIO_PROCESS, 0, nice + 3)  # of this thread alone
         actor = Host(None, tmp_path, "mine", Manner("2", nice))
         await actor.start(manner, "scene")
-        found = await asyncio.wait_for(actor.take(), 30)
+        found = await asyncio.wait_for(actor.take(), HANG_S)
         await actor.stop(5)
         return found
 
@@ -59,7 +60,7 @@ def test_messages_reach_the_process_in_order_from_the_first(tmp_path: Path, monk
         await actor.start(echo, "scene")
         await actor.post(2, "c")
         while len(found) < 3:
-            found += await asyncio.wait_for(actor.take(), 30)
+            found += await asyncio.wait_for(actor.take(), HANG_S)
         await actor.stop(5)
         return found
 

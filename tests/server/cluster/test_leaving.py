@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sending import wait_for_soon
+from waiting import HANG_S, wait_for_soon
 
 ray_placement = pytest.importorskip(
     "server.cluster.ray_placement", reason="Ray is not installed: pip install 'scas4d[ray]'"
@@ -23,6 +23,7 @@ from server.cluster.needs import Needs  # noqa: E402
 from server.processes.placement import Ended  # noqa: E402
 from server.settings import ServerSettings  # noqa: E402
 from tests.server.cluster.losing import LosableCluster  # noqa: E402
+from tests.server.cluster.others import others_have_called  # noqa: E402
 
 
 class Answer:
@@ -65,7 +66,7 @@ class Cluster(LosableCluster):
     def _shutdown(self) -> None:
         self.looks()
         self.leaves.set()
-        self.may_leave.wait(5)
+        self.may_leave.wait(HANG_S)
         super()._shutdown()
 
     def _host(self, name: str, needs: Needs) -> Any:
@@ -116,15 +117,15 @@ def test_answers_are_kept_until_the_service_has_left_and_calls_are_made_afterwar
         process = await cluster.started()
         process.send("message")
         stopping = asyncio.ensure_future((await cluster.started()).stop(100))
-        await asyncio.sleep(0.05)
+        await wait_for_soon(lambda: len(cluster.pending) - cluster.dropped() == 4)
         del process
         there = len(cluster.pending) - cluster.dropped()
         cluster.may_leave.clear()
         cluster.lost = True
-        assert await asyncio.to_thread(cluster.leaves.wait, 10)
+        assert await asyncio.to_thread(cluster.leaves.wait, HANG_S)
         asked = cluster.placement.asked(called.append, 1)
-        await asyncio.wait_for(stopping, 10)
-        await asyncio.sleep(0.05)
+        await asyncio.wait_for(stopping, HANG_S)
+        await others_have_called()
         gc.collect()
         assert len(cluster.pending) - cluster.dropped() == there == 4
         assert called == []
@@ -164,9 +165,9 @@ def test_a_service_that_ends_while_it_joins_again_drops_nothing(cluster: Cluster
         del process
         cluster.may_leave.clear()
         cluster.lost = True
-        assert await asyncio.to_thread(cluster.leaves.wait, 10)
+        assert await asyncio.to_thread(cluster.leaves.wait, HANG_S)
         closing = asyncio.ensure_future(cluster.placement.close())
-        await asyncio.sleep(0.05)
+        await others_have_called()
         gc.collect()
         assert cluster.pending
         assert cluster.dropped() == 0
@@ -191,10 +192,13 @@ def test_what_ray_has_begun_is_waited_for_and_a_fault_of_one_scene_keeps_nobody(
     async def test() -> None:
         await cluster.started(fails)
         await cluster.started()
-        call = cluster.placement.asked(over.wait, 10)
-        await asyncio.sleep(0.05)
+        begun = threading.Event()
+        call = cluster.placement.asked(lambda: begun.set() or over.wait(HANG_S))
+        await wait_for_soon(begun.is_set)
         cluster.lost = True
-        assert not await asyncio.to_thread(cluster.leaves.wait, 1)
+        await wait_for_soon(lambda: cluster.ends)  # that it is lost is known
+        await others_have_called()
+        assert not cluster.leaves.is_set()
         assert when == []
         over.set()
         await call

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import threading
+from typing import Any
 
 import pytest
-from sending import wait_for_soon
+from waiting import HANG_S, wait_for_soon
 
 membership = pytest.importorskip("server.cluster.membership", reason="Ray is not installed: pip install 'scas4d[ray]'")
 
@@ -35,7 +36,7 @@ def test_what_ran_is_given_up_first_and_the_service_is_announced_last(cluster: L
 
     async def test() -> None:
         keeping = asyncio.ensure_future(member.keep(give_up, announce))
-        await asyncio.sleep(0.1)
+        await wait_for_soon(lambda: cluster.looks_done > 3)
         assert cluster.events == ["joined"]  # nothing is lost
         cluster.refuses = 2
         cluster.lost = True
@@ -52,12 +53,18 @@ def test_a_silent_head_is_told_of_once_and_is_no_lost_node(
 ) -> None:
     answers = threading.Event()
     asked: list[bool] = []
+    waits: list[float | None] = []
+    real = asyncio.wait
+
+    async def wait(answers: Any, *, timeout: float | None = None) -> Any:
+        waits.append(timeout)
+        return await real(answers, timeout=timeout)
 
     def ask() -> bool:
         asked.append(True)
         if len(asked) == 1:
             raise RuntimeError("no head")
-        answers.wait(10)
+        answers.wait(HANG_S)
         return False
 
     async def nothing() -> None:
@@ -65,9 +72,8 @@ def test_a_silent_head_is_told_of_once_and_is_no_lost_node(
 
     async def test() -> None:
         keeping = asyncio.ensure_future(member.keep(nothing, nothing))
-        await wait_for_soon(lambda: len(asked) == 2)
-        await asyncio.sleep(0.1)
-        assert len(asked) == 2  # one question at a time
+        await wait_for_soon(lambda: len(asked) == 2 and waits[2:] == [0.02, None])  # in vain, and it waits on
+        assert member._thread._work_queue.empty()  # one question at a time
         answers.set()
         await wait_for_soon(lambda: len(asked) > 3)
         keeping.cancel()
@@ -76,6 +82,7 @@ def test_a_silent_head_is_told_of_once_and_is_no_lost_node(
     monkeypatch.setattr(membership, "SILENT_S", 0.02)
     member = membership.Membership(None)
     member.join()
+    monkeypatch.setattr(membership.asyncio, "wait", wait)
     with caplog.at_level("INFO", "scas4d.server"):
         asyncio.run(test())
     told = [record.message for record in caplog.records]
@@ -108,7 +115,7 @@ def test_a_service_that_ray_does_not_let_join_again_ends(
     member.join()
     monkeypatch.setattr(membership, "JOIN_S", 0.05)
     monkeypatch.setattr(membership.os, "_exit", end)
-    monkeypatch.setattr(membership.ray, "shutdown", lambda: stands_still.wait(10))
+    monkeypatch.setattr(membership.ray, "shutdown", lambda: stands_still.wait(HANG_S))
     asyncio.run(test())
     assert set(ended) == {1}
 
@@ -141,7 +148,7 @@ def test_a_service_that_ray_does_not_let_leave_ends(cluster: LosableCluster, mon
     stands_still = threading.Event()
     monkeypatch.setattr(membership, "LEAVE_S", 0.05)
     monkeypatch.setattr(membership.os, "_exit", ended.append)
-    monkeypatch.setattr(membership.ray, "shutdown", lambda: stands_still.wait(10))
+    monkeypatch.setattr(membership.ray, "shutdown", lambda: stands_still.wait(HANG_S))
     membership.Membership(None).leave()
     stands_still.set()
     assert ended == [1]

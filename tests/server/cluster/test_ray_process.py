@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sending import wait_for_soon
+from waiting import HANG_S, wait_for_soon
 
 ray_placement = pytest.importorskip(
     "server.cluster.ray_placement", reason="Ray is not installed: pip install 'scas4d[ray]'"
@@ -24,6 +24,7 @@ from server.cluster.needs import Needs  # noqa: E402
 from server.cluster.nodes import is_lost, own_node_is_lost  # noqa: E402
 from server.processes.placement import Ended  # noqa: E402
 from server.settings import ServerSettings  # noqa: E402
+from tests.server.cluster.others import others_have_called  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("default")
 NEEDS = Needs("worker", "scene", 1, 0, 1)
@@ -69,14 +70,15 @@ class FakePlacement:
     def __init__(self) -> None:
         self.places: dict[str, Any] = {}
         self.actor = FakeActor()
-        self.may_make = threading.Event()
+        self.may_make, self.makes = threading.Event(), threading.Event()
         self.may_make.set()
 
     def asked(self, function: Callable[..., Any], *arguments: Any) -> asyncio.Future[Any]:
         return asyncio.get_running_loop().run_in_executor(None, function, *arguments)
 
     def host(self, name: str, needs: Needs) -> FakeActor:
-        self.may_make.wait(10)
+        self.makes.set()
+        self.may_make.wait(HANG_S)
         return self.actor
 
 
@@ -189,11 +191,11 @@ def test_one_that_waits_to_begin_when_it_is_lost_is_not_made(killed: list[Any]) 
         placement.host = lambda name, needs: made.append(name)  # type: ignore[method-assign,assignment,return-value]
         calls.hold()
         running = Running(placement)
-        await asyncio.sleep(0.05)
+        await wait_for_soon(lambda: calls._may_begin._waiters)
         running.process.lose()
         await running.process.let_go()
         calls.go_on()
-        await asyncio.sleep(0.05)
+        await others_have_called()
         assert made == []
         assert running.ends[0].lost
 
@@ -215,17 +217,20 @@ def test_one_that_is_let_go_asks_nothing_more(killed: list[Any]) -> None:
 
 def test_one_that_is_stopped_when_the_cluster_is_lost_is_not_waited_for(killed: list[Any]) -> None:
     async def test(placement: FakePlacement) -> None:
+        stops = asyncio.Event()
+
         async def stands_still(seconds: float) -> None:
+            stops.set()
             await asyncio.Event().wait()
 
         placement.actor.stop = Remote(stands_still)
         running = Running(placement)
         await wait_for_soon(lambda: running.process.pid)
         stopping = asyncio.ensure_future(running.process.stop(100))
-        await asyncio.sleep(0.05)
+        await stops.wait()
         running.process.lose()
         await running.process.let_go()
-        await asyncio.wait_for(stopping, 10)
+        await asyncio.wait_for(stopping, HANG_S)
         assert running.ends == []
         assert killed == []
 
@@ -325,7 +330,8 @@ def test_messages_before_the_actor_is_made_are_posted_in_order_and_nothing_waits
         running = Running(placement)
         for message in ("a", "b"):
             running.process.send(message)
-        await asyncio.sleep(0.05)
+        await wait_for_soon(placement.makes.is_set)
+        await others_have_called()
         assert placement.actor.posted == []
         placement.may_make.set()
         await wait_for_soon(lambda: running.process.pid)
@@ -343,7 +349,8 @@ def test_one_that_is_stopped_before_it_is_made_is_killed_once_it_is(
         placement.may_make.clear()
         running = Running(placement)
         stopping = asyncio.ensure_future(running.process.stop(1))
-        await asyncio.sleep(0.05)
+        await wait_for_soon(placement.makes.is_set)
+        await others_have_called()
         assert killed == []
         placement.may_make.set()
         await stopping

@@ -7,7 +7,8 @@ import socket
 import time
 
 import pytest
-from peers import GET, HOST, LARGE_MB, SHORT, Peer, drip, put, refused, stub, until
+from peers import GET, HOST, LARGE_MB, SHORT, Peer, drip, put, refused, stub
+from waiting import wait_for
 
 from server.connections import guard
 from server.connections.connection import Connection
@@ -29,7 +30,7 @@ def test_a_hanging_upload_is_answered_408(app):
 def test_a_body_that_drips_is_ended(app, length):
     with Peer(app.port) as peer:
         peer.send(put(b"/echo", length))
-        assert drip(peer, b"a" if length else chunk(b"a")) < 15
+        drip(peer, b"a" if length else chunk(b"a"))
 
 
 def test_a_slow_body_that_goes_on_is_taken(app):
@@ -128,7 +129,7 @@ def test_an_answer_before_the_end_of_the_body_is_read(app, more):
     with Peer(app.port) as peer:
         peer.send(put(b"/early", len(body), *more), body[:1000])
         assert peer.answer()[0] == 401
-        assert peer.closed_after() < 15
+        peer.rest()
 
 
 def test_a_slow_body_behind_its_answer_is_dropped_to_its_end(app):
@@ -145,15 +146,15 @@ def test_a_slow_body_behind_its_answer_is_dropped_to_its_end(app):
 
 def test_a_body_behind_its_answer_does_not_go_on_for_ever(app, monkeypatch):
     monkeypatch.setattr(guard, "LINGER_LONGEST_S", 2.0)
+    pieces = 500
     with Peer(app.port) as peer:
-        peer.send(put(b"/early", 10_000_000))
-        peer.socket.settimeout(None)
-        began = time.monotonic()
-        while time.monotonic() - began < 15:
+        peer.send(put(b"/early", pieces * 20_000))
+        for _ in range(pieces):
             if not peer.flood(bytes(20_000), 20_000):
                 break
             time.sleep(0.1)
-        assert time.monotonic() - began < 10
+        else:
+            pytest.fail("it was taken to its end")
 
 
 def test_a_body_without_end_behind_its_answer_is_ended(app):
@@ -165,8 +166,8 @@ def test_a_body_without_end_behind_its_answer_is_ended(app):
 def test_an_answer_that_nobody_reads_is_given_up(app):
     with Peer(app.port, receive_buffer=4096) as peer:
         peer.send(b"GET /large HTTP/1.1\r\n" + HOST + b"\r\n")
-        until(lambda: app.guard.counts()["answer"] == 1)
-        until(lambda: app.guard.counts()["answer"] == 0)
+        wait_for(lambda: app.guard.counts()["answer"] == 1)
+        wait_for(lambda: app.guard.counts()["answer"] == 0)
         peer.socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
         assert len(peer.rest()) < LARGE_MB << 20
 
@@ -183,4 +184,4 @@ def test_an_answer_that_is_read_slowly_is_sent_to_its_end():
 
 
 def test_nobody_is_left(app):
-    until(lambda: sum(app.guard.counts().values()) == 0)
+    wait_for(lambda: sum(app.guard.counts().values()) == 0)

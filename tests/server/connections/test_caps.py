@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import json
 import resource
-import time
 from contextlib import ExitStack, suppress
 
 import httpx
 import pytest
-from peers import GET, HOST, Peer, put, refused, stub, until
+from peers import GET, HOST, Peer, put, refused, stub
+from waiting import HANG_S, wait_for
 
-from server.connections import process
+from server.connections import guard, process
 from server.connections.guard import peer_key
 
 LONG = dict(header_seconds=60, body_seconds=60, keep_alive_seconds=60)
 
 
 def get(app, path="echo", **headers):
-    return httpx.get(f"http://127.0.0.1:{app.port}/{path}", headers=headers, timeout=30)
+    return httpx.get(f"http://127.0.0.1:{app.port}/{path}", headers=headers, timeout=HANG_S)
 
 
 def held(stack, app, count, *pieces, sources=(None,)):
@@ -36,24 +36,25 @@ def test_half_sent_headers_and_idle_connections_give_way(caps, pieces):
         peers = held(stack, app, 30, *pieces)
         for _ in range(20):
             assert get(app).status_code == 200
-        until(lambda: sum(app.guard.counts().values()) <= 8)
+        wait_for(lambda: sum(app.guard.counts().values()) <= 8)
         peers[0].rest()  # the oldest was closed
 
 
-def test_uploads_give_way_once_they_are_quiet():
+def test_uploads_give_way_once_they_are_quiet(monkeypatch):
+    monkeypatch.setattr(guard, "QUIET_S", 3600)
     with stub(**LONG, max_connections_per_peer=8) as app, ExitStack() as stack:
         held(stack, app, 8, put(b"/echo", 100_000), bytes(20_000))
-        until(lambda: app.guard.counts()["body"] == 8)
+        wait_for(lambda: app.guard.counts()["body"] == 8)
         assert get(app).status_code == 429  # they may be at work
-        time.sleep(4)
-        assert get(app).status_code == 200
+        monkeypatch.setattr(guard, "QUIET_S", 0)
+        wait_for(lambda: get(app).status_code == 200)
 
 
 @pytest.mark.parametrize("caps", [{"max_connections_per_peer": 16}, {"max_connections": 16}])
 def test_uploads_that_hang_from_the_start_take_half_of_the_places(caps):
     with stub(**LONG, **caps) as app, ExitStack() as stack:
         sending = held(stack, app, 1, put(b"/echo", 100_000), bytes(20_000))[0]
-        until(lambda: app.guard.counts()["body"] == 1)
+        wait_for(lambda: app.guard.counts()["body"] == 1)
         for _ in range(4):
             held(stack, app, 20, put(b"/echo", 1000), b"abc")
             sending.send(bytes(1000))  # on a busy machine the rounds take so long that it would be quiet
@@ -73,7 +74,7 @@ def test_who_has_many_addresses_neither_keeps_a_rig_out_nor_ends_its_connections
         for peer in idle:
             assert peer.answer()[0] == 200
         uploads = held(stack, app, 3, put(b"/echo", 100_000), bytes(20_000))
-        until(lambda: app.guard.counts()["body"] == 3)
+        wait_for(lambda: app.guard.counts()["body"] == 3)
         for _ in range(3):
             held(stack, app, 1, *pieces, sources=OTHERS)
             for peer in uploads:
@@ -90,13 +91,15 @@ def test_who_has_many_addresses_neither_keeps_a_rig_out_nor_ends_its_connections
             assert peer.answer()[0] == 200
 
 
-def test_uploads_that_are_quiet_give_way_whoever_has_most_connections():
+def test_uploads_that_are_quiet_give_way_whoever_has_most_connections(monkeypatch):
+    monkeypatch.setattr(guard, "QUIET_S", 3600)
     with stub(**LONG, max_connections=8) as app, ExitStack() as stack:
         rig = held(stack, app, 5, b"GET /wait HTTP/1.1\r\n" + HOST + b"\r\n")
         held(stack, app, 1, put(b"/echo", 100_000), bytes(20_000), sources=OTHERS[:3])
-        until(lambda: app.guard.counts()["body"] == 3)
-        time.sleep(4)
-        assert get(app).status_code == 200
+        wait_for(lambda: app.guard.counts()["body"] == 3)
+        assert get(app).status_code == 503
+        monkeypatch.setattr(guard, "QUIET_S", 0)
+        wait_for(lambda: get(app).status_code == 200)
         app.go.set()
         for peer in rig:
             assert peer.answer()[0] == 200
@@ -110,11 +113,12 @@ def test_a_network_of_ipv6_is_one_peer():
 
 
 @pytest.mark.parametrize("caps", [{"max_connections_per_peer": 16}, {"max_connections": 16}])
-def test_a_slow_upload_that_goes_on_stays_where_others_hang(caps):
+def test_a_slow_upload_that_goes_on_stays_where_others_hang(caps, monkeypatch):
+    monkeypatch.setattr(guard, "QUIET_S", HANG_S)
     with stub(**LONG, **caps) as app, ExitStack() as stack:
         slow = held(stack, app, 1, put(b"/echo", 40_000), bytes(20_000))[0]
-        until(lambda: app.guard.counts()["body"] == 1)
-        time.sleep(1.5)  # a window ends
+        wait_for(lambda: app.guard.counts()["body"] == 1)
+        wait_for(lambda: not any(record.received for record in app.guard._records.values()))  # a window has ended
         for _ in range(3):
             slow.send(bytes(1000))
             held(stack, app, 20, put(b"/echo", 1000), b"abc")
@@ -127,7 +131,7 @@ def test_a_slow_upload_that_goes_on_stays_where_others_hang(caps):
 def test_connections_at_work_stay_and_a_further_one_is_told_so(caps, status):
     with stub(**LONG, **caps) as app, ExitStack() as stack:
         peers = held(stack, app, 8, b"GET /wait HTTP/1.1\r\n" + HOST + b"\r\n")
-        until(lambda: app.guard.counts()["answer"] == 8)
+        wait_for(lambda: app.guard.counts()["answer"] == 8)
         for _ in range(100):
             with Peer(app.port) as peer:
                 peer.send(GET + b"\r\n")
@@ -157,7 +161,7 @@ def test_a_trusted_proxy_is_believed_and_its_clients_are_counted():
     with stub(**LONG, max_connections_per_peer=4, trusted_proxies="127.0.0.0/8") as app, ExitStack() as stack:
         waiting = b"GET /wait HTTP/1.1\r\n" + HOST + b"X-Forwarded-For: 203.0.113.7\r\n\r\n"
         peers = held(stack, app, 4, waiting)
-        until(lambda: app.guard.counts()["answer"] == 4)
+        wait_for(lambda: app.guard.counts()["answer"] == 4)
         answer = get(app, **{"X-Forwarded-For": "10.9.9.9, 203.0.113.7"})  # the last is what the proxy added
         assert answer.status_code == 429
         assert answer.json()["field"] == "client"

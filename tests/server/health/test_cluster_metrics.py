@@ -10,6 +10,7 @@ import pytest
 from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import generate_latest
 from running import Running, fake_settings
+from waiting import HANG_S
 
 from client.wire import Cluster, Node, Waiting
 from server.health.metrics import of_cluster
@@ -72,7 +73,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
 
 def test_they_follow_the_placement_and_go_with_what_they_are_of(running: Running) -> None:
     def nodes_told() -> list[str]:
-        text = httpx.get(f"{running.url}/metrics").text
+        text = httpx.get(f"{running.url}/metrics", timeout=HANG_S).text
         return [line for line in text.splitlines() if line.startswith(("scas4d_node", "scas4d_scene_", "scas4d_cl"))]
 
     assert nodes_told() == []

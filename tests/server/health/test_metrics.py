@@ -11,6 +11,7 @@ import httpx
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from running import Running, fake_settings, make_rig, pictures, problem
+from waiting import HANG_S
 
 from client.sdk import Client
 from server.health import logs
@@ -92,7 +93,7 @@ def test_requests_are_logged_without_query_and_headers(http, caplog):
 def waited(running):
     """The first answer that is not 'not yet'."""
     while True:
-        answer = httpx.get(f"{running.url}/health/ready")
+        answer = httpx.get(f"{running.url}/health/ready", timeout=HANG_S)
         if answer.status_code == 200 or "seconds" not in answer.json() or "retry-after" not in answer.headers:
             return answer
         time.sleep(0.05)
@@ -103,18 +104,18 @@ def test_ready_says_how_long_the_kernels_took(tmp_path, monkeypatch):
     monkeypatch.setenv("FAKE_WARM_UP_UNTIL", str(until))
     running = Running(fake_settings(tmp_path, warm_up=True))
     try:
-        assert httpx.get(f"{running.url}/health/live").json()["status"] == "live"
-        early = httpx.get(f"{running.url}/health/ready")
+        assert httpx.get(f"{running.url}/health/live", timeout=HANG_S).json()["status"] == "live"
+        early = httpx.get(f"{running.url}/health/ready", timeout=HANG_S)
         assert "being warmed up" in problem(early, 503)["detail"]
         assert early.headers["retry-after"] == "1"
         while "kernels" not in early.json():  # until the process beside has told how far it is
-            early = httpx.get(f"{running.url}/health/ready")
+            early = httpx.get(f"{running.url}/health/ready", timeout=HANG_S)
         assert (early.json()["kernels_compiled"], early.json()["kernels"]) == (1, 3)
         assert early.json()["detail"].endswith("compiled: 1 of 3")
         until.touch()
         answer = waited(running)
         assert answer.json()["ready_after"] > 0
-        with httpx.Client(base_url=running.url) as http:
+        with httpx.Client(base_url=running.url, timeout=HANG_S) as http:
             assert samples(http)["scas4d_ready_after_seconds",] > 0
     finally:
         running.stop()

@@ -16,9 +16,12 @@ import fakes
 import httpx
 import pytest
 from running import make_rig, pictures, problem
+from waiting import HANG_S
 
 from client.sdk import Client
 from client.wire import RigModel
+
+pytestmark = pytest.mark.service
 
 ROOT = Path(__file__).parents[3]
 TOKEN = "a-token-of-thirty-two-characters"
@@ -38,12 +41,12 @@ def served(folder, *arguments, **environment):
         process = subprocess.Popen([*command, *arguments], env=environment, stderr=file, stdout=file, cwd=folder)
     url = f"http://127.0.0.1:{port}"
     try:
-        until = time.monotonic() + 60
+        until = time.monotonic() + HANG_S
         while True:
             assert process.poll() is None, log.read_text()
             assert time.monotonic() < until
             try:
-                httpx.get(f"{url}/health/live")
+                httpx.get(f"{url}/health/live", timeout=HANG_S)
                 break
             except httpx.TransportError:
                 time.sleep(0.05)
@@ -76,8 +79,8 @@ def test_it_ends_gracefully_in_the_middle_of_an_update(tmp_path, ending):
         theirs = children(process.pid)
         assert len(theirs) >= 2
         process.send_signal(ending)
-        assert process.wait(40) == 0
-        until = time.monotonic() + 10
+        assert process.wait(HANG_S) == 0
+        until = time.monotonic() + HANG_S
         while any(Path(f"/proc/{pid}").exists() for pid in theirs):
             assert time.monotonic() < until, "a process outlived the service"
             time.sleep(0.05)
@@ -91,15 +94,15 @@ def test_it_ends_gracefully_in_the_middle_of_an_update(tmp_path, ending):
 def test_every_line_of_its_log_is_json_and_none_holds_the_token(tmp_path):
     bearer = {"Authorization": f"Bearer {TOKEN}"}
     with served(tmp_path, SCAS4D_TOKEN=TOKEN, SCAS4D_TOKKEN="misspelt") as (process, url, log):
-        httpx.get(f"{url}/v1/scenes", headers=bearer)
-        httpx.get(f"{url}/v1/scenes?token={TOKEN}")
-        httpx.get(f"{url}/nowhere", headers={"Authorization": f"Bearer {TOKEN}x"})
-        ticket = httpx.post(f"{url}/v1/tickets", headers=bearer).json()
+        httpx.get(f"{url}/v1/scenes", headers=bearer, timeout=HANG_S)
+        httpx.get(f"{url}/v1/scenes?token={TOKEN}", timeout=HANG_S)
+        httpx.get(f"{url}/nowhere", headers={"Authorization": f"Bearer {TOKEN}x"}, timeout=HANG_S)
+        ticket = httpx.post(f"{url}/v1/tickets", headers=bearer, timeout=HANG_S).json()
         headers = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13"}
         headers |= {"Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==", "Sec-WebSocket-Protocol": ticket["subprotocol"]}
-        httpx.get(f"{url}/v1/scenes/none/stream?ticket={ticket['ticket']}", headers=headers)
+        httpx.get(f"{url}/v1/scenes/none/stream?ticket={ticket['ticket']}", headers=headers, timeout=HANG_S)
         process.terminate()
-        process.wait(30)
+        process.wait(HANG_S)
         text = log.read_text()
     entries = [json.loads(line) for line in text.splitlines()]
     assert {"scas4d.access", "scas4d.server"} <= {entry["logger"] for entry in entries}
@@ -111,7 +114,7 @@ def test_every_line_of_its_log_is_json_and_none_holds_the_token(tmp_path):
 def test_it_does_not_start_where_it_should_not():
     done = subprocess.run(
         [sys.executable, "-m", "client.cli.main", "serve", "--host", "0.0.0.0"],
-        cwd=ROOT, capture_output=True, text=True, timeout=60,
+        cwd=ROOT, capture_output=True, text=True, timeout=HANG_S,
     )  # fmt: skip
     assert done.returncode == 1
     assert "SCAS4D_TOKEN" in done.stderr
@@ -136,7 +139,7 @@ def raw(service, method, path, body=b"{}"):
     """The answer to exactly this path: clients tidy paths up before they send them."""
     lines = [f"{method} {path} HTTP/1.1", "Host: localhost", "Connection: close", "Content-Type: application/json"]
     with socket.create_connection(("127.0.0.1", service.port)) as connection:
-        connection.settimeout(20)
+        connection.settimeout(HANG_S)
         connection.sendall("\r\n".join([*lines, f"Content-Length: {len(body)}", "", ""]).encode() + body)
         return b"".join(iter(lambda: connection.recv(65536), b""))
 

@@ -8,6 +8,7 @@ from collections import namedtuple
 import httpx
 import pytest
 from running import Running, fake_settings, picture, pictures, problem
+from waiting import HANG_S
 
 from client.sdk import Client
 from server.http.unchanging import disposition
@@ -45,7 +46,7 @@ def test_head_is_get_without_the_body(http, committed, address):
 
 
 def test_json_is_compressed_for_those_who_accept_it_and_pictures_are_not(http, committed, address):
-    with httpx.Client(base_url=http.base_url) as client:
+    with httpx.Client(base_url=http.base_url, timeout=HANG_S) as client:
         request = client.build_request("GET", "/openapi.json", headers={"Accept-Encoding": "gzip"})
         answer = client.send(request, stream=True)
         raw = b"".join(answer.iter_raw())
@@ -158,7 +159,7 @@ def test_names_of_files_are_safe_in_a_header():
 def test_a_full_disk_ends_ingest_and_not_the_service(tmp_path, monkeypatch):
     running = Running(fake_settings(tmp_path))
     try:
-        with httpx.Client(base_url=running.url) as http, Client(running.url) as sdk:
+        with httpx.Client(base_url=running.url, timeout=HANG_S) as http, Client(running.url) as sdk:
             assert sdk.ingest_ready().ingest_ready is True
             assert sdk.ready().ingest_ready is True
             usage = namedtuple("usage", "total used free")

@@ -11,6 +11,7 @@ import httpx
 import pytest
 import websockets
 from running import Running, fake_settings, make_rig, problem
+from waiting import HANG_S
 
 from client.wire import RigModel
 from client.wire.stream import STREAM_PROTOCOL
@@ -44,13 +45,15 @@ def guarded(tmp_path_factory):
 def listened(guarded):
     """A scene of it, to stream from."""
     body = {"rig": RigModel.of(make_rig()).model_dump(mode="json")}
-    created = httpx.post(f"{guarded.url}/v1/scenes", json=body, headers=BEARER, timeout=30)
+    created = httpx.post(f"{guarded.url}/v1/scenes", json=body, headers=BEARER, timeout=HANG_S)
     yield created.json()["id"]
-    httpx.delete(guarded.url + created.headers["Location"], headers=BEARER, timeout=30)
+    httpx.delete(guarded.url + created.headers["Location"], headers=BEARER, timeout=HANG_S)
 
 
 def get(running, path="/v1/scenes", **headers):
-    return httpx.get(running.url + path, headers={name.replace("_", "-"): value for name, value in headers.items()})
+    return httpx.get(
+        running.url + path, headers={name.replace("_", "-"): value for name, value in headers.items()}, timeout=HANG_S
+    )
 
 
 # Host and Origin.
@@ -103,7 +106,7 @@ FOREIGN = ["https://evil.example", "http://localhost:1", "http://127.0.0.1", "nu
 @pytest.mark.parametrize("page", FOREIGN)
 def test_a_cross_origin_page_is_refused(service, page):
     for method in ("GET", "POST", "OPTIONS", "DELETE"):
-        answer = httpx.request(method, f"{service.url}/v1/scenes", headers={"Origin": page})
+        answer = httpx.request(method, f"{service.url}/v1/scenes", headers={"Origin": page}, timeout=HANG_S)
         assert problem(answer, 403)["field"] == "Origin"
 
 
@@ -132,7 +135,9 @@ def test_pictures_and_frames_of_other_sites_are_refused_and_links_are_not(servic
     assert answer.status_code == 200
     assert answer.headers["x-frame-options"] == "DENY"
     problem(get(service, "/docs", **link | {"Sec_Fetch_Dest": "iframe"}), 403)
-    form = httpx.post(f"{service.url}/v1/scenes", headers={k.replace("_", "-"): v for k, v in link.items()})
+    form = httpx.post(
+        f"{service.url}/v1/scenes", headers={k.replace("_", "-"): v for k, v in link.items()}, timeout=HANG_S
+    )
     problem(form, 403)
 
 
@@ -182,7 +187,7 @@ WRONG = [
 
 @pytest.mark.parametrize("given", WRONG)
 def test_a_wrong_token_is_refused(guarded, given):
-    answer = httpx.get(f"{guarded.url}/v1/scenes", headers={"Authorization": given.encode("latin-1")})
+    answer = httpx.get(f"{guarded.url}/v1/scenes", headers={"Authorization": given.encode("latin-1")}, timeout=HANG_S)
     document = problem(answer, 401)
     assert document["field"] == "Authorization"
     assert answer.headers["www-authenticate"].startswith("Bearer")
@@ -200,7 +205,10 @@ def test_everything_but_what_bears_no_data_is_behind_the_token(guarded):
     for path in ("/metrics", "/health/other", "/v1", "/nowhere", "/viewerx", "//v1/scenes"):
         problem(get(guarded, path), 401)
         assert get(guarded, path, **BEARER).status_code in (200, 404)
-    problem(httpx.get(f"{guarded.url}/v1/scenes", headers=[("Authorization", BEARER["Authorization"])] * 2), 401)
+    problem(
+        httpx.get(f"{guarded.url}/v1/scenes", headers=[("Authorization", BEARER["Authorization"])] * 2, timeout=HANG_S),
+        401,
+    )
 
 
 def test_a_secret_in_an_address_is_refused(guarded):
@@ -220,7 +228,7 @@ def connect(running, id, protocols=(STREAM_PROTOCOL,), **options):
         address = running.url.replace("http", "ws") + f"/v1/scenes/{id}/stream"
         try:
             async with websockets.connect(address, subprotocols=list(protocols), **options) as socket:
-                await asyncio.wait_for(socket.recv(), 10)
+                await asyncio.wait_for(socket.recv(), HANG_S)
                 return socket.subprotocol
         except websockets.InvalidStatus as refused:
             return json.loads(refused.response.body)  # no problem document is no JSON
@@ -229,7 +237,7 @@ def connect(running, id, protocols=(STREAM_PROTOCOL,), **options):
 
 
 def ticket(running):
-    return httpx.post(f"{running.url}/v1/tickets", headers=BEARER).json()
+    return httpx.post(f"{running.url}/v1/tickets", headers=BEARER, timeout=HANG_S).json()
 
 
 def test_a_websocket_without_a_token_is_refused(guarded, listened):
@@ -239,7 +247,7 @@ def test_a_websocket_without_a_token_is_refused(guarded, listened):
 
 
 def test_a_ticket_opens_one_websocket(guarded, listened):
-    problem(httpx.post(f"{guarded.url}/v1/tickets"), 401)
+    problem(httpx.post(f"{guarded.url}/v1/tickets", timeout=HANG_S), 401)
     issued = ticket(guarded)
     assert issued["subprotocol"] == SUBPROTOCOL + issued["ticket"]
     offered = (STREAM_PROTOCOL, issued["subprotocol"])
@@ -251,7 +259,7 @@ def test_a_ticket_opens_one_websocket(guarded, listened):
     two = ticket(guarded)["subprotocol"], ticket(guarded)["subprotocol"]
     assert connect(guarded, listened, (STREAM_PROTOCOL, *two))["status"] == 401
     # A ticket is for a WebSocket, not for requests.
-    problem(httpx.get(f"{guarded.url}/v1/scenes", headers={"Authorization": "Bearer " + two[0]}), 401)
+    problem(httpx.get(f"{guarded.url}/v1/scenes", headers={"Authorization": "Bearer " + two[0]}, timeout=HANG_S), 401)
 
 
 def test_a_ticket_alone_is_echoed_so_that_browsers_accept_the_handshake():
@@ -294,7 +302,7 @@ def handshake(running, path, host):
         lines += ["Connection: Upgrade", "Sec-WebSocket-Version: 13", "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA=="]
         lines += [f"Sec-WebSocket-Protocol: {STREAM_PROTOCOL}"]
         raw.sendall("\r\n".join([*lines, "", ""]).encode())
-        raw.settimeout(10)
+        raw.settimeout(HANG_S)
         return raw.recv(4096).decode()
 
 

@@ -13,6 +13,7 @@ import zlib
 import pytest
 from hypothesis import HealthCheck, assume, settings
 from running import Running, fake_settings, make_rig, pictures
+from waiting import HANG_S
 
 from client.sdk import Client
 from server.app import create_app
@@ -94,7 +95,7 @@ def test_no_answer_outside_the_document(case, fuzzed):
         headers=HEADERS,
         # That a rotation is one, or that a picture is whole, cannot be said in a schema: 422 is right there.
         excluded_checks=[positive_data_acceptance],
-        timeout=30,
+        timeout=HANG_S,
     )
 
 

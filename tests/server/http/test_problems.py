@@ -7,6 +7,7 @@ import socket
 import httpx
 import pytest
 from running import problem
+from waiting import HANG_S
 
 
 def test_an_unknown_address(http):
@@ -35,7 +36,7 @@ def test_a_body_that_is_too_large_by_its_length_or_while_it_comes(http, service)
     with socket.create_connection(("127.0.0.1", service.port)) as raw:  # refused before anything of it is sent
         lines = ["POST /v1/scenes HTTP/1.1", "Host: localhost", "Connection: close", f"Content-Length: {limit + 1}"]
         raw.sendall("\r\n".join([*lines, "", ""]).encode())
-        raw.settimeout(10)
+        raw.settimeout(HANG_S)
         answer = b"".join(iter(lambda: raw.recv(65536), b""))
     assert answer.startswith(b"HTTP/1.1 413")
     assert b"SCAS4D_MAX_BODY_MB" in answer
@@ -63,6 +64,6 @@ def test_a_fault_of_the_service_names_no_more_than_its_kind(service, monkeypatch
         raise KeyError("an inner secret")
 
     monkeypatch.setattr("server.scene.scenes.Scenes.refuse", fails)
-    document = problem(httpx.get(f"{service.url}/v1/scenes/x"), 500)
+    document = problem(httpx.get(f"{service.url}/v1/scenes/x", timeout=HANG_S), 500)
     assert "KeyError" in document["detail"]
     assert "secret" not in str(document)

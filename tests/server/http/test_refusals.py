@@ -7,6 +7,7 @@ import importlib.util
 import httpx
 import pytest
 from running import make_rig, picture, pictures, problem
+from waiting import HANG_S
 
 from client.sdk import Client
 from client.wire import RigModel
@@ -17,7 +18,7 @@ CUT_JPEG, CUT_PNG = picture(format="JPEG")[:-9], picture()[:-9]
 @pytest.fixture(scope="module")
 def here(service):
     """A scene of two cameras with one committed frame."""
-    with Client(service.url, patience=20) as sdk:
+    with Client(service.url, patience=HANG_S) as sdk:
         id = sdk.create_scene(make_rig()).id
         sdk.put_frame(id, 0, pictures())
         sdk.wait(id, 0)
@@ -141,4 +142,4 @@ def test_a_device_that_is_not_there_is_refused_before_the_scene_is_made(http):
 
 
 def test_addresses_of_the_page_may_have_parameters(service):
-    assert httpx.get(f"{service.url}/?from=mail").status_code == 200
+    assert httpx.get(f"{service.url}/?from=mail", timeout=HANG_S).status_code == 200

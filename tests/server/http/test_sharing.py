@@ -9,6 +9,7 @@ import httpx
 import pytest
 import websockets
 from running import Running, fake_settings, make_rig, pictures, problem
+from waiting import HANG_S
 
 from client.sdk import Client
 from client.wire.stream import STREAM_PROTOCOL
@@ -37,7 +38,7 @@ def scenes(running):
 
 
 def bearer(running, token):
-    return httpx.Client(base_url=running.url, headers={"Authorization": f"Bearer {token}"}, timeout=60)
+    return httpx.Client(base_url=running.url, headers={"Authorization": f"Bearer {token}"}, timeout=HANG_S)
 
 
 @pytest.fixture(scope="module")
@@ -198,6 +199,9 @@ def test_what_cannot_be_shared(running, owner, tmp_path):
         assert problem(http.post("/v1/shares", json={"seconds": 0}), 422)["field"] == "body.seconds"
     open_service = Running(fake_settings(tmp_path))
     try:
-        assert problem(httpx.post(f"{open_service.url}/v1/shares", json={}), 409)["field"] == "SCAS4D_TOKEN"
+        assert (
+            problem(httpx.post(f"{open_service.url}/v1/shares", json={}, timeout=HANG_S), 409)["field"]
+            == "SCAS4D_TOKEN"
+        )
     finally:
         open_service.stop()

@@ -11,6 +11,7 @@ import pytest
 from blake3 import blake3
 from running import picture, pictures, problem
 from sending import FRAMED, create, finished, framed, put_framed, status
+from waiting import HANG_S
 
 from client.wire.framing import MAX_HEAD, PREFIX
 from server.ingest.receive import Receiving, read_framed
@@ -59,7 +60,7 @@ FAULTS = {
 @pytest.fixture(scope="module")
 def begun(service):
     """A scene that has its first frame, at 0 s; it takes none of the others."""
-    with httpx.Client(base_url=service.url, timeout=30) as http:
+    with httpx.Client(base_url=service.url, timeout=HANG_S) as http:
         id = create(http)
         assert put_framed(http, id, 0).status_code == 202
         finished(http, id, 0)

@@ -12,6 +12,7 @@ import pytest
 from running import make_rig, picture, pictures, problem
 from sending import FRAMED, finished, framed, put_camera, status, wait_for
 from sending import put_framed as put
+from waiting import HANG_S
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -60,7 +61,7 @@ def test_frames_that_come_side_by_side_are_taken_in_order(http, make, service):
     def send(index):
         import httpx
 
-        with httpx.Client(base_url=service.url, timeout=30) as own:
+        with httpx.Client(base_url=service.url, timeout=HANG_S) as own:
             answer = put(own, id, index)
             while answer.status_code == 409:  # its sender is ahead of the one before
                 answer = put(own, id, index)
@@ -70,7 +71,7 @@ def test_frames_that_come_side_by_side_are_taken_in_order(http, make, service):
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join()
+        thread.join(HANG_S)
     assert answers == dict.fromkeys(range(6), 202)
     assert status(http, id)["next_frame"] == 6
 
@@ -190,7 +191,9 @@ def test_a_paused_scene_takes_frames_and_reconstructs_none(http, make):
     id = make(queue_frames=3)
     assert http.post(f"/v1/scenes/{id}/pause").json()["state"] == "paused"
     put(http, id, 0)
-    time.sleep(0.3)
+    other = make()
+    put(http, other, 0)
+    assert finished(http, other, 0)["state"] == "committed"  # made and sent later
     assert (status(http, id)["state"], status(http, id)["queued"]) == ("paused", 1)
     assert http.post(f"/v1/scenes/{id}/resume").json()["paused"] is False
     assert finished(http, id, 0)["state"] == "committed"
@@ -232,11 +235,14 @@ def test_retention_deletes_pictures_and_states_and_says_so(http, make, service):
 
 
 def test_nothing_uncommitted_is_deleted(http, make):
-    id = make(queue_frames=8, keep_frames={"last": 0})
+    id, other = (make(queue_frames=8, keep_frames={"last": 0}) for _ in range(2))
     http.post(f"/v1/scenes/{id}/pause")
     for index in range(4):
         put(http, id, index)
-    time.sleep(0.2)
+    for index in range(4):
+        put(http, other, index)
+    finished(http, other, 3)
+    wait_for(lambda: status(http, other)["frames_held"] == 1)  # sent later, and deleted
     assert status(http, id)["frames_held"] == 4
     http.post(f"/v1/scenes/{id}/resume")
     finished(http, id, 3)
@@ -301,7 +307,7 @@ def test_a_scene_has_only_so_many_sending_websockets(http, make, service, monkey
 
 
 def retried(action, error):
-    until = time.monotonic() + 20
+    until = time.monotonic() + HANG_S
     while True:
         try:
             return action()

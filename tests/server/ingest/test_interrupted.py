@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import socket
-import time
+import threading
 
 import pytest
 from running import picture, problem
 from sending import create, finished, framed, put_camera, put_form, serving, status, wait_for
 from sending import put_framed as put
+from waiting import HANG_S, wait_for_soon
 
 from client.wire import FRAME_MEDIA_TYPE
 from server.ingest import camera_files, receive
@@ -26,12 +27,33 @@ def test_a_refused_sender_that_goes_in_the_middle_leaves_the_frame_free(http, ma
     body = framed(0, {"c0": picture()[:-9], "c1": picture(), "c2": picture() + bytes(500_000)})
     head = f"PUT /v1/scenes/{id}/frames/0 HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: {FRAME_MEDIA_TYPE}\r\n"
     ingest = service.app.state.scenes[id].ingest
+    refused, real = threading.Event(), receive.drain
+
+    async def drain(body):
+        refused.set()
+        await real(body)
+
+    monkeypatch.setattr(receive, "drain", drain)
     with socket.create_connection(("127.0.0.1", service.port)) as sender:
         sender.sendall(f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body[:-400_000])
-        time.sleep(0.5)
-    time.sleep(0.2)
-    assert ingest._coming == {}
+        assert refused.wait(HANG_S)
+    wait_for(lambda: ingest._coming == {})
     assert http.post(f"/v1/scenes/{id}/frames/0/missing").json()["state"] == "missing"
+
+
+class HeldJournal:
+    """Writes of journals wait, from now on, until `go_on` is set; `writes` is set once one does."""
+
+    def __init__(self, monkeypatch):
+        self.writes, self.go_on = threading.Event(), threading.Event()
+        real = Journal._write
+
+        def held(journal, data):
+            self.writes.set()
+            assert self.go_on.wait(HANG_S)
+            real(journal, data)
+
+        monkeypatch.setattr(Journal, "_write", held)
 
 
 def on_the_loop(scene, coroutine):
@@ -43,25 +65,29 @@ def test_a_request_cancelled_while_its_event_is_written_keeps_its_pictures(http,
     id = make(1)
     http.post(f"/v1/scenes/{id}/pause")
     scene = service.app.state.scenes[id]
-    real = Journal._write
-
-    def slow(self, data):
-        time.sleep(0.5)
-        real(self, data)
+    over = threading.Event()
 
     async def body():
         yield framed(0, {"c0": picture()}, part=part)
 
-    monkeypatch.setattr(Journal, "_write", slow)
+    async def taken():
+        try:
+            await take
+        finally:
+            over.set()
+
+    journal = HeldJournal(monkeypatch)
     if part:
         take = camera_files.receive_camera(scene.open_frames, 0, "c0", body(), None)
     else:
         take = receive.receive_frame(scene.ingest, 0, body(), None)
-    request = on_the_loop(scene, take)
-    time.sleep(0.25)
+    request = on_the_loop(scene, taken())
+    assert journal.writes.wait(HANG_S)
     request.cancel()
+    on_the_loop(scene, asyncio.sleep(0)).result(HANG_S)  # the cancellation is there
+    journal.go_on.set()
     wait_for(lambda: scene.next_frame == 1)
-    time.sleep(0.2)
+    assert over.wait(HANG_S)
     assert len(list(scene.spec.folder.frames.iterdir())) == 1
     http.post(f"/v1/scenes/{id}/resume")
     assert finished(http, id, 0)["state"] == "committed"
@@ -70,26 +96,24 @@ def test_a_request_cancelled_while_its_event_is_written_keeps_its_pictures(http,
 def test_a_frame_accepted_while_the_first_one_fails_does_not_wait_for_ever(http, make, service, monkeypatch):
     id = make(queue_frames=9)
     scene = service.app.state.scenes[id]
-    real = Journal._write
-
-    def slow(self, data):
-        time.sleep(0.3)
-        real(self, data)
 
     async def race():
         event = FrameSetAside(index=0, reason="told to", fatal=True)
         setting = asyncio.ensure_future(scene.updates._set_aside(event))
-        await asyncio.sleep(0.1)
+        await wait_for_soon(journal.writes.is_set)
 
         async def body():
             yield framed(1)
 
-        await asyncio.gather(setting, receive.receive_frame(scene.ingest, 1, body(), None))
+        taking = asyncio.ensure_future(receive.receive_frame(scene.ingest, 1, body(), None))
+        await wait_for_soon(lambda: scene.log.journal._waiting)  # its event waits behind the other
+        journal.go_on.set()
+        await asyncio.gather(setting, taking)
 
     http.post(f"/v1/scenes/{id}/pause")
     put(http, id, 0)
-    monkeypatch.setattr(Journal, "_write", slow)
-    on_the_loop(scene, race()).result(20)
+    journal = HeldJournal(monkeypatch)
+    on_the_loop(scene, race()).result(HANG_S)
     wait_for(lambda: status(http, id)["queued"] == 0)
     assert http.get(f"/v1/scenes/{id}/frames/1").json()["state"] == "set_aside"
 

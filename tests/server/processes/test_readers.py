@@ -16,14 +16,13 @@ import numpy as np
 import pytest
 from PIL import Image
 from running import HEIGHT, WIDTH, Running, fake_settings, make_rig, pictures, problem
+from waiting import HANG_S, wait_for
 
 from client.sdk import Client
 from client.wire import CameraModel, part_colour
 from server.processes import query_queue, renderer
 from server.processes.placement import Ended
 from server.processes.queries import Answer
-
-PATIENCE_S = 30
 
 
 @pytest.fixture(scope="module")
@@ -38,7 +37,7 @@ def impatient(tmp_path_factory):
 @contextlib.contextmanager
 def two_frames(impatient):
     """A scene of two frames: id, its readers, and a client."""
-    with Client(impatient.url, patience=20) as sdk, httpx.Client(base_url=impatient.url, timeout=PATIENCE_S) as http:
+    with Client(impatient.url, patience=HANG_S) as sdk, httpx.Client(base_url=impatient.url, timeout=HANG_S) as http:
         id = sdk.create_scene(make_rig(), frames_per_second=10).id
         for index in range(2):
             sdk.put_frame(id, index, pictures())
@@ -61,13 +60,6 @@ def still(impatient):
         yield made
 
 
-def until(condition):
-    end = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-
-
 def in_the_background(function):
     result = concurrent.futures.Future()
 
@@ -82,7 +74,7 @@ def in_the_background(function):
 def test_views_do_not_wait_for_a_query_that_never_ends(scene):
     id, readers, http = scene
     hanging = in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}"))
-    until(lambda: readers.bulk._at_work is not None)
+    wait_for(lambda: readers.bulk._at_work is not None)
     for frame in (0, 1):
         assert http.get(f"/v1/scenes/{id}/render?frame={frame}").status_code == 200
     assert not hanging.done()
@@ -101,7 +93,7 @@ def test_one_who_hangs_up_takes_the_question_back(scene):
     id, readers, http = scene
     with pytest.raises(httpx.ReadTimeout):
         http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}", timeout=1.0)
-    until(lambda: readers.bulk._at_work is None)
+    wait_for(lambda: readers.bulk._at_work is None)
     assert http.get(f"/v1/scenes/{id}/tracks?ids=1").status_code == 200
 
 
@@ -109,11 +101,11 @@ def test_one_who_hangs_up_takes_the_question_back(scene):
 def test_a_question_that_waits_and_is_given_up_is_never_begun(scene, question):
     id, readers, http = scene
     hanging = in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}"))
-    until(lambda: readers.bulk._at_work is not None)
+    wait_for(lambda: readers.bulk._at_work is not None)
     asked = readers.bulk._asked
     with pytest.raises(httpx.ReadTimeout):
         http.get(f"/v1/scenes/{id}/{question}", timeout=0.5)
-    until(lambda: not readers.bulk._waiting)
+    wait_for(lambda: not readers.bulk._waiting)
     assert readers.bulk._asked == asked + 1
     assert not hanging.done()
 
@@ -146,9 +138,9 @@ def test_too_many_questions_are_refused(scene, monkeypatch):
     id, readers, http = scene
     monkeypatch.setattr(query_queue, "MOST_WAITING", 1)
     hanging = in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}"))
-    until(lambda: readers.bulk._at_work is not None)
+    wait_for(lambda: readers.bulk._at_work is not None)
     in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids=0"))
-    until(lambda: readers.bulk._waiting)
+    wait_for(lambda: readers.bulk._waiting)
     refused = http.get(f"/v1/scenes/{id}/parts")
     assert problem(refused, 503)["detail"] == "1 question of this scene waiting for an answer already"
     assert refused.headers["retry-after"] == "1"
@@ -156,16 +148,16 @@ def test_too_many_questions_are_refused(scene, monkeypatch):
 
 
 def test_deleting_a_scene_answers_whoever_waits(service):
-    with Client(service.url, patience=20) as sdk, httpx.Client(base_url=service.url, timeout=PATIENCE_S) as http:
+    with Client(service.url, patience=HANG_S) as sdk, httpx.Client(base_url=service.url, timeout=HANG_S) as http:
         id = sdk.create_scene(make_rig()).id
         sdk.put_frame(id, 0, pictures())
         sdk.wait(id, 0)
         readers = service.app.state.scenes[id].readers
         hanging = in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}"))
-        until(lambda: readers.bulk._at_work is not None)
+        wait_for(lambda: readers.bulk._at_work is not None)
         processes = [readers.views.process._process, readers.bulk.process._process]
         sdk.delete_scene(id)
-        assert "ended" in problem(hanging.result(PATIENCE_S), 503)["detail"]
+        assert "ended" in problem(hanging.result(HANG_S), 503)["detail"]
         for process in processes:
             with pytest.raises(ValueError, match="closed"):
                 process.is_alive()
@@ -175,7 +167,7 @@ def test_new_frames_are_seen_without_a_new_process(scene):
     id, readers, http = scene
     assert http.get(f"/v1/scenes/{id}/tracks?ids=0").json()["frames"] == [0, 1]
     before = readers.views.process.pid, readers.bulk.process.pid
-    with Client(str(http.base_url), patience=20) as sdk:
+    with Client(str(http.base_url), patience=HANG_S) as sdk:
         for index in (2, 3):
             sdk.put_frame(id, index, pictures())
             sdk.wait(id, index)
@@ -188,14 +180,14 @@ def test_views_of_parts_never_wait_for_parts_but_the_first_time(scene):
     id, readers, http = scene
     address = f"/v1/scenes/{id}/render?kind=parts&parts=2"
     assert http.get(address).headers["x-parts-frame"] == "1"
-    with Client(str(http.base_url), patience=20) as sdk:
+    with Client(str(http.base_url), patience=HANG_S) as sdk:
         sdk.put_frame(id, 2, pictures())
         sdk.wait(id, 2)
     in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}", timeout=2.0))
-    until(lambda: readers.bulk._at_work is not None)
+    wait_for(lambda: readers.bulk._at_work is not None)
     seen = http.get(address)
     assert (seen.headers["x-frame"], seen.headers["x-parts-frame"]) == ("2", "1")
-    until(lambda: http.get(address).headers["x-parts-frame"] == "2")
+    wait_for(lambda: http.get(address).headers["x-parts-frame"] == "2")
 
 
 def mine():
@@ -295,7 +287,7 @@ def test_a_state_that_went_missing_is_answered_from_a_copy_or_asked_for_later(sc
     answer = http.get(f"/v1/scenes/{id}/render?frame=1")
     assert "frame 1" in problem(answer, answer.status_code)["detail"]
     assert answer.status_code in (404, 503)
-    until = time.monotonic() + 20
+    until = time.monotonic() + HANG_S
     while http.get(f"/v1/scenes/{id}/render?frame=1").status_code != 200:
         assert time.monotonic() < until
         time.sleep(0.05)
@@ -347,7 +339,7 @@ def test_a_query_whose_reader_is_lost_with_its_machine_goes_to_the_next(monkeypa
                 await asyncio.sleep(0.005)
             (again,) = placement.started[1].asked
             placement.started[1].on_message(Answer(again.number, b"", "image/png"))
-        answer = await asyncio.wait_for(asking, 10)
+        answer = await asyncio.wait_for(asking, HANG_S)
         await queue.stop(0)
         return answer
 

@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 from running import HEIGHT, WIDTH, picture, pictures, problem
 from sending import animated, declares
+from waiting import HANG_S
 
 
 def put(http, scene, index, images, masks=None, **data):
@@ -116,7 +117,7 @@ def test_a_first_frame_that_fails_fails_the_scene(http, sdk, scene):
 def test_frames_that_waited_behind_a_failed_first_one_do_not_bring_the_scene_back(sdk, scene):
     sdk.put_frame(scene, 0, pictures(fakes.SLOW_RAISES))
     sdk.put_frame(scene, 1, pictures())  # is taken: frame 0 is still at work
-    until = time.monotonic() + 10
+    until = time.monotonic() + HANG_S
     while sdk.frame(scene, 1).state != "set_aside":
         assert time.monotonic() < until
         time.sleep(0.05)

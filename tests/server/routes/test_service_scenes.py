@@ -1,11 +1,11 @@
 from __future__ import annotations
 
 import io
-import time
 
 import numpy as np
 import pytest
 from running import HEIGHT, WIDTH, make_rig, picture, pictures, problem
+from waiting import wait_for
 
 from client.calls import put_frame
 from client.sdk import ServiceError
@@ -327,8 +327,10 @@ def test_a_reader_that_dies_is_replaced(sdk, scene, service):
     sdk.put_frame(scene, 0, pictures())
     sdk.wait(scene, 0)
     sdk.render(scene, "c0")
-    service.app.state.scenes[scene].readers.views.process._process.kill()
-    time.sleep(0.2)
+    views = service.app.state.scenes[scene].readers.views
+    killed = views.process
+    killed._process.kill()
+    wait_for(lambda: views.process is not killed)
     assert sdk.render(scene, "c0").shape == (HEIGHT, WIDTH, 3)
 
 

@@ -9,6 +9,7 @@ import fakes
 import numpy as np
 import pytest
 from running import make_rig, pictures, problem
+from waiting import HANG_S
 
 from client.sdk import Client
 from client.wire import CameraModel
@@ -23,7 +24,7 @@ FRAMES = 6
 @pytest.fixture(scope="module")
 def finished(service):
     """A scene of six frames."""
-    with Client(service.url, patience=20) as sdk:
+    with Client(service.url, patience=HANG_S) as sdk:
         id = sdk.create_scene(make_rig(), frames_per_second=10).id
         for index in range(FRAMES):
             sdk.put_frame(id, index, pictures())

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from running import make_rig, pictures, problem
 from sending import FRAMED, create, framed, put_form, settled, status, wait_for
+from waiting import HANG_S
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
@@ -123,7 +124,7 @@ def test_of_two_senders_one_begins(http, sdk, service, make):
     answers = []
 
     def send(iterations):
-        with httpx.Client(base_url=service.url, timeout=30) as mine:
+        with httpx.Client(base_url=service.url, timeout=HANG_S) as mine:
             while (answer := begin(mine, id, 1, settings={"update": {"iterations": iterations}})).status_code == 503:
                 time.sleep(0.05)
             answers.append((answer.status_code, iterations))
@@ -132,7 +133,7 @@ def test_of_two_senders_one_begins(http, sdk, service, make):
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join()
+        thread.join(HANG_S)
     assert sorted(code for code, _ in answers) == [200, 409, 409]
     (winner,) = (iterations for code, iterations in answers if code == 200)
     assert status(http, id)["settings"]["update"]["iterations"] == winner
@@ -303,14 +304,14 @@ def test_streams_and_sockets_go_on(http, sdk, service, make):
         socket.put_frame(1, pictures())
         seen = []
         while not seen or seen[-1].index < 1:
-            event = stream.receive(30)
+            event = stream.receive(HANG_S)
             if isinstance(event, FrameMessage):
                 seen.append(event.report)
         assert (seen[-1].index, seen[-1].state) == (1, "committed")
-        assert stream.receive(30).status.reconstruction == 1
-        assert '"hello"' in raw.recv(30)
+        assert stream.receive(HANG_S).status.reconstruction == 1
+        assert '"hello"' in raw.recv(timeout=HANG_S)
         with pytest.raises(ConnectionClosed) as closed:
-            raw.recv(30)
+            raw.recv(timeout=HANG_S)
         assert closed.value.rcvd.code == SCENE_RESTARTS
 
 
@@ -408,19 +409,19 @@ def test_an_upload_that_is_under_way_is_asked_for_again(http, sdk, service, make
 
         def pieces():
             yield body[:200]
-            go_on.wait(20)
+            go_on.wait(HANG_S)
             yield body[200:]
 
         headers = {**FRAMED, "Content-Length": str(len(body))}
-        with httpx.Client(base_url=service.url, timeout=30) as mine:
+        with httpx.Client(base_url=service.url, timeout=HANG_S) as mine:
             answers.append(mine.put(f"/v1/scenes/{id}/frames/1", content=pieces(), headers=headers))
 
     thread = threading.Thread(target=send)
     thread.start()
-    time.sleep(0.5)
+    wait_for(lambda: service.app.state.scenes[id].ingest.is_coming(1))
     begun(http, id, 1)
     go_on.set()
-    thread.join()
+    thread.join(HANG_S)
     assert problem(answers[0], 503)
     assert status(http, id)["next_frame"] == 1
     wait_for(lambda: len(list(folder_of(service, id).frames.iterdir())) == 1)

@@ -11,6 +11,7 @@ import fakes
 import httpx
 import pytest
 from running import Running, fake_settings, make_rig, pictures, problem
+from waiting import HANG_S
 
 from client.sdk import Client
 from client.wire import Budget
@@ -22,7 +23,7 @@ from server.storage.ledger import Ledger
 def serving(folder):
     running = Running(fake_settings(folder))
     try:
-        with httpx.Client(base_url=running.url, timeout=30) as http, Client(running.url, patience=20) as sdk:
+        with httpx.Client(base_url=running.url, timeout=HANG_S) as http, Client(running.url, patience=HANG_S) as sdk:
             yield running, http, sdk
     finally:
         running.stop()
@@ -62,7 +63,7 @@ def test_it_holds_from_the_first_frame_that_is_not_begun(sdk, scene):
     assert sdk.set_budget(scene, iterations=25).since == 2
     push(sdk, scene, 2)
     sdk.put_frame(scene, 3, pictures(fakes.SLOW))
-    until = time.monotonic() + 20
+    until = time.monotonic() + HANG_S
     while sdk.frame(scene, 3).state != "updating":
         assert time.monotonic() < until
         time.sleep(0.02)
@@ -79,7 +80,7 @@ def test_frames_that_wait_get_the_budget_that_held_for_them_after_kill_9(tmp_pat
         push(sdk, id, 0, 1)
         sdk.set_budget(id, iterations=25)
         sdk.put_frame(id, 2, pictures(fakes.SLOW))
-        until = time.monotonic() + 20
+        until = time.monotonic() + HANG_S
         while sdk.frame(id, 2).state != "updating":
             assert time.monotonic() < until
             time.sleep(0.02)

@@ -12,6 +12,7 @@ from typing import get_args
 import numpy as np
 import pytest
 from running import Running, fake_settings, make_rig, pictures, problem
+from waiting import HANG_S
 
 from client.errors import Conflict, NotFound
 from client.sdk import Client
@@ -31,7 +32,7 @@ def push(sdk, id, indices):
 
 
 def over(sdk, id, export):
-    until = time.monotonic() + 60
+    until = time.monotonic() + HANG_S
     while (found := sdk.export(id, export)).state in ("waiting", "running"):
         assert time.monotonic() < until
         time.sleep(0.03)
@@ -40,7 +41,7 @@ def over(sdk, id, export):
 
 @pytest.fixture(scope="module")
 def ran(service):
-    with Client(service.url, patience=20) as sdk:
+    with Client(service.url, patience=HANG_S) as sdk:
         id = sdk.create_scene(make_rig(), name="Robot / 1", frames_per_second=10).id
         push(sdk, id, range(4))
         yield sdk, id
@@ -137,7 +138,7 @@ def test_exports_wait_for_each_other_and_can_be_cancelled(ran, http, service):
     sdk, id = ran
     manager = service.app.state.exports
     first = sdk.begin_export(id, "ply")
-    until = time.monotonic() + 20
+    until = time.monotonic() + HANG_S
     while sdk.export(id, first.id).state == "waiting":
         assert time.monotonic() < until
     second, third = sdk.begin_export(id, "ply"), sdk.begin_export(id, "splat")
@@ -176,7 +177,7 @@ def test_a_process_that_dies_leaves_words_and_no_file(ran, service, monkeypatch)
     begin, started = manager._placement.start, []
     monkeypatch.setattr(manager._placement, "start", lambda *given: started.append(begin(*given)) or started[-1])
     export = sdk.begin_export(id, "ply")
-    until = time.monotonic() + 20
+    until = time.monotonic() + HANG_S
     while not started:
         assert time.monotonic() < until
         time.sleep(0.001)
@@ -201,7 +202,7 @@ def test_a_damaged_state_is_named_and_mended(ran, service):
     assert "frame_000002" in found.error
     assert "again later" in found.error
     assert "/" not in found.error
-    until = time.monotonic() + 20
+    until = time.monotonic() + HANG_S
     while file.read_bytes() != whole:  # it was told to the worker, which has it in memory
         assert time.monotonic() < until
         time.sleep(0.02)
@@ -226,7 +227,7 @@ def test_limits_are_told(ran, service, monkeypatch, http):
     assert file.exists()
     assert done.expires is not None
     kept.task.get_loop().call_soon_threadsafe(manager._expire, kept)  # its timer would, after a day
-    until = time.monotonic() + 20
+    until = time.monotonic() + HANG_S
     while file.parent.exists():
         assert time.monotonic() < until
         time.sleep(0.02)
@@ -241,7 +242,7 @@ def test_frames_that_retention_deletes_meanwhile_are_named(sdk, service):
     blocked = sdk.begin_export(id, "ply")  # so that the next one waits
     export = sdk.begin_export(id, "ply", first=1)
     sdk.edit_scene(id, keep_states=Retention(last=1))
-    until = time.monotonic() + 20
+    until = time.monotonic() + HANG_S
     while (states / "frame_000001.npz").exists():
         assert time.monotonic() < until
         time.sleep(0.01)
@@ -268,7 +269,7 @@ def test_a_scene_that_sleeps_is_exported_asleep_and_leftovers_go_at_the_start(tm
     running = Running(fake_settings(tmp_path))
     try:
         assert not (tmp_path / "exports").exists()
-        with Client(running.url, patience=20) as sdk:
+        with Client(running.url, patience=HANG_S) as sdk:
             id = sdk.create_scene(make_rig(), frames_per_second=10).id
             push(sdk, id, [0])
             sdk.edit_scene(id, archived=True)

@@ -11,6 +11,7 @@ from box_scene import SHIFT, make_box, make_rig, moved, take_frame
 from PIL import Image
 from running import Running
 from scipy.spatial.transform import Rotation
+from waiting import HANG_S
 
 from client.sdk import Client
 from scas4d_core.captures import InitialPoints
@@ -44,7 +45,7 @@ def put(sdk, id, index, dark=()):
     images, masks = seen(index)
     black = png(np.zeros((48, 48, 3), np.uint8))
     sdk.put_frame(id, index, images | {name: black for name in dark}, masks, 0.1 * index)
-    return sdk.wait(id, index, seconds=120)
+    return sdk.wait(id, index, seconds=HANG_S)
 
 
 def metric(sdk, line):
@@ -56,7 +57,7 @@ def served(tmp_path_factory):
     folder = tmp_path_factory.mktemp("judged")
     running = Running(ServerSettings(data=folder), core=None)
     try:
-        with Client(running.url, patience=60) as sdk:
+        with Client(running.url, patience=HANG_S) as sdk:
             id = sdk.create_scene(RIG, settings=SETTINGS, frames_per_second=10).id
             sdk.put_points(id, InitialPoints(BOX.means.astype(np.float64), BOX.colours, BOX.foreground))
             for index in range(4):
@@ -153,7 +154,7 @@ def test_what_was_judged_is_known_again_after_a_restart(served):
     running.stop()
     again = Running(running.app.state.settings, core=None)
     try:
-        with Client(again.url, patience=60) as after, httpx.Client(base_url=again.url) as http:
+        with Client(again.url, patience=HANG_S) as after, httpx.Client(base_url=again.url, timeout=HANG_S) as http:
             assert after.frame(id, index) == before
             assert after.scene(id).degraded
             assert "held as it was" in after.scene(id).error

@@ -10,6 +10,7 @@ import httpx
 import pytest
 from running import Running, fake_settings, pictures
 from sending import create, put_framed, status, wait_for
+from waiting import HANG_S
 
 from scas4d_core.storage.history import History
 from server.processes import worker
@@ -18,8 +19,6 @@ from server.scene import supervision
 from server.scene.supervision import LONGEST_AFTER_LOST_S, OTHER_DEATHS, WorkerDeaths
 from server.storage.fencing import epoch_read
 from server.storage.layout import DataFolder
-
-PATIENCE_S = 60
 
 
 class Machines(Placement):
@@ -38,7 +37,7 @@ class Machines(Placement):
 def service(folder, placement):
     running = Running(fake_settings(folder, queue_frames=20), placement=placement)
     try:
-        with httpx.Client(base_url=running.url, timeout=60) as http:
+        with httpx.Client(base_url=running.url, timeout=HANG_S) as http:
             yield http
     finally:
         running.stop()
@@ -54,7 +53,7 @@ def sent(http, id, frames):
 
 
 def committed(http, id, count):
-    wait_for(lambda: status(http, id)["committed"] == count, PATIENCE_S)
+    wait_for(lambda: status(http, id)["committed"] == count)
 
 
 def test_no_frame_is_set_aside_for_machines_that_were_lost(tmp_path):
@@ -63,7 +62,7 @@ def test_no_frame_is_set_aside_for_machines_that_were_lost(tmp_path):
         sent(http, id, [0])
         committed(http, id, 1)
         assert put_framed(http, id, 1, pictures(fakes.DIES)).status_code == 202
-        wait_for(lambda: status(http, id)["worker_deaths"] > OTHER_DEATHS, PATIENCE_S)
+        wait_for(lambda: status(http, id)["worker_deaths"] > OTHER_DEATHS)
         assert http.get(f"/v1/scenes/{id}/frames/1").json()["state"] in ("queued", "updating")
 
 
@@ -83,7 +82,7 @@ def test_states_that_cannot_be_taken_over_are_tried_again(tmp_path, monkeypatch,
     monkeypatch.setattr(supervision, "begin_epoch", faulty)
     with service(tmp_path, Machines) as http:
         id = create(http)
-        wait_for(lambda: "the committed states cannot be taken over: " in (status(http, id)["error"] or ""), PATIENCE_S)
+        wait_for(lambda: "the committed states cannot be taken over: " in (status(http, id)["error"] or ""))
         sent(http, id, [0])
         committed(http, id, 1)
         assert len(faults) == 2

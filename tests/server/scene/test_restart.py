@@ -13,6 +13,7 @@ import pytest
 from running import Running, fake_settings, make_rig, picture, pictures, problem
 from sending import create, serving, settled
 from sending import put_form as put
+from waiting import HANG_S
 
 from client.wire import RigModel
 from scas4d_core.captures import InitialPoints
@@ -91,7 +92,7 @@ def test_a_frame_0_that_is_a_guess_is_a_warning_and_is_one_again(tmp_path):
     with serving(tmp_path) as (http, sdk):
         put(http, id, 2)
         sdk.wait(id, 2)  # the worker has said by then what it found
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + HANG_S
         while sdk.scene(id).warnings != said and time.monotonic() < deadline:
             time.sleep(0.02)
         assert sdk.scene(id).warnings == said
@@ -108,7 +109,7 @@ def test_a_camera_out_of_step_is_a_warning_for_as_long_as_it_is(tmp_path):
         assert [name for name, one in sdk.frame(id, 1).timing.items() if one.off] == ["c1"]
         assert sdk.frame(id, 1).alarms == []
     with serving(tmp_path) as (http, sdk):
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + HANG_S
         while sdk.scene(id).warnings != [said] and time.monotonic() < deadline:
             time.sleep(0.02)  # the worker says what it found
         assert sdk.scene(id).warnings == [said]
@@ -134,7 +135,7 @@ def test_deaths_at_a_frame_are_counted_over_restarts(tmp_path):
         put(http, id, 0)
         sdk.wait(id, 0)
         put(http, id, 1, pictures(fakes.DIES))
-        until = time.monotonic() + 20
+        until = time.monotonic() + HANG_S
         while not http.get(f"/v1/scenes/{id}/frames/1").json()["attempts"]:
             assert time.monotonic() < until
             time.sleep(0.02)
@@ -152,7 +153,7 @@ def test_a_deletion_that_was_cut_short_is_finished_and_half_a_scene_is_none(tmp_
     (tmp_path / "scenes" / "half" / "frames").mkdir(parents=True)  # made, never acknowledged
     with serving(tmp_path) as (http, _):
         assert [scene["id"] for scene in http.get("/v1/scenes").json()["scenes"]] == [kept]
-        until = time.monotonic() + 20
+        until = time.monotonic() + HANG_S
         while list((tmp_path / "deleted").iterdir()):  # behind the service that answers already
             assert time.monotonic() < until
             time.sleep(0.02)
@@ -203,13 +204,13 @@ def test_it_answers_while_scenes_are_recovered(tmp_path, monkeypatch):
     go_on = threading.Semaphore(0)
 
     def recover(*given):
-        assert go_on.acquire(timeout=60)
+        assert go_on.acquire(timeout=HANG_S)
         return recovery.recover(*given)
 
     monkeypatch.setattr("server.scene.found.recover", recover)
     running = Running(fake_settings(tmp_path), ready=False)
     try:
-        with httpx.Client(base_url=running.url, timeout=30) as http:
+        with httpx.Client(base_url=running.url, timeout=HANG_S) as http:
             assert http.get("/health/live").json()["status"] == "live"
             answer = http.get("/health/ready")
             assert "recovering 0 of 2 scenes" in problem(answer, 503)["detail"]
@@ -220,7 +221,7 @@ def test_it_answers_while_scenes_are_recovered(tmp_path, monkeypatch):
             problem(http.get("/v1/scenes/none"), 404)
             problem(http.post("/v1/scenes", json={"rig": RigModel.of(make_rig()).model_dump(mode="json")}), 503)
             go_on.release()
-            until = time.monotonic() + 20
+            until = time.monotonic() + HANG_S
             while not (found := [id for id in (first, second) if http.get(f"/v1/scenes/{id}").status_code == 200]):
                 assert time.monotonic() < until
                 time.sleep(0.02)
@@ -241,7 +242,7 @@ def test_a_service_that_ends_while_scenes_are_recovered_leaves_them_as_they_are(
         id = create(http)
     go_on = threading.Semaphore(0)
     monkeypatch.setattr(
-        "server.scene.found.recover", lambda *given: go_on.acquire(timeout=60) and recovery.recover(*given)
+        "server.scene.found.recover", lambda *given: go_on.acquire(timeout=HANG_S) and recovery.recover(*given)
     )
     running = Running(fake_settings(tmp_path), ready=False)
     threading.Timer(0.5, go_on.release).start()

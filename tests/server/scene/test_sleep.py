@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import os
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from fakes import SLOW
+from fakes import SLOW, WAITS
 from running import pictures, problem
 from sending import filled, finished, put_form, put_to_sleep, serving_with, status, view, wait_for
 
 from client.stream import Stream, scene_changes
-from studies.service import study as of
+from studies.running import study as of
 
 LONG, SHORT = 3600.0, 1.0
 
@@ -109,13 +108,17 @@ def test_a_scene_that_was_just_used_does_not_make_room(tmp_path):
         problem(http.post("/v1/scenes", json=body), 429)
 
 
-def test_a_scene_at_work_does_not_sleep(tmp_path):
+def test_a_scene_at_work_does_not_sleep(tmp_path, monkeypatch):
+    go_on = tmp_path / "go on"
+    monkeypatch.setenv("FAKE_GO_ON", str(go_on))
     with serving_with(tmp_path, sleep_seconds=SHORT) as (_, http, _sdk):
-        id = filled(http)
-        put_form(http, id, 2, pictures(SLOW))
+        id, later = filled(http), filled(http)
+        put_form(http, id, 2, pictures(WAITS))
         problem(http.post(f"/v1/scenes/{id}/sleep"), 409)
-        time.sleep(1.5)  # longer than it may be idle, shorter than the update
+        assert view(http, later).status_code == 200
+        wait_for(lambda: status(http, later)["asleep"])  # used after the other one, and asleep
         assert status(http, id)["asleep"] is False
+        go_on.touch()
         assert finished(http, id, 2)["state"] == "committed"
 
 

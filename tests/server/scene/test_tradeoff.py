@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import time
 from types import SimpleNamespace
 
 import fakes
 import pytest
 from running import Running, fake_settings, make_rig, pictures, problem
+from sending import serving
+from waiting import HANG_S, wait_for
 
 from client.sdk import Client
 from client.wire import IngestSettings, Retention
@@ -22,11 +23,8 @@ def push(sdk, id, indices, red=0):
 
 
 def replayed(sdk, id):
-    until = time.monotonic() + 60
-    while (found := sdk.tradeoff(id)).replay.state == "running":
-        assert time.monotonic() < until
-        time.sleep(0.05)
-    return found
+    wait_for(lambda: sdk.tradeoff(id).replay.state != "running")
+    return sdk.tradeoff(id)
 
 
 def points(found, kind):
@@ -36,7 +34,7 @@ def points(found, kind):
 @pytest.fixture(scope="module")
 def ran(service):
     """A scene that ran 100 and 40 iterations."""
-    with Client(service.url, patience=20) as sdk:
+    with Client(service.url, patience=HANG_S) as sdk:
         id = sdk.create_scene(make_rig(), frames_per_second=10).id
         push(sdk, id, range(4))
         sdk.set_budget(id, iterations=40)
@@ -124,18 +122,27 @@ def test_what_fits_into_a_time_is_told_by_frames_that_moved_and_were_met(sdk):
     sdk.delete_scene(id)
 
 
-def test_one_replay_at_a_time_and_the_scene_goes_on_beside_it(sdk, http):
+def test_one_replay_at_a_time_and_the_scene_goes_on_beside_it(tmp_path, monkeypatch):
+    go_on = tmp_path / "go on"
+    monkeypatch.setenv("FAKE_GO_ON", str(go_on))
+    with serving(tmp_path / "data") as (http, sdk):
+        goes_on_beside_a_replay(http, sdk, go_on)
+
+
+def goes_on_beside_a_replay(http, sdk, go_on):
     id = sdk.create_scene(make_rig(), frames_per_second=10).id
     push(sdk, id, range(2))
-    push(sdk, id, [2], red=fakes.SLOW)  # two seconds in the replay, too
+    go_on.touch()
+    push(sdk, id, [2], red=fakes.WAITS)
+    go_on.unlink()  # it waits in the replay
     sdk.replay(id, [50], frames=1)
     document = problem(http.post(f"/v1/scenes/{id}/tradeoff", json={}), 409)
     assert "running" in document["detail"]
-    began = time.monotonic()
     push(sdk, id, [3])
     assert sdk.tradeoff(id).replay.state == "running"
-    assert time.monotonic() - began < 2 * fakes.SLOW_S
+    go_on.touch()
     assert replayed(sdk, id).replay.state == "done"
+    go_on.unlink()
     sdk.replay(id, [50], frames=1)
     ended = sdk.end_replay(id).replay
     assert (ended.state, ended.error) == ("failed", "it was ended on request")
@@ -164,10 +171,7 @@ def test_what_cannot_be_replayed_says_what_would_help(http, sdk):
     document = problem(http.post(f"/v1/scenes/{id}/tradeoff"), 409)
     assert document["field"] == "frames"
     push(sdk, id, range(7))
-    until = time.monotonic() + 20
-    while sdk.frame(id, 4).held:
-        assert time.monotonic() < until
-        time.sleep(0.02)
+    wait_for(lambda: not sdk.frame(id, 4).held)
     document = problem(http.post(f"/v1/scenes/{id}/tradeoff", json={"frames": 4}), 409)
     assert "not held" in document["detail"]
     assert "at most 1 frame" in document["remedy"]
@@ -176,10 +180,7 @@ def test_what_cannot_be_replayed_says_what_would_help(http, sdk):
     few = IngestSettings(keep_states=Retention(last=3), queue_frames=9)
     id = sdk.create_scene(make_rig(), frames_per_second=10, ingest=few).id
     push(sdk, id, range(7))
-    until = time.monotonic() + 20
-    while sdk.scene(id).states_deleted < 3:
-        assert time.monotonic() < until
-        time.sleep(0.02)
+    wait_for(lambda: sdk.scene(id).states_deleted >= 3)
     document = problem(http.post(f"/v1/scenes/{id}/tradeoff", json={"frames": 2}), 409)
     assert "deleted" in document["detail"]
     assert "keep_states" in document["remedy"]
@@ -204,14 +205,14 @@ def test_what_is_no_replay_is_refused(http, quiet_scene, body):
 
 def test_after_a_restart_what_was_measured_is_read_again(tmp_path):
     running = Running(fake_settings(tmp_path))
-    with Client(running.url, patience=20) as sdk:
+    with Client(running.url, patience=HANG_S) as sdk:
         id = sdk.create_scene(make_rig(), frames_per_second=10).id
         push(sdk, id, range(4))
         before = sdk.tradeoff(id)
     running.stop()
     running = Running(fake_settings(tmp_path))
     try:
-        with Client(running.url, patience=20) as sdk:
+        with Client(running.url, patience=HANG_S) as sdk:
             assert sdk.tradeoff(id) == before
             assert sdk.tradeoff(id) == before
     finally:

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from running import Running, fake_settings, picture, pictures, problem
 from sending import FRAMED, create, framed, put_form, put_framed, wait_for
+from waiting import HANG_S
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
@@ -28,7 +29,6 @@ from server.siblings.passing import PassOn
 from server.siblings.siblings import Siblings
 
 TOKEN = "the token of all services 0123456789".replace(" ", "-")
-PATIENCE_S = 60
 NOBODYS = "0123456789ab"
 HEADERS = {"Authorization": f"Bearer {TOKEN}"}
 
@@ -55,7 +55,7 @@ def services(request, tmp_path_factory):
         made.append(Running(settings, placement=Together))
     RUNNING[:] = made
     headers = HEADERS if request.param else {}
-    clients = [httpx.Client(base_url=one.url, timeout=60, headers=headers) for one in made]
+    clients = [httpx.Client(base_url=one.url, timeout=HANG_S, headers=headers) for one in made]
     yield clients, request.param
     for client in clients:
         client.close()
@@ -76,7 +76,7 @@ def other(services):
     id = create(first, queue_frames=20)
     for index in range(2):
         assert put_framed(second, id, index, pictures(index)).status_code == 202
-    wait_for(lambda: second.get(f"/v1/scenes/{id}").json()["committed"] == 2, PATIENCE_S)
+    wait_for(lambda: second.get(f"/v1/scenes/{id}").json()["committed"] == 2)
     yield second, id
     second.delete(f"/v1/scenes/{id}")
 
@@ -110,7 +110,7 @@ def test_every_way_to_send_frames(services, other):
         assert sent.status_code in (200, 202), sent.text
     chunks = (part for part in [framed(4)[:50], framed(4)[50:]])  # without a length
     assert second.put(f"/v1/scenes/{id}/frames/4", content=chunks, headers=FRAMED).status_code == 202
-    wait_for(lambda: second.get(f"/v1/scenes/{id}").json()["committed"] == 5, PATIENCE_S)
+    wait_for(lambda: second.get(f"/v1/scenes/{id}").json()["committed"] == 5)
 
 
 def test_refusals_are_those_of_the_service_that_has_the_scene(services, other):
@@ -152,7 +152,7 @@ def test_the_cluster_is_told_with_the_scenes_of_every_service(services, other):
     assert told[1]["nodes"][0]["cpus_taken"] >= own[0]["cpus_taken"] + own[1]["cpus_taken"] >= 1
     GONE.append("http://127.0.0.1:9")
     try:
-        wait_for(lambda: "x-unreachable" in second.get("/v1/cluster").headers, PATIENCE_S)
+        wait_for(lambda: "x-unreachable" in second.get("/v1/cluster").headers)
     finally:
         GONE.clear()
 
@@ -165,7 +165,7 @@ def test_streams_and_ingest_by_websocket(services, other):
     with connect(f"{url}/v1/scenes/{id}/ingest", additional_headers=headers) as socket:
         socket.send(framed(2, pictures(2)))
         assert '"status":202' in socket.recv().replace(" ", "")
-    with Client(str(second.base_url).rstrip("/"), token=token, patience=20) as sdk:
+    with Client(str(second.base_url).rstrip("/"), token=token, patience=HANG_S) as sdk:
         sdk.wait(id, 2)
         image = sdk.render(id, "c0", 2)
     assert image.shape[2] == 3
@@ -176,21 +176,17 @@ def test_streams_and_ingest_by_websocket(services, other):
     with connect(f"{url}/v1/scenes/{id}/stream", subprotocols=offered) as socket:
         assert socket.subprotocol == STREAM_PROTOCOL
         socket.send(json.dumps({"type": "subscribe", "id": "f", "topic": "frames"}))
-        assert [json.loads(socket.recv(timeout=30))["type"] for _ in range(2)] == ["hello", "subscribed"]
+        assert [json.loads(socket.recv(timeout=HANG_S))["type"] for _ in range(2)] == ["hello", "subscribed"]
         asked = {"camera": "c0", "kinds": ["colour"], "format": "png"}
         socket.send(json.dumps({"type": "subscribe", "id": "v", "topic": "render", "request": asked}))
         assert put_framed(second, id, 3, pictures(3)).status_code == 202
         found = []
-        wait_for(
-            lambda: found.append(socket.recv(timeout=30)) or any('"committed"' in str(one) for one in found), PATIENCE_S
-        )
-        wait_for(
-            lambda: found.append(socket.recv(timeout=30)) or any(isinstance(one, bytes) for one in found), PATIENCE_S
-        )
+        wait_for(lambda: found.append(socket.recv(timeout=HANG_S)) or any('"committed"' in str(one) for one in found))
+        wait_for(lambda: found.append(socket.recv(timeout=HANG_S)) or any(isinstance(one, bytes) for one in found))
         second.delete(f"/v1/scenes/{id}")
         with contextlib.suppress(ConnectionClosed):
             for _ in range(50):
-                socket.recv(timeout=30)
+                socket.recv(timeout=HANG_S)
         assert socket.close_code == 4404, (socket.close_code, socket.close_reason)
 
 
@@ -437,7 +433,7 @@ def test_known_siblings_are_asked_while_the_head_of_the_cluster_does_not_answer(
         assert await siblings.owner("x") == "http://other"
         head.clear()
         for _ in range(3):
-            assert await asyncio.wait_for(siblings.owner("x"), 1) == "http://other"
+            assert await asyncio.wait_for(siblings.owner("x"), HANG_S) == "http://other"
             await asyncio.sleep(0)
         await siblings.close()
 
@@ -520,10 +516,10 @@ def test_a_client_that_hangs_up_is_noticed(services, fresh):
     slow = Slow()
     GONE.append(slow.url)
     try:
-        wait_for(lambda: second.get("/v1/scenes/abcdefabcdef").status_code == 200, PATIENCE_S)
+        wait_for(lambda: second.get("/v1/scenes/abcdefabcdef").status_code == 200)
         with second.stream("GET", "/v1/scenes/abcdefabcdef/render") as answer:
             next(answer.iter_raw())
-        assert slow.cut.wait(20)
+        assert slow.cut.wait(HANG_S)
         assert slow.given < 1_500
     finally:
         GONE.clear()

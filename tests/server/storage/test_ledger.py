@@ -153,6 +153,7 @@ def test_every_field_of_a_commit_reaches_the_wire_or_is_named_as_left_out():
         assert set(core.__annotations__) == set(wire.model_fields)
 
 
+@pytest.mark.slow
 def test_a_day_of_frames_fits_in_memory():
     count, most = 50_000, 128  # bytes a frame, while their pictures and states are deleted behind them
     tracemalloc.start()

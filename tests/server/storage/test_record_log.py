@@ -108,6 +108,7 @@ def test_a_journal_comes_back_and_goes_on(tmp_path):
     assert read_journal(path).events == [*FACTS, FACTS[1]]
 
 
+@pytest.mark.slow
 def test_a_journal_cut_at_every_byte_starts_and_says_what_it_dropped(tmp_path):
     path = tmp_path / "journal.log"
     write_journal(path, *FACTS)

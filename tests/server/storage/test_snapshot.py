@@ -10,6 +10,7 @@ import threading
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from waiting import HANG_S
 
 from client.wire import Budget, FileKind, FrameState, ReconstructionRequest
 from server.storage.events import (
@@ -249,7 +250,7 @@ def test_an_event_that_comes_while_a_renewal_fails_is_not_forgotten(tmp_path, mo
 
         def slow(*_):
             loop.call_soon_threadsafe(began.set)
-            go.wait(10)
+            go.wait(HANG_S)
             no_space()
 
         monkeypatch.setattr(journal, "_replace", slow)
@@ -259,7 +260,7 @@ def test_an_event_that_comes_while_a_renewal_fails_is_not_forgotten(tmp_path, mo
         await asyncio.sleep(0)
         go.set()
         # There is no room for a journal anew, and the file is in its place: the event goes behind what is there.
-        await asyncio.wait_for(appended, 10)
+        await asyncio.wait_for(appended, HANG_S)
         await journal.close()
 
     asyncio.run(job())
@@ -276,7 +277,7 @@ def test_whoever_waits_for_a_renewal_that_breaks_is_told(tmp_path, monkeypatch):
         monkeypatch.setattr(journal, "_replace", broken)
         (tmp_path / "journal.log").unlink()
         with pytest.raises(ValueError, match="cannot be written"):
-            await asyncio.wait_for(journal.append(FrameMissing(index=0, reason="r")), 10)
+            await asyncio.wait_for(journal.append(FrameMissing(index=0, reason="r")), HANG_S)
         await journal.close()
 
     asyncio.run(job())

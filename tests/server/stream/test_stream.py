@@ -5,14 +5,13 @@ import json
 import numpy as np
 import pytest
 from running import HEIGHT, WIDTH, make_rig, pictures
+from waiting import HANG_S
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from client.errors import InvalidRequest, NotFound
 from client.stream import Stream, TracksEvent, ViewEvent, finished_frames, parts, scene_changes, tracks, view
 from client.wire.stream import MAGIC, STREAM_PROTOCOL, BulkHead, FrameMessage, SceneMessage, pack, unpack
-
-PATIENCE_S = 30
 
 
 @pytest.fixture
@@ -36,7 +35,7 @@ def until(stream, wanted):
     """Events up to and with the first that is wanted."""
     events = []
     while not (events and wanted(events[-1])):
-        events.append(stream.receive(PATIENCE_S))
+        events.append(stream.receive(HANG_S))
         assert events[-1] is not None
     return events
 
@@ -132,31 +131,31 @@ def test_parts_come_every_so_many_frames(sdk, scene, stream):
 
 def test_nothing_comes_after_unsubscribing(sdk, scene, service):
     with raw(service, scene) as socket:
-        assert json.loads(socket.recv(PATIENCE_S))["type"] == "hello"
+        assert json.loads(socket.recv(timeout=HANG_S))["type"] == "hello"
         for id in ("a", "b"):
             socket.send(json.dumps({"type": "subscribe", "id": id, "topic": "frames"}))
         socket.send(json.dumps({"type": "unsubscribe", "id": "a"}))
-        replies = [json.loads(socket.recv(PATIENCE_S)) for _ in range(3)]
+        replies = [json.loads(socket.recv(timeout=HANG_S)) for _ in range(3)]
         assert [(r["type"], r["id"]) for r in replies] == [
             ("subscribed", "a"),
             ("subscribed", "b"),
             ("unsubscribed", "a"),
         ]
         push(sdk, scene, [0])
-        assert json.loads(socket.recv(PATIENCE_S))["id"] == "b"
+        assert json.loads(socket.recv(timeout=HANG_S))["id"] == "b"
 
 
 def test_a_deleted_scene_ends_its_streams(sdk, service):
     scene = sdk.create_scene(make_rig()).id
     with Stream(service.url, scene) as stream, raw(service, scene) as socket:
         stream.subscribe("s", scene_changes())
-        assert stream.receive(PATIENCE_S).status.id == scene
+        assert stream.receive(HANG_S).status.id == scene
         sdk.delete_scene(scene)
         assert list(stream) == []
-        socket.recv(PATIENCE_S)
-        assert json.loads(socket.recv(PATIENCE_S))["type"] == "gone"
+        socket.recv(timeout=HANG_S)
+        assert json.loads(socket.recv(timeout=HANG_S))["type"] == "gone"
         with pytest.raises(ConnectionClosed) as closed:
-            socket.recv(PATIENCE_S)
+            socket.recv(timeout=HANG_S)
         assert closed.value.rcvd.code == 4404
 
 
@@ -181,55 +180,55 @@ MESSAGES = [
 @pytest.mark.parametrize(("message", "field"), MESSAGES)
 def test_a_bad_message_is_answered_by_name_and_changes_nothing(service, scene, message, field):
     with raw(service, scene) as socket:
-        socket.recv(PATIENCE_S)
+        socket.recv(timeout=HANG_S)
         for id, topic, request in (("scene", "scene", {}), ("view", "render", {"camera": "c0"})):
             socket.send(json.dumps({"type": "subscribe", "id": id, "topic": topic, "request": request}))
         for _ in range(3):
-            socket.recv(PATIENCE_S)
+            socket.recv(timeout=HANG_S)
         socket.send(message)
-        error = json.loads(socket.recv(PATIENCE_S))
+        error = json.loads(socket.recv(timeout=HANG_S))
         assert error["type"] == "error"
         assert field in error["problem"]["field"]
         assert error["problem"]["remedy"]
         assert 400 <= error["problem"]["status"] < 500
         socket.send(json.dumps({"type": "unsubscribe", "id": "view"}))
-        assert json.loads(socket.recv(PATIENCE_S)) == {"type": "unsubscribed", "id": "view"}
+        assert json.loads(socket.recv(timeout=HANG_S)) == {"type": "unsubscribed", "id": "view"}
 
 
 def test_what_cannot_be_rendered_is_an_error_of_its_subscription(sdk, scene, stream):
     push(sdk, scene, [0])
     stream.subscribe("v", view("c7"), tag=1)
     with pytest.raises(InvalidRequest, match="c7"):
-        stream.receive(PATIENCE_S)
+        stream.receive(HANG_S)
     stream.update("v", camera="c0", frame=9, tag=2)
     with pytest.raises(NotFound, match="frame 9"):
-        stream.receive(PATIENCE_S)
+        stream.receive(HANG_S)
     stream.subscribe("t", tracks(ids=[99]))  # only the reader knows
     with pytest.raises(InvalidRequest, match="99"):
-        stream.receive(PATIENCE_S)
+        stream.receive(HANG_S)
     stream.update("v", frame=0, format="png", tag=3)
     assert until(stream, lambda e: e.tag == 3)[-1].frame == 0
 
 
 def test_a_message_that_is_too_large_ends_the_stream(service, scene):
     with raw(service, scene) as socket:
-        limit = json.loads(socket.recv(PATIENCE_S))["limits"]["message_bytes"]
+        limit = json.loads(socket.recv(timeout=HANG_S))["limits"]["message_bytes"]
         socket.send(json.dumps({"type": "subscribe", "id": "x" * limit, "topic": "scene"}))
         with pytest.raises(ConnectionClosed) as closed:
-            socket.recv(PATIENCE_S)
+            socket.recv(timeout=HANG_S)
         assert closed.value.rcvd.code == 1009
 
 
 def test_subscriptions_of_one_client_are_bounded(service, scene):
     with raw(service, scene) as socket:
-        limit = json.loads(socket.recv(PATIENCE_S))["limits"]["subscriptions"]
+        limit = json.loads(socket.recv(timeout=HANG_S))["limits"]["subscriptions"]
         for number in range(limit + 1):
             socket.send(json.dumps({"type": "subscribe", "id": str(number), "topic": "frames"}))
-        replies = [json.loads(socket.recv(PATIENCE_S)) for _ in range(limit + 1)]
+        replies = [json.loads(socket.recv(timeout=HANG_S)) for _ in range(limit + 1)]
         assert [reply["type"] for reply in replies] == ["subscribed"] * limit + ["error"]
         assert replies[-1]["problem"]["status"] == 429
         socket.send(json.dumps({"type": "subscribe", "id": "0", "topic": "scene"}))  # in the place of the one before
-        assert json.loads(socket.recv(PATIENCE_S)) == {"type": "subscribed", "id": "0"}
+        assert json.loads(socket.recv(timeout=HANG_S)) == {"type": "subscribed", "id": "0"}
 
 
 def test_the_handshake_is_refused_with_a_reason(service, scene):

@@ -9,6 +9,7 @@ from unittest import mock
 
 import pytest
 from running import WIDTH, make_rig, pictures
+from waiting import HANG_S
 from websockets.asyncio.client import connect
 
 from client.wire import CameraModel, RenderRequest
@@ -27,7 +28,7 @@ LARGE = {"width": 600, "height": 600}
 
 
 def run(test):
-    asyncio.run(asyncio.wait_for(test, 120))
+    asyncio.run(asyncio.wait_for(test, HANG_S))
 
 
 async def settle():
@@ -258,7 +259,7 @@ def test_a_hundred_subscribers_of_which_one_never_reads(service, sdk, scene):
         """Reads until both the report and the picture of a new frame are there."""
         before = (len(reports), len(views))
         while len(reports) == before[0] or len(views) == before[1]:
-            message = await asyncio.wait_for(socket.recv(), 60)
+            message = await asyncio.wait_for(socket.recv(), HANG_S)
             if isinstance(message, bytes):
                 views.append(unpack(message)[0])
             elif (told := json.loads(message))["type"] == "frame":
@@ -279,7 +280,7 @@ def test_a_hundred_subscribers_of_which_one_never_reads(service, sdk, scene):
         assert 3 * FRAMES < service.app.state.hub._channels[scene].queries.asked <= 4 * FRAMES
         newest = {}
         while newest.get("f", (0, 0))[0] < FRAMES - 1 or newest.get("v", (0, 0))[0] < FRAMES - 1:
-            message = await asyncio.wait_for(sleeper.recv(), 60)
+            message = await asyncio.wait_for(sleeper.recv(), HANG_S)
             if isinstance(message, bytes):
                 head = unpack(message)[0]
                 newest["v"] = (head.frame, newest.get("v", (0, 0))[1] + head.missed)

@@ -29,6 +29,7 @@ from studies.frontier.tradeoff import (
     spread,
     undominated,
 )
+from studies.quality import first_frame
 from studies.quality.first_frame import first_frame_key, save_first_frame
 
 FRAMES = 4
@@ -116,7 +117,7 @@ def test_only_what_is_missing_is_measured_the_cheapest_first(tmp_path, monkeypat
     assert lines == ["8 rows, 1 of them measured already"]
 
 
-def test_a_row_with_another_constant_is_another_row():
+def test_a_varied_constant_is_another_row():
     (varied,) = AXES["max-scale"]
     assert varied.record["constants"] == {"scas4d_core.engines.plan.MAX_SCALE": 2.0}
     rows = [made_row(DEFAULT, "robot", 5), made_row(varied, "robot", 5)]
@@ -271,7 +272,7 @@ def test_settings_are_timed_in_turns_and_the_first_round_does_not_count(box_capt
     short, long = Variant("short", iterations=10), Variant("long", iterations=1000)
     paces = {short.settings.update.iterations: 1.0, long.settings.update.iterations: 3.0}
     monkeypatch.setattr(
-        timing,
+        first_frame,
         "started",
         lambda capture, settings, out: Paced(settings.update.iterations, paces[settings.update.iterations]),
     )
@@ -306,7 +307,7 @@ def test_watching_an_update_does_not_change_it(box_capture, with_frame_0):
     assert drawn["iterations"] == [0, 1, 2, 4, 7, 10, 12]
     assert drawn["psnr"][-1] > drawn["psnr"][0] + 1
     capture = open_capture(box_capture)
-    unwatched = timing.started(capture, convergence.once(short.settings), with_frame_0)
+    unwatched = first_frame.started(capture, convergence.once(short.settings), with_frame_0)
     ends = []
     for index in (1, 2):
         unwatched.step(capture.frame(index))

@@ -20,9 +20,8 @@ def test_holds(case: HardCase, size: object) -> None:
     assert run.run_case(case, size, run.backends()).violations == []
 
 
-def test_there_are_sixty_cases_with_names_of_their_own() -> None:
+def test_cases_have_names_of_their_own() -> None:
     names = [case.name for case in run.CASES]
-    assert len(names) >= 60
     assert len(set(names)) == len(names)
 
 

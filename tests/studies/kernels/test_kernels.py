@@ -134,5 +134,3 @@ def test_too_short_a_run_is_refused(tmp_path):
 
     with pytest.raises(ValueError, match="frames is 2; give at least 3"):
         kernels.study(tmp_path, settings_of("scas4d"), tmp_path, frames=2)
-    with pytest.raises(ValueError, match="device is 'cuda'"):
-        kernels.study(tmp_path, settings_of("scas4d", device="cuda"), tmp_path)

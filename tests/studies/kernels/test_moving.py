@@ -9,7 +9,7 @@ import pytest
 
 from scas4d_core.settings import Settings
 from studies.kernels import moving
-from studies.scale.footage import Size
+from studies.synthetic.wall import Size
 
 
 @pytest.mark.parametrize("share", [0.05, 0.2, 1.0])

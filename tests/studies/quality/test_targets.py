@@ -153,16 +153,6 @@ def test_only_rows_of_todays_settings_count_and_the_longest_of_them(tmp_path):
     assert left_out(tmp_path, found) == 3
 
 
-def test_a_setting_that_came_later_makes_no_row_stale(tmp_path):
-    row = made_row("scas4d", "robot", [36.0, 30.0])
-    del row["settings"]["static"]["stop_gain"]
-    Store(tmp_path).put(row)
-    assert ("scas4d", "robot") in measured_runs(Store(tmp_path))
-    row["settings"]["static"]["stop_gain"] = 0.01
-    Store(tmp_path).put(row)
-    assert not measured_runs(Store(tmp_path))
-
-
 def test_runs_differ_in_what_they_say_they_do(tmp_path):
     jobs = {name: run.job(tmp_path / "robot") for name, run in RUNS.items() if "robot" in run.captures}
     assert len({job.key for job in jobs.values()}) == len(jobs)

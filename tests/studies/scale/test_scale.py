@@ -10,7 +10,7 @@ import pytest
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from studies.scale import scale
-from studies.scale.footage import Size, known, rig, shown, wall
+from studies.synthetic.wall import Size, known, rig, shown, wall
 
 TINY = Size(gaussians=400, width=32, height=24, cameras=3)
 

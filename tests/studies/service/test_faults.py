@@ -8,8 +8,8 @@ import fakes
 import pytest
 
 from scas4d_core.captures import open_capture
+from studies.running import study as of
 from studies.service import faults
-from studies.service import study as of
 from studies.service.beginnings import beginnings
 from studies.service.strangers import Attack, strangers
 

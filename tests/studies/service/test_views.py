@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
+import threading
 import time
 
 import pytest
 from running import make_rig, pictures
+from waiting import wait_for, wait_for_soon
 
 from client.sdk import Client
 from studies.service.views import Load, ViewTimes, table
@@ -23,26 +24,29 @@ def address(service):
 
 
 def test_views_are_asked_for_at_their_rate_and_timed(address):
-    with Load(address, ["c0", "c1"], 20.0, 12) as load:
-        time.sleep(1.0)
+    began, rate = time.perf_counter(), 20.0
+    with Load(address, ["c0", "c1"], rate, 12) as load:
+        wait_for(lambda: len(load.latencies) >= 10)
     assert load.refused == 0
-    assert 10 <= len(load.latencies) <= 40
+    assert len(load.latencies) <= rate * (time.perf_counter() - began) + 1
     assert all(latency > 0 for latency in load.latencies)
 
 
 def test_arrivals_do_not_wait_for_answers(address, service, monkeypatch):
-    """One second of views is asked for while nothing is answered; each counts from when it was due."""
+    """Views are asked for while nothing is answered; each counts from when it was due."""
     readers = service.app.state.scenes[address.rstrip("/").rsplit("/", 1)[1]].readers
     ask = readers.views.ask
-    opened = time.perf_counter() + 3.0
+    asked, opened = [], threading.Event()
 
     async def slow(query):
-        await asyncio.sleep(max(0.0, opened - time.perf_counter()))
+        asked.append(time.perf_counter())
+        await wait_for_soon(opened.is_set)
         return await ask(query)
 
     monkeypatch.setattr(readers.views, "ask", slow)
     with Load(address, ["c0"], 10.0, 12) as load:
-        time.sleep(2.0)
+        wait_for(lambda: len(asked) >= 8 and time.perf_counter() - asked[0] > 1)
+        opened.set()
     assert load.refused == 0
     assert len(load.latencies) >= 8
     assert max(load.latencies) > 1000
@@ -50,8 +54,7 @@ def test_arrivals_do_not_wait_for_answers(address, service, monkeypatch):
 
 def test_views_without_an_answer_are_counted(address):
     with Load(address, ["nobody"], 20.0, 12) as load:
-        time.sleep(0.5)
-    assert load.refused >= 5
+        wait_for(lambda: load.refused >= 5)
     assert load.latencies == []
 
 

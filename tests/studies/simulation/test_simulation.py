@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import threading
-import time
 
 import pytest
 
@@ -101,9 +100,7 @@ def test_the_clock_jumps() -> None:
         await asyncio.gather(wait(3600, "b"), wait(60, "a"), wait(86_400 * 3, "c"))
         return found
 
-    began = time.monotonic()
     assert run_virtual(main()) == [(60, "a"), (3600, "b"), (86_400 * 3, "c")]
-    assert time.monotonic() - began < 5
 
 
 def test_threads_of_the_clock_are_none() -> None:

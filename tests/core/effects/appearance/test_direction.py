@@ -69,6 +69,7 @@ def after(before: Gaussians, truth: Gaussians, effects: list[str]) -> tuple[Gaus
     return result.gaussians, EFFECT.evidence(Seen(1, before, result, rig(), views, CpuRenderer((0, 0, 0))))
 
 
+@pytest.mark.slow
 def test_a_glossy_ball_is_found_in_frame_0_and_a_dull_one_is_fitted_as_if_nobody_had_looked() -> None:
     glossy, dull = fitted(sphere(), "auto"), fitted(sphere(False), "auto")
     shares = [result.evidence["direction"].share for result in (glossy, dull) if result.evidence]
@@ -179,6 +180,7 @@ def test_what_is_seen_from_everywhere_is_colour_and_not_environment() -> None:
     assert (shading.environment[MIDDLE] == np.median(state.means, axis=0)).all()
 
 
+@pytest.mark.slow
 def test_highlights_stay_with_the_world_while_the_ball_turns() -> None:
     state = sphere().replace(colours=np.full((COUNT, 3), 0.3, np.float32))
     turn = Rotation.from_rotvec([0.1, 0.5, 0.2])

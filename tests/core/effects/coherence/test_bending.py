@@ -197,6 +197,7 @@ def followed(mode: str, frames: list[Gaussians]) -> Reconstruction:
     return scene
 
 
+@pytest.mark.slow
 def test_a_sheet_that_swings_switches_it_on_and_is_met_better() -> None:
     swings = [shown(height) for height in (0.04, 0.0, 0.04)]
     auto, off = followed("auto", swings), followed("off", swings)
@@ -210,6 +211,7 @@ def test_a_sheet_that_swings_switches_it_on_and_is_met_better() -> None:
     assert same(auto.history.newest.arrays(), again.history.newest.arrays())
 
 
+@pytest.mark.slow
 def test_a_sheet_that_turns_leaves_it_off_with_the_same_bits() -> None:
     turns = [shown(0.0, Rotation.from_rotvec([0.03 * index, 0.08 * index, 0])) for index in range(1, 3)]
     auto, off = followed("auto", turns), followed("off", turns)

@@ -20,6 +20,8 @@ from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 
+pytestmark = pytest.mark.slow
+
 FAULT_PX = 3.0
 
 

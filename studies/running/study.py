@@ -5,19 +5,21 @@ from __future__ import annotations
 import hashlib
 import shutil
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import httpx
 
+from client.rig.sequence import there_and_back
 from client.wire import FrameState
 from scas4d_core.captures import Capture
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.storage.history import History
 from server.storage.layout import DataFolder
-from studies.service.process import PATIENCE_S, Service, StudyError
+from studies.running.process import PATIENCE_S, Service, StudyError
 
 AGAIN_S = 0.05
 
@@ -54,16 +56,9 @@ class Study:
 
 def encoded_frames(capture: Capture, count: int) -> list[Files]:
     """So many frames of a capture; where it has fewer, it goes back and forth, so that the motion stays one."""
-    there = capture.frame_count
-    read: dict[int, Files] = {}
-    frames = []
-    for number in range(count):
-        turn = number % max(1, 2 * there - 2)
-        index = min(turn, 2 * there - 2 - turn) if there > 1 else 0
-        if index not in read:
-            read[index] = _files(capture, index)
-        frames.append(read[index])
-    return frames
+    indices = [there_and_back(number, capture.frame_count) for number in range(count)]
+    read = {index: _files(capture, index) for index in dict.fromkeys(indices)}
+    return [read[index] for index in indices]
 
 
 def _files(capture: Capture, index: int) -> Files:
@@ -98,6 +93,33 @@ def compare(found: Mapping[int, str], expected: Mapping[int, str], but: Sequence
         first = f"{found[others[0]]} in place of {expected[others[0]]}"
         faults.append(f"states {others} are not bit-identical: {first}")
     return faults
+
+
+class Updates:
+    """Frames of a capture that are sent to a scene, some at a time, back and forth as `encoded_frames` has them.
+
+    Attributes:
+        next: index of the frame that is sent next.
+    """
+
+    def __init__(self, service: Service, scene: str, frames: Sequence[Files]) -> None:
+        self._service, self._scene, self._frames = service, scene, frames
+        self.next = 0
+
+    def run(self, count: int) -> list[float]:
+        """Sends so many frames at once and waits until they are committed; seconds that each took."""
+        first = self.next
+        for index in range(first, first + count):
+            answer = self._service.put(self._scene, index, *self._frames[there_and_back(index, len(self._frames))])
+            if not answer.is_success:
+                raise StudyError(answer.text)
+        self.next += count
+        self._service.finish(self._scene, self.next)
+        reports = [self._service.frame(self._scene, index) for index in range(first, self.next)]
+        for report in reports:
+            if report.state != FrameState.COMMITTED:
+                raise StudyError(f"frame {report.index} was not committed: {report.error}")
+        return [report.seconds["total"] for report in reports]
 
 
 class FrameSender:
@@ -141,13 +163,27 @@ class FrameSender:
         return faults
 
 
-def undisturbed(study: Study) -> tuple[dict[int, str], float]:
-    """States of a run that nothing disturbs, and the seconds that an update took."""
-    service = study.service("undisturbed")
+@contextmanager
+def running(
+    study: Study, name: str, environment: Mapping[str, str] | None = None, **rules: Any
+) -> Iterator[tuple[Service, str, FrameSender]]:
+    """A service over a new folder, a scene of it, and its sender; the service ends with this.
+
+    Args:
+        environment: more of the service's. rules: of the scene, as in `Study.create`.
+    """
+    service = study.service(name, environment)
     service.start()
     try:
-        scene = study.create(service)
-        sender = FrameSender(study, service, scene)
+        scene = study.create(service, **rules)
+        yield service, scene, FrameSender(study, service, scene)
+    finally:
+        service.stop()
+
+
+def undisturbed(study: Study) -> tuple[dict[int, str], float]:
+    """States of a run that nothing disturbs, and the seconds that an update took."""
+    with running(study, "undisturbed") as (service, scene, sender):
         sender.send(0)
         service.finish(scene, 1)
         began = time.monotonic()
@@ -158,5 +194,3 @@ def undisturbed(study: Study) -> tuple[dict[int, str], float]:
         if faults := sender.check():
             raise StudyError(f"the undisturbed run: {'; '.join(faults)}")
         return digests(DataFolder(service.data).scene(scene).states), seconds
-    finally:
-        service.stop()

@@ -15,11 +15,13 @@ from typing import Any
 
 import httpx
 
+from client.calls import put_points
 from client.wire import FRAME_MEDIA_TYPE, FrameReportModel, RigModel, SceneStatus, frame_chunks
 from scas4d_core.cameras import Rig
+from scas4d_core.captures import InitialPoints
 from server.storage.layout import DataFolder
 
-START_S, PATIENCE_S = 120.0, 900.0
+START_S, PATIENCE_S = 600.0, 900.0
 EVERY_S = 0.05
 
 
@@ -112,6 +114,13 @@ class Service:
         if answer.status_code != 201:
             raise StudyError(answer.text)
         return str(answer.json()["id"])
+
+    def put_points(self, scene: str, points: InitialPoints) -> None:
+        """Sends the first cloud of a scene."""
+        call = put_points(scene, points)
+        answer = self.http.request(call.method, call.path, **call.arguments)
+        if not answer.is_success:
+            raise StudyError(answer.text)
 
     def put(self, scene: str, index: int, images: Mapping[str, bytes], masks: Mapping[str, bytes]) -> httpx.Response:
         """One try."""

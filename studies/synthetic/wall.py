@@ -10,7 +10,7 @@ from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures.frame import Frame
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
-from studies.kernels.synthetic import photograph
+from studies.synthetic.ball import photograph
 
 WIDTH_M, AWAY_M, BASELINE_M = 2.0, 3.0, 1.0
 """Of the wall; the cameras before it; from the first camera to the last."""

@@ -6,7 +6,7 @@ import io
 
 from rich.console import Console
 
-from client.cli.progress import Bars
+from client.progress import Bars
 
 
 def test_a_stage_that_is_over_has_a_full_bar_whatever_came_first():

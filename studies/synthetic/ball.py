@@ -14,19 +14,23 @@ SHIFT, TURN = np.array([0.015, 0.01, -0.01]), 0.05
 """Metres, and radians about the vertical, from the first frame to the second."""
 
 
-def rig(size: int) -> Rig:
-    """Six square cameras of ``size`` pixels that look at the origin, three above and three below; y is down."""
+def rig(size: int, count: int = 6, *, turned: float = 0.0, names: str = "c") -> Rig:
+    """Square cameras of ``size`` pixels that look at the origin, by turns above and below; y is down.
+
+    Args:
+        count: even, so that their mean is the origin. turned: radians, of all of them about the vertical.
+    """
     lens = np.array([[1.25 * size, 0, size / 2], [0, 1.25 * size, size / 2], [0, 0, 1]])
     cameras = []
-    for k in range(6):
-        angle = np.pi * k / 3
+    for k in range(count):
+        angle = turned + 2 * np.pi * k / count
         eye = np.array([1.3 * np.sin(angle), 0.45 * (-1) ** k, 1.3 * np.cos(angle)])
         z = -eye / np.linalg.norm(eye)
         x = np.cross([0, 1, 0], z) / np.linalg.norm(np.cross([0, 1, 0], z))
         pose = np.eye(4)
         pose[:3, :3] = [x, np.cross(z, x), z]
         pose[:3, 3] = -pose[:3, :3] @ eye
-        cameras.append(Camera(f"c{k}", lens, pose, size, size))
+        cameras.append(Camera(f"{names}{k}", lens, pose, size, size))
     return Rig(tuple(cameras))
 
 

@@ -13,10 +13,10 @@ import numpy as np
 from rich.console import Console
 
 from client.cli.evaluate import DEFAULT_OPTIONS, TRAINING, Report, page, peak_megabytes, save_comparisons, summary
-from client.cli.progress import Bars
 from client.cli.scores import Row, Store
 from client.exports.sources import Source, of_path
 from client.importers.open_source import CaptureOptions
+from client.progress import Bars
 from scas4d_core.captures import Capture
 from scas4d_core.errors import InputError
 from scas4d_core.gaussians import UNBORN, Gaussians

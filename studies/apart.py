@@ -1,0 +1,18 @@
+"""A measurement in a process of its own, so that its memory and its caches are not those of earlier work."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any
+
+
+def in_a_process(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Calls a function of a module in a fresh process; returns its result, or raises its exception.
+
+    Raises:
+        BrokenProcessPool: the process ended before it answered: out of memory, or killed.
+    """
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as apart:
+        return apart.submit(function, *arguments).result()
