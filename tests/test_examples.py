@@ -55,7 +55,7 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "scas4d_core.engines.exposure": ("exposure_of",),
     "scas4d_core.engines.limits": ("scene_limits",),
     "scas4d_core.engines.torch.rasterizer": ("render",),
-    "scas4d_core.frame_outcome": ("FrameOutcome", "degraded_text", "outcome_of"),
+    "scas4d_core.frame_outcome": ("FrameOutcome", "degraded_text"),
     "scas4d_core.presets": ("preset",),
     "scas4d_core.reconstruction": ("Reconstruction",),
     "scas4d_core.settings": ("SceneSettings", "StaticSettings", "UpdateSettings"),
