@@ -59,6 +59,14 @@ class Colours:
         total: Array = chosen[:, :3] + pull
         return total
 
+    def all_gradients(self, g_features: Array) -> Array:
+        """[N, 3] ``gradient`` of the last iteration, 0 for Gaussians that have no place in the table."""
+        if self._whole:
+            return self.gradient(g_features)
+        total = np.zeros_like(self._colours)
+        total[self._rows] = self.gradient(g_features)
+        return total
+
     def step(self, g_features: Array, factor: float) -> None:
         """Take a step; ``factor`` is on all rates."""
         self._adam.step(self.gradient(g_features), factor)

@@ -13,10 +13,10 @@ from scas4d_core.engines.cpu.changed_pixels import MOST, ChangedPixels
 from scas4d_core.engines.cpu.colours import Colours
 from scas4d_core.engines.cpu.deformation import CpuDeformation
 from scas4d_core.engines.cpu.floor import floor_term
-from scas4d_core.engines.cpu.gains import CameraGains
 from scas4d_core.engines.cpu.gloss import LearntGloss, features_seen, without_turn
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.engine import REPORT, AttemptStart, IterationLog, Rendered, StepScalars, Tables, Thinned
+from scas4d_core.engines.gains import CameraGains
 from scas4d_core.engines.plan import Structure, UpdatePlan
 from scas4d_core.engines.renderer import Gradients
 from scas4d_core.engines.views import TrainingView
@@ -117,6 +117,7 @@ class CpuEngine:
         self._features[:, :3] = self._colours
         lap("cascade")
         loss, gradients = self._pictures(views, step)
+        self._gradients = gradients
         loss += self._terms(gradients, step)
         lap("effects")
         length = self._plan.axis_length
@@ -261,6 +262,21 @@ class CpuEngine:
             raise ValueError("gains were not given to begin; the plan has to follow them (UpdatePlan.camera_gains)")
         self._gains.settle()
         return self._gains.gains.copy()
+
+    def gradients(self) -> dict[str, Array]:
+        """Gradients of the last iteration's loss, before its step, for tests: nothing may be rendered in between.
+
+        By table: "cluster 0" and so on [K, 10] and "deltas" [M, 9] in the columns of ``Tables``; where they are learnt,
+        "colours" [N, 3], "gloss" [M, 3] and "environment". Those of resting layers are not up to date.
+        """
+        deformation = self._deformation
+        tables = {f"cluster {layer}": g.copy() for layer, g in enumerate(deformation.cluster_gradients)}
+        tables["deltas"] = deformation.delta_gradients.copy()
+        if self._colour_table is not None:
+            tables["colours"] = self._colour_table.all_gradients(self._gradients.features)
+        if self._gloss is not None:
+            tables["gloss"], tables["environment"] = (gradient.copy() for gradient in self._gloss.gradients)
+        return tables
 
     def _forward(self) -> None:
         """Bring the deformed Gaussians up to date with the tables."""

@@ -93,7 +93,7 @@ class Shading:
         self.gloss, self.environment = gloss, environment
         self.changed_from, self._rates = gloss.copy(), rates
         self._turned = np.empty_like(gloss)
-        self._gradients = np.zeros_like(gloss), np.zeros_like(environment)
+        self.gradients = np.zeros_like(gloss), np.zeros_like(environment)
         self.moments = [np.zeros((2, *table.shape), np.float32) for table in (gloss, environment)]
         self._columns = np.array([rates[0]] * 3, np.float32)
         self._by_row = np.full(len(environment), rates[1], np.float32)
@@ -122,8 +122,11 @@ class Shading:
         g_environment = self._kernel.shade_backward(
             means, self.gloss, turns, colours, self.environment, camera.centre, g_features, self._turned
         )
-        self._gradients[0][:] += self._turned
-        self._gradients[1][:] += g_environment
+        if self._seen == 0:
+            for gradient in self.gradients:
+                gradient[:] = 0
+        self.gradients[0][:] += self._turned
+        self.gradients[1][:] += g_environment
         self._seen += 1
 
     def step(self, factor: float = 1.0) -> None:
@@ -134,12 +137,11 @@ class Shading:
         beta1, beta2 = np.float32(0.9), np.float32(0.999)
         ones = np.full(3, factor, np.float32)
         for table, gradient, moments, columns, by_row in (
-            (self.gloss, self._gradients[0], self.moments[0], self._columns * np.float32(factor), EVERY_ROW),
-            (self.environment, self._gradients[1], self.moments[1], ones, self._by_row),
+            (self.gloss, self.gradients[0], self.moments[0], self._columns * np.float32(factor), EVERY_ROW),
+            (self.environment, self.gradients[1], self.moments[1], ones, self._by_row),
         ):
             gradient /= np.float32(max(self._seen, 1))
             adam(table, gradient, moments[0], moments[1], columns, by_row, beta1, beta2, self._steps)
-            gradient[:] = 0
         self._seen = 0
         cells = self.environment[: self._kernel.CELLS]
         cells -= (self._cells[:, None] * cells).sum(axis=0)
@@ -219,6 +221,11 @@ class LearntGloss:
     def carry_back(self, means: Array, colours: Array, camera: CameraArrays, g_features: Array) -> None:
         """Turn gradients of features into those of colours, in place, and keep those of gloss and environment."""
         self._shading.saw(means, self._turns, colours, camera, g_features)
+
+    @property
+    def gradients(self) -> tuple[Array, Array]:
+        """Gradients of gloss and environment in the last step."""
+        return self._shading.gradients
 
     def step(self, factor: float, smooth: bool) -> None:
         """Step both; ``smooth`` averages the changes of the gloss over neighbours afterwards."""

@@ -1,12 +1,42 @@
-"""Colours of Gaussians as one camera sees them, in plain torch: the twin of ``kernels.appearance.direction``."""
+"""Colours of Gaussians as one camera sees them, in plain torch (kernel: ``kernels.appearance.direction``)."""
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from scas4d_core.engines.torch.deformation import quaternion_matrices
 from scas4d_core.kernels.appearance.direction import CELLS, DARK, DULL, FALL, MIDDLE, NEARNESS, OVER, SHEEN, SIDE
+
+RATES = (2e-3, 1e-2, 1e-3)
+"""Adam's, of gloss (``gloss_rate``), light and nearness in an update."""
+STRENGTH = 0.5
+"""Strength of the gloss for which the rate of the gloss is given."""
+SMOOTH_OVER = 16
+"""Neighbours over which changes of the gloss are averaged."""
+SAME_SIDE = 0.5
+"""Cosine between normals above which neighbours are of one surface."""
+
+
+def gloss_rate(rate: float, gloss: NDArray[np.floating]) -> float:
+    """The rate of a gloss [M, 3] that turns its normals as fast as ``rate`` those of a strength of ``STRENGTH``."""
+    strengths = np.linalg.norm(gloss.astype(np.float64), axis=1)
+    return float(rate * np.square(strengths).sum() / max(strengths.sum(), 1e-9) / STRENGTH)
+
+
+def cell_shares() -> Tensor:
+    """[CELLS] share of the sphere of each cell of the octahedral map; they sum to 1."""
+    line = torch.linspace(-1, 1, SIDE, dtype=torch.float64)
+    v, u = torch.meshgrid(line, line, indexing="ij")
+    z = 1 - u.abs() - v.abs()
+    x = torch.where(z < 0, (1 - v.abs()) * u.sign(), u)
+    y = torch.where(z < 0, (1 - u.abs()) * v.sign(), v)
+    area = (x * x + y * y + z * z) ** -1.5  # of the sphere behind a piece of the map
+    area[[0, -1]] /= 2  # rows at the rim are half cells
+    area[:, [0, -1]] /= 2
+    return (area / area.sum()).flatten()
 
 
 def shade(means: Tensor, gloss: Tensor, turns: Tensor, colours: Tensor, environment: Tensor, centre: Tensor) -> Tensor:

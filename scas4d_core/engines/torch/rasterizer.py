@@ -1,4 +1,4 @@
-"""The rasterizer in plain torch: dense, slow, exact; every other backend is tested against it in float64.
+"""The rasterizer in plain torch: dense, slow, exact; every other engine is tested against it in float64.
 
 Projection is EWA splatting (Zwicker et al. 2001) in the form of 3D Gaussian Splatting (Kerbl et al. 2023), with the
 Jacobian's clamping of gsplat. Camera axes are OpenCV's; the centre of pixel (column i, row j) is (i + 0.5, j + 0.5).
@@ -15,6 +15,7 @@ from torch.utils.checkpoint import checkpoint
 
 from scas4d_core.cameras import Camera
 from scas4d_core.engines.limits import DEFAULT, Limits
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.guards import FEATURE_CEILING, NOT_FINITE
 
 PAIRS_AT_ONCE = 4_000_000
@@ -47,6 +48,13 @@ class CameraParams(NamedTuple):
         translation = torch.tensor(camera.translation, dtype=dtype, device=device)
         fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
         return cls(rotation, translation, fx, fy, cx, cy, camera.width, camera.height)
+
+    @classmethod
+    def of_arrays(cls, camera: CameraArrays) -> CameraParams:
+        """The numbers of a camera as kernels read it, in float64."""
+        pose = torch.as_tensor(camera.pose, dtype=torch.float64)
+        fx, fy, cx, cy = camera.lens[:4].astype(float).tolist()
+        return cls(pose[:, :3], pose[:, 3], fx, fy, cx, cy, camera.width, camera.height)
 
     def depths(self, means: Tensor) -> Tensor:
         """[N] metres along the camera's z axis of points [N, 3]; append it to the features to render depth."""

@@ -1,0 +1,281 @@
+"""The reference engine: one iteration of an update in torch, in the order of algorithm 1."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from scas4d_core.engines.engine import AttemptStart, IterationLog, Rendered, StepScalars, Tables, Thinned
+from scas4d_core.engines.gains import CameraGains
+from scas4d_core.engines.plan import MAX_SCALE, Structure, UpdatePlan
+from scas4d_core.engines.torch import losses
+from scas4d_core.engines.torch.gloss import RATES, SAME_SIDE, SMOOTH_OVER, cell_shares, gloss_rate
+from scas4d_core.engines.torch.parameters import GlossParameters, Parameters, leaf
+from scas4d_core.engines.torch.rasterizer import CameraParams, render
+from scas4d_core.engines.torch.renderer import TorchRenderer
+from scas4d_core.engines.torch.scene import Moved, Scene
+from scas4d_core.engines.views import LABEL, TrainingView
+from scas4d_core.gaussians import Gaussians
+from scas4d_core.kernels.appearance.direction import CELLS, MIDDLE, NEARNESS
+
+Array = NDArray[np.float32]
+
+
+class TorchEngine:
+    """The ``UpdateEngine`` of the tests: float64, autograd, every effect.
+
+    Attributes:
+        renderer: draws states with the background and limits of the plan.
+    """
+
+    name = "torch"
+    renderer: TorchRenderer
+
+    def bind(self, plan: UpdatePlan, structure: Structure) -> None:
+        """See ``UpdateEngine.bind``; this engine does all that a plan can ask for."""
+        self._plan, self._structure = plan, structure
+        self.renderer = TorchRenderer(plan.background, plan.limits)
+        self._camera_rows = {name: row for row, name in enumerate(plan.cameras)}
+        self._views: list[TrainingView] = []
+        self._probes: list[TrainingView] = []
+
+    def load_views(self, views: Sequence[TrainingView], probes: Sequence[TrainingView]) -> None:
+        """See ``UpdateEngine.load_views``."""
+        exposures = {view.name: view.exposure.copy() for view in views}
+        self._views = [replace(view, exposure=exposures[view.name]) for view in views]
+        self._probes = [replace(view, exposure=exposures[view.name]) for view in probes]
+
+    def load_state(self, previous: Gaussians) -> None:
+        """See ``UpdateEngine.load_state``."""
+        self._scene = scene = Scene(self._plan, self._structure, previous)
+        still = Tables.still(self._structure.hierarchy)
+        self._parameters = Parameters(
+            [],
+            None,
+            scene.colours[scene.rows].clone(),
+            scene.colours[scene.standing].clone(),  # type: ignore[arg-type]
+        )
+        self._parameters.set_tables(still)
+        self._gains: CameraGains | None = None
+        self._smoothing: tuple[Tensor, Tensor] | None = None
+        self._log, self._gradients = IterationLog(), dict[str, Array]()
+
+    def set_tables(self, tables: Tables) -> None:
+        """See ``UpdateEngine.set_tables``."""
+        self._parameters.set_tables(tables)
+
+    def begin(self, start: AttemptStart) -> None:
+        """See ``UpdateEngine.begin``."""
+        self._start, self._log, previous = start, IterationLog(), self._scene.previous
+        if self._plan.gloss and previous.gloss is not None and previous.environment is not None:
+            rate, environment = gloss_rate(RATES[0], previous.gloss), leaf(previous.environment)
+            self._parameters.gloss = GlossParameters(
+                leaf(previous.gloss), environment[:MIDDLE].clone(), environment[NEARNESS:].clone(),
+                environment[MIDDLE:NEARNESS].clone(), (rate, *RATES[1:]),
+            )  # fmt: skip
+        if start.gains is not None:
+            self._gains = CameraGains(start.gains, self._camera_rows, self._views)
+        self._parameters.free(start)
+
+    def iterate(self, views: Sequence[int], step: StepScalars) -> None:
+        """See ``UpdateEngine.iterate``."""
+        for parameter in self._named().values():
+            parameter.grad = None
+        moved = self._scene.moved(self._parameters)
+        colours = self._scene.all_colours(self._parameters)
+        pictures = [self._picture(index, moved, colours, step) for index in views]
+        loss = torch.stack(pictures).mean() + self._terms(moved, colours, step)
+        loss.backward()  # type: ignore[no-untyped-call]
+        self._gradients = {
+            name: (torch.zeros_like(parameter) if parameter.grad is None else parameter.grad).numpy().copy()
+            for name, parameter in self._named().items()
+        }
+        self._parameters.step(step)
+        self._settle_gloss(step)
+        self._log.losses.append(float(loss.detach()))
+
+    def _picture(self, index: int, moved: Moved, colours: Tensor, step: StepScalars) -> Tensor:
+        """Image and mask loss of a view; the log takes how well it was met."""
+        view, plan, learnt = self._views[index], self._plan, self._parameters.gloss
+        gloss, environment = (None, None) if learnt is None else (learnt.gloss, learnt.environment)
+        features = self._scene.seen(moved, colours, gloss, environment, view.camera)
+        planes, alpha = self._rendered(view, moved, features)
+        gain, offset = leaf(view.exposure[:3, 0]), leaf(view.exposure[:3, 1])
+        shown, target = planes[..., :LABEL] * gain + offset, leaf(view.target).permute(1, 2, 0)
+        loss = plan.image * losses.image_loss(shown, target[..., :LABEL])
+        if plan.mask > 0 and len(view.target) > LABEL:
+            loss = loss + plan.mask * losses.image_loss(planes[..., LABEL:], target[..., LABEL:])
+        picture = planes.detach().permute(2, 0, 1).float().numpy()
+        if self._gains is not None:
+            self._gains.saw(view, picture[:LABEL])
+            gain, offset = leaf(view.exposure[:3, 0]), leaf(view.exposure[:3, 1])
+        psnr = float(losses.psnr(shown.detach(), target[..., :LABEL]))
+        mean = planes.detach()[..., :LABEL].mean(dim=(0, 1)) * gain + offset
+        red, green, blue = (view.mean - mean.numpy()).tolist()
+        self._log.rendered.append(Rendered(index, psnr, (red, green, blue)))
+        if step.keep_pictures:
+            self._log.keep(index, Thinned.of(picture, (1 - alpha.detach()).float().numpy()))
+        return loss
+
+    def _rendered(self, view: TrainingView, moved: Moved, features: Tensor) -> tuple[Tensor, Tensor]:
+        """[H, W, 4] and [H, W]: the view without exposure, and its alpha."""
+        background = leaf([*self._plan.background, 0.0])
+        camera = CameraParams.of_arrays(view.camera)
+        given = (moved.means, moved.factors, self._scene.opacities, features, camera, background, self._plan.limits)
+        picture = render(*given)
+        return picture.features, picture.alpha
+
+    def _terms(self, moved: Moved, colours: Tensor, step: StepScalars) -> Tensor:
+        """The weighted terms beside those of pictures."""
+        plan, scene = self._plan, self._scene
+        sound = scene.rows[scene.sound]
+        share = len(sound) / max(len(scene.rows), 1)  # means are over all moving Gaussians
+        terms = [torch.zeros((), dtype=torch.float64)]
+        if plan.neighbour_terms and self._structure.neighbours is not None and len(sound):
+            terms += self._neighbour_terms(moved, step)
+        if plan.axis_length > 0 and len(sound):
+            lengths = scene.first_lengths[scene.sound]
+            terms.append(plan.axis_length * share * losses.scale_loss(moved.factors[sound], lengths, MAX_SCALE))
+        if plan.floor is not None and len(sound):
+            terms.append(plan.floor_weight * share * losses.floor_loss(moved.means[sound], plan.floor))
+        if plan.colours is not None:
+            terms.append(plan.soft_colour * losses.soft_colour_loss(colours, scene.colours))
+        return torch.stack(terms).sum()
+
+    def _neighbour_terms(self, moved: Moved, step: StepScalars) -> list[Tensor]:
+        plan, scene = self._plan, self._scene
+        middle = scene.means[scene.rows[scene.sound]].mean(dim=0)  # stands in for what is held back, at weight 0
+        now, before = (
+            torch.where(scene.sound[:, None], means[scene.rows], middle) for means in (moved.means, scene.means)
+        )
+        graph = scene.neighbours, scene.pair_weights, torch.as_tensor(self._start.samples[step.sample])
+        terms = []
+        if step.rigidity > 0:
+            terms.append(step.rigidity * losses.rigidity_loss(now, moved.turns, before, *graph))
+        if plan.isometry > 0:
+            terms.append(plan.isometry * losses.isometry_loss(now, scene.distances, *graph))
+        if plan.rotation > 0:
+            terms.append(plan.rotation * losses.rotation_loss(moved.turns, *graph))
+        return terms
+
+    @torch.no_grad()
+    def _settle_gloss(self, step: StepScalars) -> None:
+        """After a step: the environment sums to nothing over the sphere, nearness is not negative, changes smooth."""
+        learnt = self._parameters.gloss
+        if learnt is None:
+            return
+        cells = learnt.light[:CELLS]
+        cells -= (cell_shares()[:, None] * cells).sum(dim=0)
+        learnt.nearness.clamp_(min=0)
+        if step.smooth_gloss:
+            before = leaf(self._scene.previous.gloss)
+            index, weights = self._neighbours_on_surface(learnt.gloss)
+            learnt.gloss.copy_(before + (weights[..., None] * (learnt.gloss - before)[index]).sum(dim=1))
+
+    def _neighbours_on_surface(self, gloss: Tensor) -> tuple[Tensor, Tensor]:
+        """[M, k] neighbours in frame 0 and their weights: those on the same side of a surface count alike."""
+        if self._smoothing is None:
+            count = len(gloss)
+            roots = self._structure.roots[:count]
+            index = torch.as_tensor(cKDTree(roots).query(roots, min(SMOOTH_OVER, count))[1].reshape(count, -1))
+            normals = gloss / gloss.norm(dim=1, keepdim=True).clamp(min=1e-9)
+            alike = (torch.einsum("nkc,nc->nk", normals[index], normals) > SAME_SIDE).double()
+            alike[:, 0] = 1
+            self._smoothing = index, alike / alike.sum(dim=1, keepdim=True)
+        return self._smoothing
+
+    def leave_out(self, views: Sequence[int]) -> None:
+        """See ``UpdateEngine.leave_out``."""
+        if self._gains is not None:
+            self._gains.leave_out([self._views[index] for index in views])
+
+    def wait(self, iteration: int) -> None:
+        """See ``UpdateEngine.wait``: here the host does the work itself."""
+
+    @torch.no_grad()
+    def probe(self, which: Sequence[int], *, moved: bool, learnt: bool) -> list[float]:
+        """See ``UpdateEngine.probe``."""
+        scene, previous = self._scene, self._scene.previous
+        still = torch.zeros(len(scene.rows), 4, dtype=torch.float64)
+        still[:, 0] = 1
+        now = scene.moved(self._parameters) if moved else Moved(scene.means, scene.factors, still)
+        colours, looks = scene.colours, self._parameters.gloss
+        gloss = None if previous.gloss is None else leaf(previous.gloss)
+        environment = None if previous.environment is None else leaf(previous.environment)
+        if learnt:
+            colours = scene.all_colours(self._parameters)
+            gloss, environment = (gloss, environment) if looks is None else (looks.gloss, looks.environment)
+        errors = []
+        for index in which:
+            view = self._probes[index]
+            features = scene.seen(now, colours, gloss, environment, view.camera)
+            planes, _ = self._rendered(view, now, features)
+            shown = planes[..., :LABEL] * leaf(view.exposure[:3, 0]) + leaf(view.exposure[:3, 1])
+            target = leaf(view.target[:LABEL]).permute(1, 2, 0)
+            errors.append(self._plan.image * float(losses.image_loss(shown, target)))
+        return errors
+
+    def tables(self) -> Tables:
+        """See ``UpdateEngine.tables``."""
+        return self._parameters.tables()
+
+    def log(self) -> IterationLog:
+        """See ``UpdateEngine.log``."""
+        held = int((~self._scene.sound).sum())
+        self._log.guards = {"held_back": held} if held else {}
+        return self._log
+
+    @torch.no_grad()
+    def state(self, learnt: bool) -> Gaussians:
+        """See ``UpdateEngine.state``."""
+        return self._scene.state(self._scene.moved(self._parameters), self._parameters if learnt else None)
+
+    def exposures(self) -> Mapping[str, Array]:
+        """See ``UpdateEngine.exposures``."""
+        return {view.name: view.exposure.copy() for view in self._views}
+
+    def gains(self) -> Array:
+        """See ``UpdateEngine.gains``."""
+        if self._gains is None:
+            raise ValueError("gains were not given to begin; the plan has to follow them (UpdatePlan.camera_gains)")
+        self._gains.settle()
+        return self._gains.gains.copy()
+
+    def gradients(self) -> dict[str, Array]:
+        """Gradients of the last iteration's loss, before its step, for tests; see ``CpuEngine.gradients``."""
+        return tables_of_gradients(self._gradients, self._scene, len(self._parameters.clusters))
+
+    def _named(self) -> dict[str, Tensor]:
+        parameters, gloss = self._parameters, self._parameters.gloss
+        named = {
+            f"{k}.{name}": v for k, params in enumerate(parameters.clusters) for name, v in params._asdict().items()
+        }
+        named |= parameters.deltas._asdict()
+        named |= {"moving": parameters.moving_colours, "standing": parameters.standing_colours}
+        if gloss is not None:
+            named |= {"gloss": gloss.gloss, "light": gloss.light, "nearness": gloss.nearness}
+        return named
+
+
+def tables_of_gradients(named: Mapping[str, Array], scene: Scene, layers: int) -> dict[str, Array]:
+    """Gradients by table, in the columns of ``Tables``: "cluster 0", …, "deltas", "colours", "gloss", "environment"."""
+    tables = {
+        f"cluster {k}": np.concatenate(
+            [named[f"{k}.{name}"].reshape(-1, 1 if name == "s" else 3) for name in "rtcs"], axis=1
+        )
+        for k in range(layers)
+    }
+    tables["deltas"] = np.concatenate([named[name] for name in ("dp", "dr", "ds")], axis=1)
+    colours = np.zeros((len(scene.means), 3))
+    colours[scene.rows.numpy()], colours[scene.standing.numpy()] = named["moving"], named["standing"]
+    tables["colours"] = colours
+    if "gloss" in named:
+        tables["gloss"] = named["gloss"]
+        tables["environment"] = np.concatenate([named["light"], np.zeros((1, 3)), named["nearness"]])
+    return tables

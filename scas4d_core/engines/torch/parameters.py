@@ -1,0 +1,125 @@
+"""The parameters of one attempt as leaf tensors, and Adam over those that are free (algorithm 1, last line)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from scas4d_core.engines.engine import AttemptStart, StepScalars, Tables
+from scas4d_core.engines.torch.deformation import ClusterParams, Deltas
+from scas4d_core.guards import ADAM_EPSILON
+
+GLOSS_BETAS = (0.9, 0.999)
+"""Adam's decays of gloss and environment, in every update."""
+
+
+def leaf(values: object) -> Tensor:
+    """A float64 tensor of its own, from an array or a tensor."""
+    return torch.as_tensor(values, dtype=torch.float64).detach().clone()
+
+
+@dataclass(eq=False)
+class GlossParameters:
+    """Gloss and environment; see ``kernels.appearance.direction``.
+
+    Attributes:
+        gloss: [M, 3] normals times strengths. light: rows of the environment that are light.
+        nearness: [1, 3] its row of nearness; the first number counts. middle: [1, 3] metres; it is not learnt.
+        rates: Adam's, of gloss, light and nearness.
+    """
+
+    gloss: Tensor
+    light: Tensor
+    nearness: Tensor
+    middle: Tensor
+    rates: tuple[float, float, float]
+
+    @property
+    def environment(self) -> Tensor:
+        """[ROWS, 3]: light, middle, nearness."""
+        return torch.cat([self.light, self.middle, self.nearness])
+
+
+@dataclass(eq=False)
+class Parameters:
+    """Everything that an attempt can learn; what is not free keeps no gradient and stays as it is.
+
+    Attributes:
+        clusters: for each layer, coarse to fine, r, t, c, s of equation (6). deltas: Δp, ΔR, Δs of equation (7).
+        moving_colours, standing_colours: [M, 3] and [N − M, 3] RGB. gloss: None: not learnt.
+    """
+
+    clusters: list[ClusterParams]
+    deltas: Deltas
+    moving_colours: Tensor
+    standing_colours: Tensor
+    gloss: GlossParameters | None = None
+    optimizers: list[FreeParameter] = field(default_factory=list)
+
+    def set_tables(self, tables: Tables) -> None:
+        """Take a deformation from the host."""
+        self.clusters, self.deltas = deformation_of(tables)
+
+    def tables(self) -> Tables:
+        """The deformation, for the host."""
+        clusters = [torch.cat([p.r, p.t, p.c, p.s[:, None]], dim=1) for p in self.clusters]
+        return Tables(
+            [values.detach().float().numpy() for values in clusters],
+            torch.cat(list(self.deltas), dim=1).detach().float().numpy(),
+        )
+
+    def free(self, start: AttemptStart) -> None:
+        """Give each parameter whose rate is above 0 an optimizer, with moments of zero."""
+        betas = start.beta1, start.beta2
+        self.optimizers = []
+        for layer, (params, (rotation, translation, scaling)) in enumerate(
+            zip(self.clusters, start.layers, strict=True)
+        ):
+            rates = zip(params, (rotation, translation, scaling, scaling), strict=True)
+            self._free(rates, betas, f"layer {layer}")
+        self._free(zip(self.deltas, (start.position, start.rotation, start.scale), strict=True), betas, "own")
+        colours = (self.moving_colours, start.colour), (self.standing_colours, start.colour_standing)
+        self._free(iter(colours), betas, "colour")
+        if self.gloss is not None:
+            own = (self.gloss.gloss, self.gloss.light, self.gloss.nearness)
+            self._free(zip(own, self.gloss.rates, strict=True), GLOSS_BETAS, "gloss")
+
+    def _free(self, rates: Iterator[tuple[Tensor, float]], betas: tuple[float, float], stage: str) -> None:
+        for tensor, rate in rates:
+            if rate > 0 and tensor.numel():
+                self.optimizers.append(FreeParameter(tensor.requires_grad_(), rate, betas, stage))
+
+    def step(self, step: StepScalars) -> None:
+        """Adam over all that is free, by the factors of an iteration."""
+        factors = {f"layer {layer}": factor for layer, factor in enumerate(step.layers)}
+        factors |= {"own": step.own, "colour": step.colour, "gloss": step.gloss}
+        for parameter in self.optimizers:
+            parameter.step(factors[parameter.stage])
+
+
+class FreeParameter:
+    """One tensor and its Adam.
+
+    Attributes:
+        stage: which factor of ``StepScalars`` its rate follows: "layer k", "own", "colour" or "gloss".
+    """
+
+    def __init__(self, tensor: Tensor, rate: float, betas: tuple[float, float], stage: str) -> None:
+        self._rate, self.stage = rate, stage
+        self._adam = torch.optim.Adam([tensor], lr=rate, betas=betas, eps=ADAM_EPSILON)
+
+    def step(self, factor: float) -> None:
+        """Take a step; a factor of 0 takes none and leaves the moments."""
+        if factor:
+            self._adam.param_groups[0]["lr"] = self._rate * factor
+            self._adam.step()
+
+
+def deformation_of(tables: Tables) -> tuple[list[ClusterParams], Deltas]:
+    """The parameters of a deformation as tensors."""
+    clusters = [ClusterParams(leaf(v[:, :3]), leaf(v[:, 3:6]), leaf(v[:, 6:9]), leaf(v[:, 9])) for v in tables.clusters]
+    own = tables.deltas
+    return clusters, Deltas(leaf(own[:, :3]), leaf(own[:, 3:6]), leaf(own[:, 6:]))

@@ -1,0 +1,112 @@
+"""The tensors of one attempt: Θ_{t−1}, the structure that deforms it, and Θ_t as a function of the parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from scas4d_core.engines.plan import Structure, UpdatePlan
+from scas4d_core.engines.torch.deformation import Layer, deform, material_rotations
+from scas4d_core.engines.torch.gloss import shade
+from scas4d_core.engines.torch.parameters import Parameters, leaf
+from scas4d_core.engines.views import CameraArrays
+from scas4d_core.gaussians import Gaussians
+
+
+@dataclass(eq=False)
+class Moved:
+    """Θ_t as tensors, differentiable with respect to the parameters.
+
+    Attributes:
+        means [N, 3], factors [N, 3, 3]: of all Gaussians. turns: [M, 4] of the moving since Θ_{t−1}.
+    """
+
+    means: Tensor
+    factors: Tensor
+    turns: Tensor
+
+
+class Scene:
+    """Θ_{t−1} in float64, and what an update makes of it.
+
+    A moving Gaussian that is not finite is held back: it stays as it is, is in no pivot and in no pair of neighbours.
+
+    Attributes:
+        rows: [M] moving Gaussians. sound: [M] those that are not held back. standing: [N − M] the others.
+    """
+
+    def __init__(self, plan: UpdatePlan, structure: Structure, previous: Gaussians) -> None:
+        hierarchy = structure.hierarchy
+        self.plan, self.previous = plan, previous
+        moving = hierarchy.rows
+        held = np.concatenate([previous.means[moving], previous.factors[moving].reshape(-1, 9)], axis=1)
+        self.sound = torch.as_tensor(np.isfinite(held).all(axis=1))
+        self.rows = torch.as_tensor(moving)
+        self.standing = torch.as_tensor(np.setdiff1d(np.arange(len(previous)), moving))
+        self.means, self.factors = leaf(previous.means), leaf(previous.factors)
+        self.opacities, self.labels = leaf(previous.opacities), leaf(previous.foreground)
+        self.colours = leaf(previous.colours)
+        self._clusters = [torch.as_tensor(labels.astype(np.int64))[self.sound] for labels in hierarchy.labels]
+        self.first_lengths = leaf(structure.first_lengths)
+        if structure.neighbours is not None:
+            graph = structure.neighbours
+            self.neighbours = torch.as_tensor(graph.index.astype(np.int64))
+            self.distances = leaf(graph.distances)
+            pairs = self.sound[:, None] & self.sound[self.neighbours]
+            self.pair_weights = torch.where(pairs, leaf(graph.weights), 0)
+
+    def moved(self, parameters: Parameters) -> Moved:
+        """Equations (5) to (7)."""
+        chosen = self.rows[self.sound]
+        layers = [Layer(labels, params) for labels, params in zip(self._clusters, parameters.clusters, strict=True)]
+        deltas = type(parameters.deltas)(*(values[self.sound] for values in parameters.deltas))
+        plan = self.plan
+        now = deform(self.means[chosen], self.factors[chosen], layers, deltas, plan.cluster_map, plan.covariance)
+        still = torch.zeros(len(self.rows), 4, dtype=torch.float64)
+        still[:, 0] = 1
+        return Moved(
+            self.means.index_copy(0, chosen, now.means),
+            self.factors.index_copy(0, chosen, now.factors),
+            still.index_copy(0, torch.nonzero(self.sound)[:, 0], now.turns),
+        )
+
+    def all_colours(self, parameters: Parameters) -> Tensor:
+        """[N, 3] RGB, without gloss."""
+        colours = self.colours.index_copy(0, self.rows, parameters.moving_colours)
+        return colours.index_copy(0, self.standing, parameters.standing_colours)
+
+    def seen(
+        self, moved: Moved, colours: Tensor, gloss: Tensor | None, environment: Tensor | None, camera: CameraArrays
+    ) -> Tensor:
+        """[N, 4] features as a camera sees them: RGB with gloss, and the label; no gradient to places and turns."""
+        if gloss is not None and environment is not None:
+            turns = torch.zeros(len(self.means), 4, dtype=torch.float64)
+            turns[:, 0] = 1
+            turns = turns.index_copy(0, self.rows, moved.turns.detach())
+            dull = torch.zeros(len(self.means) - len(gloss), 3, dtype=torch.float64)
+            colours = shade(
+                moved.means.detach(), torch.cat([gloss, dull]), turns, colours, environment, leaf(camera.centre)
+            )
+        return torch.cat([colours, self.labels[:, None]], dim=1)
+
+    def state(self, moved: Moved, parameters: Parameters | None) -> Gaussians:
+        """Θ_t with material rotations; ``parameters``: with the looks that were learnt, else those of Θ_{t−1}."""
+        previous, chosen = self.previous, self.rows[self.sound].numpy()
+        means, factors, rotations = previous.means.copy(), previous.factors.copy(), previous.rotations.copy()
+        means[chosen] = moved.means.detach()[chosen].float().numpy()
+        factors[chosen] = moved.factors.detach()[chosen].float().numpy()
+        turned = material_rotations(moved.turns.detach(), leaf(previous.rotations[self.rows.numpy()]))
+        rotations[self.rows.numpy()] = turned.float().numpy()
+        state = previous.replace(means=means, factors=factors, rotations=rotations)
+        if parameters is None:
+            return state
+        state = state.replace(colours=self.all_colours(parameters).detach().float().numpy())
+        if parameters.gloss is None:
+            return state
+        learnt = parameters.gloss
+        return state.replace(
+            gloss=learnt.gloss.detach().float().numpy(), environment=learnt.environment.detach().float().numpy()
+        )
