@@ -10,7 +10,10 @@ from effect_cases import BEFORE, RIG, UPDATE, builder, updater_of
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.checkpoint import CarryOver
 from scas4d_core.effects.switches import first_switches, joined
+from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.engine import UpdateEngine
+from scas4d_core.engines.torch.engine import TorchEngine
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import Preparation
 from scas4d_core.settings import Settings
@@ -33,12 +36,13 @@ def one_iteration() -> PlanBuilder:
     return joined(builder(update=UPDATE.model_copy(update={"iterations": 1})), names)
 
 
-def test_starts_and_ends_are_called() -> None:
+@pytest.mark.parametrize("kind", [CpuEngine, TorchEngine])
+def test_starts_and_ends_are_called(kind: type[UpdateEngine]) -> None:
     built = one_iteration()
     views = built.factory.views(take_frame(1, 1.0, moved(BEFORE), RIG, True), {})
-    without = updater_of(built).run(BEFORE, views, None, 1.0, seed=3)
+    without = updater_of(built, kind()).run(BEFORE, views, None, 1.0, seed=3)
     built.parts.append(Moves())
-    found = updater_of(built).run(BEFORE, views, None, 1.0, seed=3)
+    found = updater_of(built, kind()).run(BEFORE, views, None, 1.0, seed=3)
     went = (found.gaussians.means - without.gaussians.means)[built.hierarchy.rows]
     np.testing.assert_allclose(np.median(went, axis=0), [0.5, 0, 0], atol=0.1)
     assert found.gaussians.colours.min() > 0.9

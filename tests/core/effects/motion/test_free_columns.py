@@ -16,6 +16,8 @@ from scas4d_core.effects.switches import first_switches, joined, names_on
 from scas4d_core.engines.cpu import engine as cpu_engine
 from scas4d_core.engines.cpu.adam import Adam
 from scas4d_core.engines.cpu.engine import CpuEngine
+from scas4d_core.engines.engine import UpdateEngine
+from scas4d_core.engines.torch.engine import TorchEngine
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.presets import SettingError, preset
 from scas4d_core.settings import Settings, UpdateSettings
@@ -42,7 +44,7 @@ def without(*names: str) -> list[str]:
     return [name for name in usual() if name not in names]
 
 
-def updater(effects: Sequence[str], update: UpdateSettings = UPDATE, engine: CpuEngine | None = None) -> FrameUpdate:
+def updater(effects: Sequence[str], update: UpdateSettings = UPDATE, engine: UpdateEngine | None = None) -> FrameUpdate:
     return updater_of(joined(builder(update=update), effects), engine)
 
 
@@ -83,9 +85,10 @@ def test_the_state_is_that_of_steps_over_all_columns(
 
 
 @pytest.mark.parametrize("name", MOVES)
-def test_columns_that_are_off_stay_exactly_0_and_no_others(name: str) -> None:
+@pytest.mark.parametrize("kind", [CpuEngine, TorchEngine])
+def test_columns_that_are_off_stay_exactly_0_and_no_others(name: str, kind: type[UpdateEngine]) -> None:
     short = UPDATE.model_copy(update={"iterations": 3, "own_start": 0.0, "momentum": 0.5})
-    engine = CpuEngine()
+    engine = kind()
     run(updater(without(name), short, engine), found_motion())
     tables = engine.tables()
     for other, columns in COLUMNS.items():
@@ -115,12 +118,25 @@ def test_a_rigid_motion_is_found_by_clusters_that_turn_and_shift_alone() -> None
     assert np.median(missed) < 0.15 * np.median(way)
 
 
-def test_without_prediction_an_update_starts_where_the_frame_before_ended() -> None:
+def test_torch_obeys_the_same_freedoms() -> None:
+    """The first steps, before rounding decides: the terms between neighbours have a kink at the start."""
+    update = UPDATE.model_copy(update={"iterations": 3, "own_start": 0.0})
+    ties = ("rigidity", "isometry", "rotation")
+    off = without("cluster_rotation", "own_position", *ties)
+    on_cpu, in_torch = (run(updater(off, update, engine)) for engine in (CpuEngine(), TorchEngine()))
+    np.testing.assert_allclose(in_torch.trace.losses, on_cpu.trace.losses, rtol=2e-4)
+    apart = np.linalg.norm(in_torch.gaussians.means - on_cpu.gaussians.means, axis=1)[:MOVING]
+    free = run(updater(without(*ties), update)).gaussians.means
+    assert np.median(apart) < 0.05 * np.median(np.linalg.norm(free - on_cpu.gaussians.means, axis=1)[:MOVING])
+
+
+@pytest.mark.parametrize("kind", [CpuEngine, TorchEngine])
+def test_without_prediction_an_update_starts_where_the_frame_before_ended(kind: type[UpdateEngine]) -> None:
     short = UPDATE.model_copy(update={"iterations": 2})
-    still = run(updater(without("prediction"), short), found_motion(), COMPARED)
+    still = run(updater(without("prediction"), short, kind()), found_motion(), COMPARED)
     assert set(still.trace.errors) == {Candidate.STILL, Candidate.END}
-    assert same(still.gaussians.arrays(), run(updater(usual(), short), None, COMPARED).gaussians.arrays())
-    warm = run(updater(usual(), short), found_motion(), COMPARED)
+    assert same(still.gaussians.arrays(), run(updater(usual(), short, kind()), None, COMPARED).gaussians.arrays())
+    warm = run(updater(usual(), short, kind()), found_motion(), COMPARED)
     assert Candidate.WARM in warm.trace.errors
     assert not same(still.gaussians.arrays(), warm.gaussians.arrays())
 
