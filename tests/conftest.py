@@ -44,7 +44,7 @@ SERVICE_STARTERS = {"Running", "Service", "serving", "serving_with", "stub"}
 SLOW = "tests/studies/"
 BROWSER = "tests/browser/"
 SECOND_PROCESSOR = (
-    "tests/core/kernels/", "tests/core/properties/", "tests/core/rasterize/", "tests/core/torch_backend/",
+    "tests/core/kernels/", "tests/core/properties/", "tests/core/engines/", "tests/core/torch_backend/",
     "tests/studies/hard_cases/",
 )  # fmt: skip
 """The same folders are named in .ci/run."""

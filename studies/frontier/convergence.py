@@ -17,6 +17,7 @@ from client.cli.evaluate import Report
 from client.cli.scores import Row, read_row, write_row
 from scas4d_core import metrics
 from scas4d_core.captures import Capture
+from scas4d_core.engines.engine import StepScalars, UpdateEngine
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.settings import Settings
 from scas4d_core.warm_up import warm_up_elsewhere
@@ -30,25 +31,25 @@ CHECKPOINTS = (0, 1, 2, 4, 7, 10, 15, 20, 25, 30, 40, 50, 60, 70, 80, 90, 100, 1
 WATCHED = (("scas4d", 25), ("scas4d", 100), ("scas4d", 300), ("dynamic3dgs", 100), ("dynamic3dgs", 300))
 """Preset and iterations."""
 
-Look = Callable[[int, Any, Any, Any, Any], None]
-"""Called with the iterations done, means, factors, opacities and features."""
+Look = Callable[[int, UpdateEngine], None]
+"""Called with the iterations done, and the engine after them."""
 
 
-class WatchedPictures:
-    """Stands before an update's ``CpuRenderer`` and shows what it is about to render, iteration by iteration."""
+class WatchedEngine:
+    """Stands before an update's engine and shows it before each iteration."""
 
-    def __init__(self, inner: Any, look: Look) -> None:
-        self._inner, self._look = inner, look
+    def __init__(self, inner: UpdateEngine, look: Look) -> None:
+        self.inner, self._look = inner, look
         self._done = 0
 
-    def evaluate(self, means: Any, factors: Any, opacities: Any, features: Any, *others: Any, **more: Any) -> Any:
-        """See ``CpuRenderer.evaluate``."""
-        self._look(self._done, means, factors, opacities, features)
+    def iterate(self, views: Sequence[int], step: StepScalars) -> None:
+        """See ``UpdateEngine.iterate``."""
+        self._look(self._done, self.inner)
         self._done += 1
-        return self._inner.evaluate(means, factors, opacities, features, *others, **more)
+        self.inner.iterate(views, step)
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._inner, name)
+        return getattr(self.inner, name)
 
 
 def measure_convergence(
@@ -108,22 +109,15 @@ def _watched(capture: Capture, variant: Variant, out: Path, updates: int) -> lis
     for index in range(1, updates + 1):
         curve: dict[int, float] = {}
         true = capture.test_frame(index).images
-        state: Gaussians = reconstruction.history.gaussians(index - 1)
 
-        def look(
-            done: int, means: Any, factors: Any, opacities: Any, features: Any,
-            curve: dict[int, float] = curve, true: Any = true, state: Gaussians = state,
-        ) -> None:  # fmt: skip
+        def look(done: int, engine: UpdateEngine, curve: dict[int, float] = curve, true: Any = true) -> None:
             if done in CHECKPOINTS:
-                now = state.replace(
-                    means=means.copy(), factors=factors.copy(), opacities=opacities, colours=features[:, :3].copy()
-                )
-                curve[done] = _psnr(reconstruction, capture, now, true)
+                curve[done] = _psnr(reconstruction, capture, engine.state(learnt=True), true)
 
-        updater = reconstruction._prepared.updater
-        updater._picture = WatchedPictures(updater._picture, look)
+        updater, inner = reconstruction._prepared.updater, reconstruction._prepared.updater._engine
+        updater._engine = WatchedEngine(inner, look)
         reconstruction.step(capture.frame(index))
-        updater._picture = updater._picture._inner
+        updater._engine = inner
         curve[variant.iterations] = _psnr(reconstruction, capture, reconstruction.history.gaussians(index), true)
         curves.append(curve)
     return curves

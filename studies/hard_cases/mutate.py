@@ -46,7 +46,7 @@ PATCHES: dict[str, tuple[tuple[str, str, str], ...]] = {
     ),
     "held_back": (
         (
-            "update/deformation.py",
+            "engines/cpu/deformation.py",
             "sound: NDArray[np.bool_] = np.isfinite(held).all(axis=1)",
             "sound: NDArray[np.bool_] = np.ones(len(held), bool)",
         ),
@@ -145,9 +145,10 @@ def failing_without(guard: Guard | None, sections: list[str]) -> list[str]:
 
 
 LOOKED_AT = (
-    "scas4d_core/guards.py", "scas4d_core/kernels/*.py", "scas4d_core/rasterize/[!c]*.py",
-    "scas4d_core/rasterize/cpu.py", "scas4d_core/update/deformation.py", "scas4d_core/structure/*h*.py",
-    "scas4d_core/torch_backend/deformation.py", "scas4d_core/torch_backend/losses.py", "scas4d_core/query/ply.py",
+    "scas4d_core/guards.py", "scas4d_core/kernels/*.py", "scas4d_core/engines/limits.py",
+    "scas4d_core/engines/cpu/[!ce]*.py", "scas4d_core/structure/*h*.py",
+    "scas4d_core/engines/torch/deformation.py", "scas4d_core/engines/torch/losses.py",
+    "scas4d_core/engines/torch/rasterizer.py", "scas4d_core/query/ply.py",
     "studies/hard_cases/ca*.py", "studies/hard_cases/*ing.py", "studies/hard_cases/geometry.py",
     "studies/hard_cases/cluster_map.py", "studies/hard_cases/steps.py",
 )  # fmt: skip

@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.effects import effect as effect_module
 from scas4d_core.effects.evidence import Seen
+from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.remake import remake
@@ -24,6 +25,7 @@ from scas4d_core.robust.update_input import UpdateInput
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings, UpdateSettings
 from scas4d_core.storage.births import Life
 from scas4d_core.storage.history import History
+from scas4d_core.update.frame_update import structure_of
 from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.schedule import FOR_BIRTHS
 from scas4d_core.update.warm_start import Motion, motion_between, warm_start
@@ -247,7 +249,9 @@ def test_births_have_their_time_in_the_budget(monkeypatch: pytest.MonkeyPatch) -
 def test_the_motion_between_two_states_goes_on_in_other_clusters(monkeypatch: pytest.MonkeyPatch) -> None:
     """A body that turns and shifts alike from frame to frame: the start of the next frame is where it will be."""
     scene = start(History(), masks=True)
-    hierarchy, deformation = scene._prepared.updater.hierarchy, scene._prepared.updater._deformation  # type: ignore[attr-defined]
+    hierarchy = scene._prepared.updater.hierarchy
+    engine = CpuEngine()
+    engine.bind(scene._prepared.plan, structure_of(hierarchy, None, BOX))
     turn, shift = Rotation.from_rotvec([0.02, 0.05, -0.01]), np.array([0.02, -0.01, 0.015])
 
     def after(steps: int) -> np.ndarray:
@@ -268,11 +272,11 @@ def test_the_motion_between_two_states_goes_on_in_other_clusters(monkeypatch: py
     assert isinstance(motion, Motion)
     assert np.abs(motion.rest[known]).max() < 1e-3
     assert (motion.rest[~known] == 0).all()
-    deformation.start(now)
-    warm_start(deformation, motion, 0.1, 1.0)
-    deformation.forward()
+    engine.load_state(now)
+    engine.set_tables(warm_start(hierarchy, motion, 0.1, 1.0))
+    means = engine.state(learnt=False).means
     moved_on = np.linalg.norm(after(2) - after(1), axis=1).mean()
-    off = np.linalg.norm(deformation.means[:MOVING] - after(2), axis=1)
+    off = np.linalg.norm(means[:MOVING] - after(2), axis=1)
     assert off.mean() < 0.05 * moved_on
     nothing = motion_between(hierarchy, BOX, now, np.zeros(MOVING, np.bool_), 0.1)
     assert all((array == 0).all() for array in (*nothing.turns, *nothing.shifts, nothing.rest))

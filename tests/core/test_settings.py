@@ -121,8 +121,10 @@ def test_a_constant_of_the_method_is_refused_as_an_unknown_setting() -> None:
 
 
 def test_changes_go_over_the_preset_later_ones_over_earlier_ones() -> None:
-    changed = preset("adaptive", {"update": {"iterations": 20, "seed": 3}}, {"update": {"seed": 4}, "device": "cuda"})
-    assert (changed.update.iterations, changed.update.seed, changed.device) == (20, 4, "cuda")
+    changed = preset(
+        "adaptive", {"update": {"iterations": 20, "seed": 3}}, {"update": {"seed": 4}, "effects": {"floor": "off"}}
+    )
+    assert (changed.update.iterations, changed.update.seed, changed.effects) == (20, 4, {"floor": "off"})
     assert changed.update.beta1 == PRESETS["adaptive"].update.beta1
     assert PRESETS["adaptive"].update.iterations == 50
     assert preset("adaptive", {}) == PRESETS["adaptive"]

@@ -19,5 +19,5 @@ def test_a_constant_has_another_value_for_a_while() -> None:
 
 
 def test_a_constant_that_is_not_there_is_refused() -> None:
-    with pytest.raises(AttributeError, match="LARGEST"), varied("scas4d_core.engines.cpu.deformation.LARGEST", 2.0):
+    with pytest.raises(AttributeError, match="LARGEST"), varied("scas4d_core.engines.plan.LARGEST", 2.0):
         pass

@@ -28,7 +28,7 @@ def test_the_table_is_todays() -> None:
 
 @pytest.fixture
 def drag(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """The example of the page, its file and both its lines in place."""
+    """The example of the page, its file and its line in place."""
     line = re.search(r'^    "(\w+)": "([\w.]+)",$', PAGE, re.MULTILINE)
     assert line is not None
     name, place = line.groups()

@@ -9,20 +9,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from effect_cases import BEFORE, RIG, UPDATE, builder, same, updated
-from scas4d_core.effects.appearance.colours import Colours
-from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
 from source_tree import ROOT
 
 from scas4d_core.effect_names import EFFECTS
 from scas4d_core.effects import effect as effect_module
-from scas4d_core.effects.coherence.floor import FloorPart
-from scas4d_core.effects.effect import Effect, Group, effect, refused_at_zero, refused_on_gpu
+from scas4d_core.effects.coherence.floor import FLOOR_WEIGHT
+from scas4d_core.effects.effect import Effect, Group, effect, refused_at_zero
 from scas4d_core.effects.evidence import Evidence, Seen
 from scas4d_core.effects.switches import IDLE, Switch, decided, first_switches, joined, names_on
 from scas4d_core.errors import InputError
 from scas4d_core.presets import SettingError, preset
 from scas4d_core.settings import SceneSettings, Settings
-from scas4d_core.update.parts import Hooks, Part, PartsBuilder, Work
+from scas4d_core.update.parts import Part, PlanBuilder
 
 WEIGHTS = ("rigidity", "isometry", "rotation", "scale")
 
@@ -43,13 +41,15 @@ def test_the_descriptions_are_light() -> None:
 
 
 def test_an_effect_that_is_off_has_no_part() -> None:
-    assert joined(builder(), []).parts == []
-    assert joined(builder(), []).length == 0
-    parts = joined(builder(), ["isometry", "standing_colour"])
-    assert [type(part) for part in parts.parts] == [NeighbourTerms, Colours]
-    colours = parts.find(Colours)
-    assert colours is not None
-    assert (colours.moving, colours.standing) == (False, True)
+    off = joined(builder(), [])
+    assert off.parts == []
+    assert off.plan.axis_length == 0
+    assert (off.plan.neighbour_terms, off.plan.colours) == (False, None)
+    plan = joined(builder(), ["isometry", "standing_colour"]).plan
+    assert plan.neighbour_terms
+    assert (plan.rigidity, plan.isometry, plan.rotation) == (0, UPDATE.weights.isometry, 0)
+    assert plan.colours is not None
+    assert (plan.colours.moving, plan.colours.standing) == (False, True)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,10 @@ def test_a_scene_without_a_floor_has_no_floor_term() -> None:
     assert not first_switches(Settings(), 0)["floor"].on
     scene = SceneSettings(floor=(0, 1, 0, -0.5))
     assert first_switches(Settings(scene=scene), 0)["floor"].on
-    assert any(isinstance(part, FloorPart) for part in joined(builder(scene)).parts)
+    plan = joined(builder(scene)).plan
+    assert (plan.floor, plan.floor_weight) == (scene.floor, FLOOR_WEIGHT)
+    without = joined(builder()).plan
+    assert (without.floor, without.floor_weight) == (None, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -110,10 +113,7 @@ def test_contradictions_are_refused(given: dict[str, object], fault: str, remedy
 
 @pytest.mark.parametrize("name", EFFECTS)
 def test_refusals_of_one_kind_have_one_text(name: str) -> None:
-    """A device, and a rate or weight of 0, are refused in the same words by all effects that refuse them."""
-    gpu, cpu = (effect(name).refused(Settings(device=device)) for device in ("cuda", "cpu"))
-    if gpu != cpu:
-        assert gpu == refused_on_gpu(Settings(device="cuda")) == ("device is 'cuda'", "set device to 'cpu'")
+    """A rate or weight of 0 is refused in the same words by all effects that refuse it."""
     for key in ("rate_colour", "rate_colour_standing", "rate_scale", *(f"weights.{one}" for one in WEIGHTS)):
         first, _, last = key.partition(".")
         zero = Settings.model_validate({"update": {first: {last: 0} if last else 0}, "scene": {"floor": (0, 1, 0, 0)}})
@@ -136,8 +136,8 @@ class Shy(Effect):
         share = {0: 0.5, 1: 0.9, 2: None}.get(seen.index, 0.1)
         return None if share is None else Evidence(share, f"frame {seen.index}")
 
-    def join(self, parts: PartsBuilder) -> None:
-        parts.parts.append(Part())
+    def join(self, builder: PlanBuilder) -> None:
+        builder.parts.append(Part())
 
 
 SHY = Shy("shy", Group.MOTION, "It moves.", "none", "none", auto=True, on_above=0.8, off_below=0.3)
@@ -174,16 +174,6 @@ def test_a_pinned_switch_hears_no_evidence() -> None:
     switches = decided({"shy": first_switches(settings, 0)["shy"]}, settings, seen(1))
     assert not switches["shy"].on
     assert switches["shy"].pinned
-
-
-def test_a_hook_that_does_nothing_is_not_called() -> None:
-    class Counting(Part):
-        def loss(self, work: Work) -> float:
-            return 1.0
-
-    hooks = Hooks([Counting(), Part()])
-    assert len(hooks.loss) == 1
-    assert not any((hooks.start, hooks.show, hooks.saw, hooks.step, hooks.end, hooks.guards))
 
 
 @pytest.mark.usefixtures("shy")

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from scas4d_core.cameras import WorldFrame
-from scas4d_core.effects.coherence.floor import floor_inside, floor_term
+from scas4d_core.effects.coherence.floor import floor_inside
+from scas4d_core.engines.cpu.floor import floor_term
 from scas4d_core.engines.torch.losses import floor_loss
 
 WORLD = WorldFrame(np.array([100.0, -20.0, 5.0]), 0.25)

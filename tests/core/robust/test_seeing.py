@@ -11,6 +11,8 @@ import pytest
 
 from scas4d_core.cameras import rig_inside
 from scas4d_core.captures.frame import Frame
+from scas4d_core.effects.switches import joined
+from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import Candidate
@@ -21,6 +23,7 @@ from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.update.best_state import VIEWS, BestState, ProbeViews, by_size, mean_error, spread
 from scas4d_core.update.frame_update import FrameUpdate
+from scas4d_core.update.parts import PlanBuilder
 from scas4d_core.update.result import AttemptOptions
 from scas4d_core.update.schedule import Stopping
 from scas4d_core.update.view_factory import ViewFactory
@@ -30,13 +33,14 @@ from studies.hard_frames.scene import BALL, GOES, first_state, gone
 FOOTAGE = SyntheticFootage()
 BEFORE = first_state(resting_may_move=False)
 FACTORY = ViewFactory(rig_inside(FOOTAGE.rig.world_frame(1.0), FOOTAGE.rig.cameras))
-PICTURE = CpuRenderer(FACTORY, (0.0, 0.0, 0.0), 1.0, 0.0)
+RENDERER = CpuRenderer((0.0, 0.0, 0.0))
 SETTINGS = UpdateSettings(iterations=30, clusters=(2, 12))
 
 
-def updater(settings: UpdateSettings = SETTINGS) -> FrameUpdate:
+def updater(settings: UpdateSettings = SETTINGS, engine: CpuEngine | None = None) -> FrameUpdate:
     hierarchy = build_hierarchy(BEFORE.means, BEFORE.moving, settings.clusters, 8)
-    return FrameUpdate(FACTORY, SceneSettings(metres_per_unit=1.0), settings, hierarchy, None, BEFORE)
+    built = joined(PlanBuilder(SceneSettings(metres_per_unit=1.0), settings, FACTORY, hierarchy, BEFORE))
+    return FrameUpdate(engine or CpuEngine(), built, None)
 
 
 def compared(iterations: int, enough: Mapping[str, float] | None = None) -> AttemptOptions:
@@ -48,7 +52,12 @@ def views(frame: Frame) -> list[TrainingView]:
 
 
 def error(state: Gaussians, frame: Frame) -> float:
-    found = ProbeViews(FACTORY, PICTURE, views(frame)).errors(state)
+    engine = CpuEngine()
+    updater(engine=engine)
+    probes = ProbeViews(FACTORY, engine, views(frame))
+    engine.load_views(views(frame), probes.views)
+    engine.load_state(state)
+    found = probes.errors(moved=False, learnt=False)
     return mean_error(found, list(found))
 
 
@@ -105,13 +114,14 @@ def test_a_motion_that_ended_is_not_gone_on_with() -> None:
 @pytest.mark.parametrize("known", [True, False])
 def test_a_coarse_layer_rests_where_the_motion_before_leads_near(known: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """In an update whose plan grows past its rest and falls back: it learns again, and rests again."""
-    update, frame = updater(), FOOTAGE.frame(4)
+    engine = CpuEngine()
+    update, frame = updater(engine=engine), FOOTAGE.frame(4)
     if known:  # the frame is two on from where the motion led
         monkeypatch.setattr("scas4d_core.update.rates.NEAR", 10.0)
     moved = update.run(BEFORE, views(FOOTAGE.frame(1)), None, 0.1, 0, compared(60))
     errors = moved.trace.errors[Candidate.END]
     usual = by_size(errors, moved.trace.whole) if known else None
-    inside, coarse = update._deformation, list[np.ndarray]()
+    inside, coarse = engine._deformation, list[np.ndarray]()
     forward = inside.forward
 
     def record() -> None:
@@ -161,9 +171,10 @@ def test_a_frame_that_stands_needs_no_iteration() -> None:
 def test_cameras_that_were_left_out_have_no_say_in_what_is_best() -> None:
     assert np.isnan(mean_error({}, ["c0"]))
     assert mean_error({"c0": 1.0, "c1": 3.0}, ["c1", "c7"]) == 3.0
-    deformation = updater()._deformation
-    deformation.start(BEFORE)
-    best = BestState(ProbeViews(FACTORY, PICTURE, []), deformation, BEFORE, None, 0.1, SETTINGS.momentum)
+    engine = CpuEngine()
+    hierarchy = updater(engine=engine).hierarchy
+    engine.load_state(BEFORE)
+    best = BestState(ProbeViews(FACTORY, engine, []), engine, hierarchy, None, 0.1, SETTINGS.momentum)
     best.start()
     assert not best.stands({"c0": 9.0})
     assert best.errors == {}
@@ -174,9 +185,9 @@ def test_the_gain_of_the_light_is_found_and_taken_out(gain: float) -> None:
     frame = FOOTAGE.frame(0)
     brighter = {name: (gain * picture).round().clip(0, 255).astype(np.uint8) for name, picture in frame.images.items()}
     sent = views(replace(frame, images=brighter))
-    found, without, others = evened(FACTORY, PICTURE, BEFORE, sent[2:], sent[:2])
+    found, without, others = evened(FACTORY, RENDERER, BEFORE, sent[2:], sent[:2])
     assert found == pytest.approx(gain, rel=0.03)
-    assert gain_of(PICTURE, BEFORE, sent) == pytest.approx(gain, rel=0.03)
+    assert gain_of(RENDERER, BEFORE, sent) == pytest.approx(gain, rel=0.03)
     for view, usual in zip([*others, *without], views(frame), strict=True):
         assert view.name == usual.name
         assert abs(float((view.target[:3] - usual.target[:3]).mean())) < 0.02
@@ -185,7 +196,7 @@ def test_the_gain_of_the_light_is_found_and_taken_out(gain: float) -> None:
 
 def test_pictures_that_are_not_brighter_stay_as_they_are() -> None:
     before = views(FOOTAGE.frame(1))
-    found, without, others = evened(FACTORY, PICTURE, BEFORE, before[2:], before[:2])
+    found, without, others = evened(FACTORY, RENDERER, BEFORE, before[2:], before[:2])
     assert found == 1.0
     assert all(one is other for one, other in zip(before, [*others, *without], strict=True))
 
@@ -194,7 +205,7 @@ def test_pictures_that_are_not_brighter_stay_as_they_are() -> None:
 def test_pictures_without_a_light_tell_of_none(value: int) -> None:
     frame = FOOTAGE.frame(0)
     filled = {name: np.full_like(picture, value) for name, picture in frame.images.items()}
-    assert gain_of(PICTURE, BEFORE, views(replace(frame, images=filled))) is None
+    assert gain_of(RENDERER, BEFORE, views(replace(frame, images=filled))) is None
 
 
 def test_a_state_in_another_light_is_no_brighter_than_white() -> None:
@@ -206,7 +217,7 @@ def test_a_state_in_another_light_is_no_brighter_than_white() -> None:
 @pytest.mark.parametrize("sizes", [0.5, 1.0, 2.0])
 def test_a_jump_is_found(sizes: float) -> None:
     frame, _ = FOOTAGE.jumped(0, sizes)
-    found = find_jump(BEFORE, views(frame), PICTURE, FACTORY.rig)
+    found = find_jump(BEFORE, views(frame), RENDERER, FACTORY.rig)
     assert found is not None
     true = np.array([-0.8, 0.0, -0.6]) * sizes * 2 * BALL
     assert np.linalg.norm(found - true) < 0.4 * BALL
@@ -221,27 +232,25 @@ def test_a_camera_that_did_not_see_the_object_has_no_say_in_where_it_went() -> N
     away[BEFORE.moving] = [0, -500, 0]
     images = {name: picture.copy() for name, picture in frame.images.items()}
     unseen = BEFORE.replace(means=away)
-    features = np.concatenate([unseen.colours, unseen.foreground[:, None]], axis=1)
     for view in views(frame):  # as the scene is shown, but for one pixel
-        PICTURE.measure(unseen.means, unseen.factors, unseen.opacities, features, view)
-        shown = PICTURE.rasterizer.planes[:3, : view.camera.height, : view.camera.width]
+        shown = RENDERER.render(unseen, view.camera).features[:3]
         images[view.name] = np.rint(255 * shown.clip(0, 1)).astype(np.uint8).transpose(1, 2, 0).copy()
         images[view.name][0, 0] = 255 - images[view.name][0, 0]
-    assert find_jump(unseen, views(replace(frame, images=images)), PICTURE, FACTORY.rig) is None
+    assert find_jump(unseen, views(replace(frame, images=images)), RENDERER, FACTORY.rig) is None
 
 
 def test_cameras_that_disagree_find_no_jump() -> None:
     jumped = [FOOTAGE.jumped(index, sizes)[0] for index, sizes in ((0, 1.0), (0, -1.0))]
     mixed = {name: jumped[k % 2].images[name] for k, name in enumerate(FOOTAGE.rig.names)}
-    assert find_jump(BEFORE, views(replace(jumped[0], images=mixed)), PICTURE, FACTORY.rig) is None
+    assert find_jump(BEFORE, views(replace(jumped[0], images=mixed)), RENDERER, FACTORY.rig) is None
 
 
 def test_an_object_that_is_gone_or_does_not_exist_is_not_found() -> None:
     frame = FOOTAGE.frame(0)
     standing = BEFORE.replace(foreground=np.zeros(len(BEFORE), np.float32))
-    assert find_jump(standing, views(frame), PICTURE, FACTORY.rig) is None
+    assert find_jump(standing, views(frame), RENDERER, FACTORY.rig) is None
     rng = np.random.default_rng(0)
     noise = {name: rng.integers(0, 256, picture.shape, np.uint8) for name, picture in frame.images.items()}
-    assert find_jump(BEFORE, views(replace(frame, images=noise)), PICTURE, FACTORY.rig) is None
+    assert find_jump(BEFORE, views(replace(frame, images=noise)), RENDERER, FACTORY.rig) is None
     few = {name: frame.images[name] for name in FOOTAGE.rig.names[:2]}
-    assert find_jump(BEFORE, FACTORY.views(Frame(0, 0.0, few, {}), {}), PICTURE, FACTORY.rig) is None
+    assert find_jump(BEFORE, FACTORY.views(Frame(0, 0.0, few, {}), {}), RENDERER, FACTORY.rig) is None

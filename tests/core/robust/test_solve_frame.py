@@ -40,7 +40,7 @@ NAMES = list(FRAME.images)
 BRIGHT = brightness(FRAME.images)
 FACTORY = ViewFactory(RIG)
 VIEWS = FACTORY.views(FRAME, {})
-PICTURE = CpuRenderer(FACTORY, (0.0, 0.0, 0.0), 1.0, 0.0)
+RENDERER = CpuRenderer((0.0, 0.0, 0.0))
 SETTINGS = UpdateSettings(iterations=30, clusters=(2,), patience=3)
 LEVEL = 33.0
 PAST = judge.settle(Past(), dict.fromkeys(NAMES, LEVEL), BRIGHT, 1.0)
@@ -93,7 +93,7 @@ def given(past: Past = PAST, **changes: Any) -> UpdateInput:
 
 
 def solve(fake: Fake, asked: UpdateInput, **changes: object) -> tuple[UpdateResult, Past]:
-    return FrameSolver(fake, FACTORY, PICTURE, SETTINGS.model_copy(update=changes)).run(asked)
+    return FrameSolver(fake, FACTORY, RENDERER, SETTINGS.model_copy(update=changes)).run(asked)
 
 
 def names(fake: Fake) -> list[str]:
@@ -396,9 +396,7 @@ def test_suspects_are_looked_at_in_the_light_that_the_colours_are_in() -> None:
 
 
 def _shown(view: TrainingView) -> float:
-    features = np.concatenate([FITTED.colours, FITTED.foreground[:, None]], axis=1)
-    PICTURE.measure(FITTED.means, FITTED.factors, FITTED.opacities, features, view)
-    return PICTURE.psnr
+    return RENDERER.compare(FITTED, view).psnr
 
 
 def errors(still: float, end: float) -> Callable[[UpdateTrace], UpdateTrace]:

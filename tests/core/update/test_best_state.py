@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
 from box_scene import MOVING, make_box
 
-from scas4d_core.engines.cpu.deformation import CpuDeformation, length_bounds
+from scas4d_core.engines.cpu.engine import CpuEngine
+from scas4d_core.engines.engine import Tables
+from scas4d_core.engines.plan import UpdatePlan
 from scas4d_core.frame_outcome import Candidate
-from scas4d_core.gaussians import Gaussians
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.update.best_state import BestState
+from scas4d_core.update.frame_update import structure_of
 from scas4d_core.update.warm_start import Motion
 
 BOX = make_box()
@@ -37,69 +38,76 @@ def sharp(off: float) -> float:
 
 
 class Probes:
-    """Errors by how far a state is off; what was asked for is counted."""
+    """Errors by how far a state of the engine is off; what was asked for is counted."""
+
+    engine: CpuEngine
 
     def __init__(self, small: Error, whole: Error, are_whole: bool = False) -> None:
         self.whole, self._small, self._whole = are_whole, small, whole
         self.asked = 0
 
-    def errors(self, state: Gaussians, turns: Any = None) -> dict[str, float]:
-        return self._found(self._small, state)
+    def errors(self, *, moved: bool, learnt: bool) -> dict[str, float]:
+        return self._found(self._small, moved)
 
-    def whole_errors(self, state: Gaussians, turns: Any = None) -> dict[str, float]:
+    def whole_errors(self, *, moved: bool, learnt: bool) -> dict[str, float]:
         self.asked += 1
-        return self._found(self._whole, state)
+        return self._found(self._whole, moved)
 
-    def _found(self, error: Error, state: Gaussians) -> dict[str, float]:
-        moved = np.abs(state.means - BOX.means)[BOX.moving, 0].mean()
-        return dict.fromkeys(NAMES, error(abs(float(moved) - WAY)))
+    def _found(self, error: Error, moved: bool) -> dict[str, float]:
+        state = self.engine.state(learnt=False) if moved else BOX
+        way = np.abs(state.means - BOX.means)[BOX.moving, 0].mean()
+        return dict.fromkeys(NAMES, error(abs(float(way) - WAY)))
 
 
-def ended(probes: Probes, motion: Motion | None = None, at: float = WAY) -> tuple[BestState, CpuDeformation]:
-    """An update whose first layer ended at a shift along x, with its second at rest."""
-    deformation = CpuDeformation(HIERARCHY, None, length_bounds(HIERARCHY, BOX), "centred")
-    deformation.start(BOX)
-    best = BestState(probes, deformation, BOX, motion, 1.0, 0.0)  # type: ignore[arg-type]
+def ended(probes: Probes, motion: Motion | None = None, at: float = WAY) -> tuple[BestState, CpuEngine]:
+    """An update whose first layer ended at a shift along x."""
+    engine = probes.engine = CpuEngine()
+    engine.bind(UpdatePlan(NAMES), structure_of(HIERARCHY, None, BOX))
+    engine.load_state(BOX)
+    best = BestState(probes, engine, HIERARCHY, motion, 1.0, 0.0)  # type: ignore[arg-type]
     best.start()
-    for values in (*deformation.clusters, deformation.deltas):
-        values[:] = 0
-    deformation.clusters[0][:, 3] = at
-    deformation.rest(1)
-    deformation.forward()
-    return best, deformation
+    tables = Tables.still(HIERARCHY)
+    tables.clusters[0][:, 3] = at
+    engine.set_tables(tables)
+    return best, engine
+
+
+def means(engine: CpuEngine) -> np.ndarray:
+    """[N, 3] metres, where the engine's tables put everything."""
+    return engine.state(learnt=False).means
 
 
 def test_an_end_that_whole_pictures_prefer_is_kept_as_it_was() -> None:
     probes = Probes(blind, sharp)
-    best, deformation = ended(probes)
-    means = deformation.means.copy()
-    assert best.end(BOX, 10, {}) is Candidate.END
+    best, engine = ended(probes)
+    before = means(engine)
+    assert best.end(10, {}) is Candidate.END
     assert best.errors[Candidate.STILL]["c0"] < best.errors[Candidate.END]["c0"]  # the small ones said otherwise
-    np.testing.assert_array_equal(deformation.means, means)
-    np.testing.assert_array_equal(deformation.clusters[0][:, 3], np.float32(WAY))
+    np.testing.assert_array_equal(means(engine), before)
+    np.testing.assert_array_equal(engine.tables().clusters[0][:, 3], np.float32(WAY))
 
 
 @pytest.mark.parametrize(
     "probes", [Probes(blind, blind), Probes(blind, sharp, are_whole=True), Probes(blind, lambda off: math.nan)]
 )
 def test_else_what_the_small_pictures_prefer_is_committed(probes: Probes) -> None:
-    best, deformation = ended(probes)
-    assert best.end(BOX, 10, {}) is Candidate.STILL
-    np.testing.assert_array_equal(deformation.means, BOX.means)
+    best, engine = ended(probes)
+    assert best.end(10, {}) is Candidate.STILL
+    np.testing.assert_array_equal(means(engine), BOX.means)
     assert probes.asked == (0 if probes.whole else 2)
 
 
 def test_nothing_is_looked_at_twice_where_the_end_is_the_best() -> None:
     probes = Probes(sharp, sharp)
     best, _ = ended(probes)
-    assert (best.end(BOX, 10, {}), probes.asked) == (Candidate.END, 0)
+    assert (best.end(10, {}), probes.asked) == (Candidate.END, 0)
 
 
 def test_an_end_that_is_not_finite_is_left() -> None:
     probes = Probes(lambda off: off, sharp)
-    best, deformation = ended(probes, at=math.nan)
-    assert best.end(BOX, 10, {}) is Candidate.STILL
-    np.testing.assert_array_equal(deformation.means, BOX.means)
+    best, engine = ended(probes, at=math.nan)
+    assert best.end(10, {}) is Candidate.STILL
+    np.testing.assert_array_equal(means(engine), BOX.means)
 
 
 @pytest.mark.parametrize(
@@ -123,6 +131,6 @@ def test_the_motion_before_is_taken_where_whole_pictures_prefer_it() -> None:
     """Small pictures prefer not moving to all else, and the end to going on; whole ones say how it is."""
     motion = Motion([np.zeros((2, 3)), np.zeros((6, 3))], [np.full((2, 3), [WAY, 0, 0]), np.zeros((6, 3))],
                     np.zeros((MOVING, 3)), np.zeros((MOVING, 3)), 1.0)  # fmt: skip
-    best, deformation = ended(Probes(blind, sharp), motion, at=0.6 * WAY)
-    assert best.end(BOX, 10, {}) is Candidate.WARM
-    np.testing.assert_allclose(deformation.clusters[0][:, 3], WAY, rtol=1e-6)
+    best, engine = ended(Probes(blind, sharp), motion, at=0.6 * WAY)
+    assert best.end(10, {}) is Candidate.WARM
+    np.testing.assert_allclose(engine.tables().clusters[0][:, 3], WAY, rtol=1e-6)

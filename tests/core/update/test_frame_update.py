@@ -13,22 +13,25 @@ import torch
 from box_scene import MOVING, SHIFT, TURN, make_box, make_rig, moved, take_frame
 from effect_cases import of_whole_pictures
 
-from scas4d_core.engines.cpu.deformation import MAX_SCALE, CpuDeformation
+from scas4d_core.engines.cpu.adam import Adam
+from scas4d_core.engines.cpu.deformation import CpuDeformation
+from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.cpu.renderer import CpuRenderer
-from scas4d_core.engines.torch import arrays
-from scas4d_core.engines.torch import update as update_torch
+from scas4d_core.engines.engine import REPORT, StepScalars
+from scas4d_core.engines.limits import DEFAULT
+from scas4d_core.engines.plan import MAX_SCALE
+from scas4d_core.engines.torch import losses, rasterizer
+from scas4d_core.engines.torch.deformation import ClusterParams, Deltas, Layer, deform
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels import neighbour_terms
 from scas4d_core.preparation import SMALLEST_CLUSTER
-from scas4d_core.settings import SceneSettings, UpdateSettings
+from scas4d_core.settings import UpdateSettings
 from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.structure.neighbours import Neighbours, build_neighbours
 from scas4d_core.update import rates, schedule
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.parts import Work
-from scas4d_core.update.rates import Adam, Rates
-from scas4d_core.update.result import REPORT, AttemptOptions, Stopwatch, UpdateResult
+from scas4d_core.update.result import AttemptOptions, Stopwatch, UpdateResult
 from scas4d_core.update.schedule import Stopping, ViewPlan, plan_samples, view_order
 from scas4d_core.update.view_factory import ViewFactory
 
@@ -48,13 +51,17 @@ def tied(settings: UpdateSettings, gaussians: Gaussians, count: int = NEIGHBOURS
 
 
 def prepare(
-    settings: UpdateSettings = SETTINGS, truth: Gaussians = AFTER, masks: bool = True, count: int = NEIGHBOURS
+    settings: UpdateSettings = SETTINGS,
+    truth: Gaussians = AFTER,
+    masks: bool = True,
+    count: int = NEIGHBOURS,
+    engine: CpuEngine | None = None,
 ) -> tuple[FrameUpdate, list[TrainingView]]:
     """The updater of the box and the views of a frame that shows ``truth``."""
     factory = ViewFactory(RIG)
     hierarchy, neighbours = tied(settings, BEFORE, count)
-    parts = of_whole_pictures(factory, settings, hierarchy, BEFORE)
-    updater = FrameUpdate(factory, SceneSettings(), settings, hierarchy, neighbours, BEFORE, parts)
+    built = of_whole_pictures(factory, settings, hierarchy, BEFORE)
+    updater = FrameUpdate(engine or CpuEngine(), built, neighbours)
     return updater, factory.views(take_frame(1, 1.0, truth, RIG, masks), {})
 
 
@@ -132,8 +139,7 @@ def test_nothing_moving_only_changes_colours() -> None:
     settings = SETTINGS.model_copy(update={"iterations": 5})
     factory = ViewFactory(RIG)
     hierarchy, neighbours = tied(settings, still)
-    parts = of_whole_pictures(factory, settings, hierarchy, still)
-    updater = FrameUpdate(factory, SceneSettings(), settings, hierarchy, neighbours, still, parts)
+    updater = FrameUpdate(CpuEngine(), of_whole_pictures(factory, settings, hierarchy, still), neighbours)
     after = updater.run(still, factory.views(take_frame(1, 1.0, AFTER, RIG), {}), None, 1.0, 1).gaussians
     np.testing.assert_array_equal(after.means, still.means)
     np.testing.assert_array_equal(after.rotations, still.rotations)
@@ -179,7 +185,7 @@ class Iteration:
         self.gradients: list[np.ndarray] = []
         seen: list[int] = []
 
-        def step(optimizer: Adam, gradients: np.ndarray, number: int, factor: float) -> None:
+        def step(optimizer: Adam, gradients: np.ndarray, factor: float) -> None:
             table = len(self.gradients) % len(self.parameters)
             self.gradients.append(gradients.copy())
             optimizer._parameters[:] = self.parameters[table]
@@ -197,6 +203,7 @@ class Iteration:
         monkeypatch.setattr(Adam, "step", step)
         monkeypatch.setattr(CpuRenderer, "evaluate", rendered)
         monkeypatch.setattr(CpuDeformation, "neighbour_losses", looked_at)
+        self.near = updater.plan.limits.near
         self.loss = updater.run(BEFORE, views, None, 1.0, seed=9).trace.losses[1]
         self.gradients = self.gradients[len(self.parameters) :]
         assert len(seen) == 2 * settings.views
@@ -205,52 +212,52 @@ class Iteration:
 
 def twin_iteration(fused: Iteration, settings: UpdateSettings, masks: bool) -> tuple[float, list[np.ndarray]]:
     """Loss and gradients of the same parameters and views in float64 torch."""
-    rows, weights = fused.hierarchy.rows, settings.weights
-    terms = {"image": schedule.IMAGE_WEIGHT, "soft_colour": schedule.SOFT_COLOUR_WEIGHT, **weights.model_dump()}
-    del terms["mask_alone"]
-    update_of_twin = update_torch.TorchUpdate(
-        moving=rows,
-        labels=[labels.astype(np.int64) for labels in fused.hierarchy.labels],
-        graph=arrays.Graph(
-            fused.neighbours.index.astype(np.int64), fused.neighbours.weights, fused.neighbours.distances
-        ),
-        first_lengths=np.linalg.norm(BEFORE.factors[rows].astype(np.float64), axis=1),
-        rates=Rates(
-            layers=((1.0, 1.0, 1.0),) * len(fused.hierarchy.sizes),
-            position=1,
-            rotation=1,
-            scale=1,
-            colour=1,
-            colour_standing=1,
-        ),
-        weights=arrays.TermWeights(**terms),
-        max_scale=MAX_SCALE,
-        cluster_map=settings.cluster_map,
-        covariance=settings.covariance,
-        dtype=torch.float64,
-    )
-    frame = take_frame(1, 1.0, AFTER, RIG, masks)
-    views = [
-        arrays.TorchView(camera, frame.images[camera.name] / 255.0, frame.masks.get(camera.name))
-        for camera in RIG.cameras
+    rows, weights, frame = fused.hierarchy.rows, settings.weights, take_frame(1, 1.0, AFTER, RIG, masks)
+    graph = torch.tensor(fused.neighbours.index.astype(np.int64)), doubles(fused.neighbours.weights)
+    given = [doubles(table).requires_grad_() for table in fused.parameters]
+    *clusters, deltas, colours = given
+    layers = [
+        Layer(torch.tensor(labels.astype(np.int64)), ClusterParams(p[:, :3], p[:, 3:6], p[:, 6:9], p[:, 9]))
+        for labels, p in zip(fused.hierarchy.labels, clusters, strict=True)
     ]
-    *clusters, deltas, colours = fused.parameters
-    start = [arrays.ClusterArrays(p[:, :3], p[:, 3:6], p[:, 6:9], p[:, 9]) for p in clusters]
-    own = arrays.DeltaArrays(deltas[:, :3], deltas[:, 3:6], deltas[:, 6:])
-    scene = update_torch._Scene.of(update_of_twin, BEFORE, views, start, own)
-    given = torch.tensor(colours, dtype=torch.float64)
-    scene.free_colours = (given[scene.moving], given[scene.standing])
-    scene.parameter_groups(update_of_twin.rates)
-    loss = scene.loss(fused.views, torch.tensor(fused.sample))
+    own = Deltas(deltas[:, :3], deltas[:, 3:6], deltas[:, 6:])
+    means, factors, before = doubles(BEFORE.means), doubles(BEFORE.factors), doubles(BEFORE.colours)
+    now = deform(means[rows], factors[rows], layers, own, settings.cluster_map, settings.covariance)
+    features, background = colours, [0.0] * 3
+    if masks:
+        features, background = torch.cat([colours, doubles(BEFORE.foreground)[:, None]], dim=1), [0.0] * 4
+    terms = []
+    for index in fused.views:
+        camera = RIG.cameras[index]
+        moved_means, moved_factors = (
+            whole.index_copy(0, torch.tensor(rows), part)
+            for whole, part in ((means, now.means), (factors, now.factors))
+        )
+        picture = rasterizer.render(
+            moved_means, moved_factors, doubles(BEFORE.opacities), features,
+            rasterizer.CameraParams.of(camera), doubles(background), DEFAULT._replace(near=fused.near),
+        ).features  # fmt: skip
+        image = doubles(frame.images[camera.name] / 255.0)
+        terms.append(schedule.IMAGE_WEIGHT * losses.image_loss(picture[..., :3], image) / len(fused.views))
+        if masks:
+            mask = doubles(frame.masks[camera.name])[..., None]
+            terms.append(weights.mask * losses.image_loss(picture[..., 3:], mask) / len(fused.views))
+    sample, distances = torch.tensor(fused.sample), doubles(fused.neighbours.distances)
+    lengths = doubles(np.linalg.norm(BEFORE.factors[rows].astype(np.float64), axis=1))
+    terms += [
+        schedule.SOFT_COLOUR_WEIGHT * losses.soft_colour_loss(colours, before),
+        weights.rigidity * losses.rigidity_loss(now.means, now.turns, means[rows], *graph, sample),
+        weights.isometry * losses.isometry_loss(now.means, distances, *graph, sample),
+        weights.rotation * losses.rotation_loss(now.turns, *graph, sample),
+        weights.scale * losses.scale_loss(now.factors, lengths, MAX_SCALE),
+    ]
+    loss = torch.stack(terms).sum()
     loss.backward()
+    return loss.item(), [tensor.grad.numpy() for tensor in given]
 
-    def gradient(*tensors: Any) -> np.ndarray:
-        return np.concatenate([tensor.grad.numpy().reshape(len(tensor), -1) for tensor in tensors], axis=1)
 
-    tables = [gradient(layer.params.r, layer.params.t, layer.params.c, layer.params.s) for layer in scene.layers]
-    g_colours = np.empty((len(BEFORE), 3))
-    g_colours[scene.moving.numpy()], g_colours[scene.standing.numpy()] = map(gradient, scene.free_colours)
-    return loss.item(), [*tables, gradient(*scene.deltas), g_colours]
+def doubles(array: Any) -> torch.Tensor:
+    return torch.tensor(np.asarray(array), dtype=torch.float64)
 
 
 @pytest.mark.parametrize("masks", [True, False])
@@ -302,20 +309,20 @@ def test_the_reported_loss_is_that_of_the_twin(masks: bool, views: int, monkeypa
 def test_several_views_are_a_mean_and_one_is_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """The mean of a view and itself is that view to the last bit, and so is the whole update."""
     given: list[tuple[bool, float]] = []
-    inside, evaluate = FrameUpdate._pictures, CpuRenderer.evaluate
+    inside, evaluate = CpuEngine._pictures, CpuRenderer.evaluate
     last: list[Any] = []
 
     def rendered(picture: CpuRenderer, *arguments: Any) -> Any:
         last[:] = [evaluate(picture, *arguments), picture.image_part + picture.mask_part]
         return last[0]
 
-    def pictures(updater: FrameUpdate, views: Any, work: Work, *arguments: Any) -> float:
-        loss = inside(updater, views, work, *arguments)
-        given.append((work.gradients is last[0], loss - last[1]))
-        return loss
+    def pictures(engine: CpuEngine, views: Any, step: StepScalars) -> Any:
+        loss, gradients = inside(engine, views, step)
+        given.append((gradients is last[0], loss - last[1]))
+        return loss, gradients
 
     monkeypatch.setattr(CpuRenderer, "evaluate", rendered)
-    monkeypatch.setattr(FrameUpdate, "_pictures", pictures)
+    monkeypatch.setattr(CpuEngine, "_pictures", pictures)
     found = []
     for count in (1, 2, 4):
         updater, views = prepare(SETTINGS.model_copy(update={"iterations": 4, "views": count}))
@@ -334,13 +341,13 @@ def test_each_view_has_its_turn_before_any_has_another(each: int) -> None:
     settings = SETTINGS.model_copy(update={"views": each})
     _, views = prepare(settings)
     count, most = len(views), 30
-    plan = ViewPlan(views, each, most, np.random.default_rng(7))
+    plan = ViewPlan(count, each, most, np.random.default_rng(7))
     taken = [plan.take() for _ in range(most)]
     assert {len(seen) for seen in taken} == {each}
-    order = [view.name for seen in taken for view in seen]
-    assert order == [views[index].name for index in view_order(count, most * each, np.random.default_rng(7))]
+    order = [view for seen in taken for view in seen]
+    assert order == view_order(count, most * each, np.random.default_rng(7))
     rounds = [order[start : start + count] for start in range(0, len(order) - count + 1, count)]
-    assert all(len(set(names)) == count for names in rounds)
+    assert all(len(set(seen)) == count for seen in rounds)
 
 
 def test_cameras_are_judged_once_all_were_seen() -> None:
@@ -367,8 +374,7 @@ def test_without_a_graph_no_neighbour_term_is_computed(monkeypatch: pytest.Monke
     with pytest.raises(AssertionError, match="computed"):
         updater.run(BEFORE, views, None, 1.0, seed=1)
     factory = ViewFactory(RIG)
-    parts = of_whole_pictures(factory, settings, updater.hierarchy, BEFORE)
-    bare = FrameUpdate(factory, SceneSettings(), settings, updater.hierarchy, None, BEFORE, parts)
+    bare = FrameUpdate(CpuEngine(), of_whole_pictures(factory, settings, updater.hierarchy, BEFORE), None)
     assert len(bare.run(BEFORE, views, None, 1.0, seed=1).trace.losses) == 2
 
 
@@ -421,9 +427,10 @@ def test_deformation_starts_from_what_it_is_given() -> None:
 def test_a_layer_that_begins_late_stays_where_it_was_before(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rates, "LAYER_STARTS", (0.0, 0.5, 0.5))
     settings = SETTINGS.model_copy(update={"own_start": 0.5, "iterations": 3})
-    updater, views = prepare(settings)
+    engine = CpuEngine()
+    updater, views = prepare(settings, engine=engine)
     seen: list[list[np.ndarray]] = []
-    inside = updater._deformation
+    inside = engine._deformation
     forward = inside.forward
 
     def record() -> None:
@@ -449,7 +456,7 @@ def test_the_stages_are_all_the_time_and_the_timers_are_a_part_of_the_report() -
 def test_an_update_that_tells_less_finds_the_same_bits() -> None:
     updater, views = prepare()
     told = updater.run(BEFORE, views, None, 1.0, seed=1)
-    updater.tells = False
+    updater.curve = False
     quiet = updater.run(BEFORE, views, None, 1.0, seed=1)
     for name, array in told.gaussians.arrays().items():
         np.testing.assert_array_equal(array, quiet.gaussians.arrays()[name])

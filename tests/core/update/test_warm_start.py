@@ -8,9 +8,10 @@ from box_scene import MOVING, make_box, moved
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.engines.cpu.deformation import CpuDeformation
-from scas4d_core.gaussians import Gaussians
+from scas4d_core.engines.engine import Tables
+from scas4d_core.gaussians import Gaussians, quaternion_products
 from scas4d_core.structure.hierarchy import build_hierarchy
-from scas4d_core.update.warm_start import Motion, quaternion_products, rotate, warm_start
+from scas4d_core.update.warm_start import Motion, rotate, warm_start
 from studies.constants import varied
 
 AXIS = np.array([0.6, 0.0, 0.8])
@@ -42,12 +43,22 @@ def set_turn(
 
 def begin(model: CpuDeformation, before: Gaussians) -> None:
     model.start(before)
-    warm_start(model, None, 1.0, 0.0)
+    warmed(model, None, 1.0)
+
+
+def warmed(model: CpuDeformation, motion: Motion | None, seconds: float) -> None:
+    tables = warm_start(model.hierarchy, motion, seconds, 0.0)
+    for values, given in zip([*model.clusters, model.deltas], [*tables.clusters, tables.deltas], strict=True):
+        values[:] = given
+
+
+def motion_of(model: CpuDeformation, seconds: float) -> Motion:
+    return Motion.of(Tables(model.clusters, model.deltas), model.hierarchy, seconds)
 
 
 def predicted(model: CpuDeformation, now: Gaussians, motion: Motion | None, seconds: float) -> np.ndarray:
     model.start(now)
-    warm_start(model, motion, seconds, 0.0)
+    warmed(model, motion, seconds)
     model.forward()
     return model.means.copy()
 
@@ -67,7 +78,7 @@ def test_a_constant_rotation_about_an_axis_goes_on(clusters: tuple[int, ...], la
     moving = slice(0, MOVING)
     np.testing.assert_allclose(model.means[moving], turned(box.means[moving], angle), atol=1e-6)
     now = box.replace(means=model.means.copy(), factors=model.factors.copy())
-    found = predicted(model, now, Motion.of(model, 1.0), 1.0)
+    found = predicted(model, now, motion_of(model, 1.0), 1.0)
     truth = turned(box.means[moving], 2 * angle)
     step = np.linalg.norm(truth - now.means[moving], axis=1)
     assert np.linalg.norm(found[moving] - truth, axis=1).max() < 0.01 * step.min()
@@ -99,7 +110,7 @@ def test_a_part_that_turns_on_a_turning_body_goes_on() -> None:
     set_turn(model, 1, near, part, turn.apply(own), turned(joint, body))
     model.forward()
     np.testing.assert_allclose(model.means[:MOVING], at(1), atol=1e-6)
-    found = predicted(model, before.replace(means=model.means.copy()), Motion.of(model, 1.0), 1.0)
+    found = predicted(model, before.replace(means=model.means.copy()), motion_of(model, 1.0), 1.0)
     step = np.linalg.norm(at(2) - at(1), axis=1)
     assert np.linalg.norm(found[:MOVING] - at(2), axis=1).max() < 0.03 * np.median(step)
 
@@ -117,7 +128,7 @@ def test_displacement_is_in_proportion_to_the_time(ratio: float, by_deltas: bool
     else:
         model.clusters[1][:, 3:6] = shift
     model.forward()
-    found = predicted(model, after, Motion.of(model, 0.2), seconds=0.2 * ratio)
+    found = predicted(model, after, motion_of(model, 0.2), seconds=0.2 * ratio)
     np.testing.assert_allclose(found[:MOVING] - after.means[:MOVING], np.tile(ratio * shift, (MOVING, 1)), atol=2e-6)
 
 
@@ -127,7 +138,7 @@ def test_a_turn_is_in_proportion_to_the_time() -> None:
     begin(model, box)
     set_turn(model, 0, every(model, 0), 0.1, AXIS, CENTRE)
     model.forward()
-    predicted(model, box.replace(means=model.means.copy()), Motion.of(model, 1.0), seconds=2.0)
+    predicted(model, box.replace(means=model.means.copy()), motion_of(model, 1.0), seconds=2.0)
     angle = 2 * np.arctan2(np.linalg.norm(model.turns[:, 1:], axis=1), model.turns[:, 0])
     np.testing.assert_allclose(angle, 0.2, rtol=1e-2)
 
@@ -139,7 +150,7 @@ def test_share_zero_and_no_motion_are_the_identity() -> None:
     set_turn(model, 0, every(model, 0), 0.1, AXIS, CENTRE)
     model.deltas[:] = 0.01
     model.forward()
-    motion = Motion.of(model, 1.0)
+    motion = motion_of(model, 1.0)
     with varied("scas4d_core.update.warm_start.WARM_START", 0.0):
         nothing = predicted(model, box, motion, 1.0)
     for found in (nothing, predicted(model, box, None, 1.0)):

@@ -90,15 +90,10 @@ def seen(
     rig = make_rig()
     factory = ViewFactory(rig)
     views = factory.views(take_frame(index, float(index), true, rig, masks), {})
-    picture = CpuRenderer(factory, (0.0, 0.0, 0.0), 1.0, 0.0, limits=scene_limits("auto", rig.radius))
-    return Seen(index, state, UpdateResult(state, None, UpdateTrace(), carried=carried or {}), rig, views, picture)
+    renderer = CpuRenderer((0.0, 0.0, 0.0), limits=scene_limits("auto", rig.radius))
+    return Seen(index, state, UpdateResult(state, None, UpdateTrace(), carried=carried or {}), rig, views, renderer)
 
 
 def psnr(state: Gaussians, frame: Seen) -> float:
     """DB of a state, mean over the views of a frame."""
-    features = np.concatenate([state.colours, state.foreground[:, None]], axis=1)
-    found = []
-    for view in frame.views:
-        frame.picture.measure(state.means, state.factors, state.opacities, features, view)
-        found.append(frame.picture.psnr)
-    return float(np.mean(found))
+    return float(np.mean([frame.renderer.compare(state, view).psnr for view in frame.views]))

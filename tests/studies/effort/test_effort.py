@@ -112,5 +112,5 @@ def test_reports_are_measured_with_and_without(tmp_path: Path, monkeypatch: pyte
     assert row["updates"] == 2
     assert 0 < row["share"] <= row["share_worst"] < 1
     assert row["stages"]["report"] > 0
-    assert FrameUpdate.tells
+    assert FrameUpdate.curve
     assert (tmp_path / "effort" / "robot-report.json").exists()

@@ -55,7 +55,7 @@ def test_the_page_keeps_what_stands_beside_its_marks(tmp_path: Path) -> None:
 @pytest.mark.parametrize("guard", list(mutate.mutants()), ids=lambda guard: guard.name)
 def test_each_guard_can_be_taken_away(guard: mutate.Guard, tmp_path: Path) -> None:
     """The places that a mutation edits are there once, and a section of the catalogue looks at it."""
-    for name in ("guards.py", "update/deformation.py", "structure/hierarchy.py", "kernels/projection.py"):
+    for name in ("guards.py", "engines/cpu/deformation.py", "structure/hierarchy.py", "kernels/projection.py"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text((mutate.CORE / name).read_text())
     before = {path: path.read_text() for path in tmp_path.rglob("*.py")}
@@ -69,7 +69,7 @@ def test_no_clamp_of_the_kernels_has_a_number_of_its_own() -> None:
     numbers = re.compile(r"(?<![\w.])\d+(?:\.\d+)?e[-+]?(\d+)")
     others = [
         mutate.CORE / name
-        for name in ("torch_backend/deformation.py", "torch_backend/losses.py", "update/picture_loss.py")
+        for name in ("engines/torch/deformation.py", "engines/torch/losses.py", "engines/cpu/renderer.py")
     ]
     for path in [*(mutate.CORE / "kernels").glob("*.py"), *others]:
         code = re.sub(r'(?s:""".*?""")|#.*', "", path.read_text())

@@ -10,16 +10,17 @@ from box_scene import make_box, make_rig, moved, take_frame
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.captures.frame import Frame
-from scas4d_core.effects.appearance.camera_gain import FOOT, NAME, POWER, exposure_of, known_gains, measured
-from scas4d_core.effects.effect import effect
-from scas4d_core.effects.switches import contradictions, joined
+from scas4d_core.effects.appearance.camera_gain import NAME, POWER, known_gains
+from scas4d_core.effects.switches import joined
+from scas4d_core.engines.cpu.engine import CpuEngine
+from scas4d_core.engines.exposure import FOOT, exposure_of, measured_gain
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import SceneSettings, Settings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.parts import PartsBuilder
+from scas4d_core.update.parts import PlanBuilder
 from scas4d_core.update.view_factory import ViewFactory
 
 RIG = make_rig()
@@ -120,21 +121,15 @@ def test_a_picture_that_is_dark_tells_no_gain() -> None:
     picture = 1.1 * shown + 0.1 * FOOT
     picture[2] = 0.01
     picture[:, :3] = 1.0  # saturated pixels have no say
-    assert measured(picture, shown) == pytest.approx(np.array([1.1, 1.1, np.nan]), abs=1e-4, nan_ok=True)
-
-
-def test_another_device_is_refused() -> None:
-    settings = Settings.model_construct(device="cuda", effects={NAME: "on"})
-    assert [name for name, *_ in contradictions(settings)] == [NAME]
-    assert effect(NAME).refused(Settings()) is None
+    assert measured_gain(picture, shown) == pytest.approx(np.array([1.1, 1.1, np.nan]), abs=1e-4, nan_ok=True)
 
 
 def test_an_attempt_starts_from_the_exposures_of_the_frame_and_not_from_those_of_another() -> None:
     settings = UpdateSettings(clusters=(2, 12), iterations=24)
     factory = ViewFactory(RIG)
     hierarchy = build_hierarchy(BOX.means, BOX.moving, settings.clusters, SMALLEST_CLUSTER)
-    parts = joined(PartsBuilder(SceneSettings(), settings, factory, hierarchy, BOX), [NAME])
-    updater = FrameUpdate(factory, SceneSettings(), settings, hierarchy, None, BOX, parts)
+    built = joined(PlanBuilder(SceneSettings(), settings, factory, hierarchy, BOX), [NAME])
+    updater = FrameUpdate(CpuEngine(), built, None)
     views = factory.views(shot(1, GAINS), {})
     first, second = (updater.run(BOX, views, None, 1 / 30, seed=1) for _ in range(2))
     assert all((view.exposure[:3] == [1, 0]).all() for view in views)

@@ -13,16 +13,15 @@ from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import WorldFrame
-from scas4d_core.effects.appearance.direction import EFFECT
+from scas4d_core.effects.appearance.direction import EFFECT, neighbourhood_turns, neighbourhoods
 from scas4d_core.effects.evidence import Evidence, Seen
 from scas4d_core.effects.switches import first_switches, joined, names_on
+from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.cpu.gloss import (
     GLOSS,
     Shading,
     colours_seen,
     gloss_rate,
-    neighbourhood_turns,
-    neighbourhoods,
     without_turn,
 )
 from scas4d_core.engines.cpu.renderer import CpuRenderer
@@ -42,7 +41,7 @@ from scas4d_core.settings import SceneSettings, Settings, StaticSettings
 from scas4d_core.storage.history import History
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.parts import PartsBuilder
+from scas4d_core.update.parts import PlanBuilder
 from scas4d_core.update.view_factory import ViewFactory
 
 
@@ -63,11 +62,10 @@ def after(before: Gaussians, truth: Gaussians, effects: list[str]) -> tuple[Gaus
     views = factory.views(frame(truth, 1), {}, use_masks=False)
     hierarchy = build_hierarchy(before.means, before.moving, (2, 12), SMALLEST_CLUSTER)
     settings = UPDATE.model_copy(update={"iterations": 24})
-    parts = joined(PartsBuilder(SceneSettings(), settings, factory, hierarchy, before), effects)
-    updater = FrameUpdate(factory, SceneSettings(), settings, hierarchy, None, before, parts)
+    built = joined(PlanBuilder(SceneSettings(), settings, factory, hierarchy, before), effects)
+    updater = FrameUpdate(CpuEngine(), built, None)
     result = updater.run(before, views, None, 1.0, seed=1)
-    picture_loss = CpuRenderer(factory, (0, 0, 0), 1.0, 0.0)
-    return result.gaussians, EFFECT.evidence(Seen(1, before, result, rig(), views, picture_loss))
+    return result.gaussians, EFFECT.evidence(Seen(1, before, result, rig(), views, CpuRenderer((0, 0, 0))))
 
 
 @pytest.mark.slow
@@ -93,11 +91,6 @@ def test_a_pin_needs_no_evidence_and_off_is_never_tried() -> None:
     off = Settings.model_validate({"effects": {"direction": "off"}})
     assert not first_switches(off, 0, {"direction": Evidence(1, "")})["direction"].on
     assert "direction" not in names_on(first_switches(Settings(), 0))
-
-
-def test_a_gpu_is_refused() -> None:
-    assert EFFECT.refused(Settings()) is None
-    assert EFFECT.refused(Settings.model_validate({"device": "cuda"})) == ("device is 'cuda'", "set device to 'cpu'")
 
 
 def test_normals_are_those_of_the_ball() -> None:

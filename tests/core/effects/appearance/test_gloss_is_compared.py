@@ -11,9 +11,10 @@ from scas4d_core.effects.evidence import FitTime
 from scas4d_core.effects.presence.growing import _Fit, settled
 from scas4d_core.effects.presence.novelty import novelties
 from scas4d_core.effects.switches import joined
-from scas4d_core.engines.cpu.deformation import CpuDeformation
+from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.cpu.gloss import colours_seen
 from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.engine import Tables
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
@@ -25,7 +26,7 @@ from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.update.best_state import BestState, ProbeViews, mean_error
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.parts import PartsBuilder
+from scas4d_core.update.parts import PlanBuilder
 from scas4d_core.update.result import AttemptOptions, UpdateResult
 from scas4d_core.update.schedule import Stopping
 from scas4d_core.update.view_factory import ViewFactory
@@ -33,7 +34,7 @@ from scas4d_core.update.view_factory import ViewFactory
 BALL = sphere()
 PLAIN = BALL.replace(gloss=None, environment=None)
 FACTORY = ViewFactory(rig())
-PICTURE = CpuRenderer(FACTORY, (0.0, 0.0, 0.0), 1.0, 0.0)
+RENDERER = CpuRenderer((0.0, 0.0, 0.0))
 SETTINGS = UpdateSettings(iterations=24, clusters=(2, 12))
 CLOSE = 0.7
 """Of the error without the gloss, that is left with it: probe views are coarser than the pictures."""
@@ -43,11 +44,26 @@ def views(truth: Gaussians = BALL) -> list[TrainingView]:
     return FACTORY.views(frame(truth, 1), {}, use_masks=False)
 
 
+def updater(before: Gaussians, engine: CpuEngine, clusters: tuple[int, ...] = (2, 12)) -> FrameUpdate:
+    hierarchy = build_hierarchy(before.means, before.moving, clusters, SMALLEST_CLUSTER)
+    built = PlanBuilder(SceneSettings(), SETTINGS, FACTORY, hierarchy, before)
+    return FrameUpdate(engine, joined(built, ["moving_colour", "direction"]), None)
+
+
 def run(before: Gaussians) -> UpdateResult:
-    hierarchy = build_hierarchy(before.means, before.moving, (2, 12), SMALLEST_CLUSTER)
-    parts = joined(PartsBuilder(SceneSettings(), SETTINGS, FACTORY, hierarchy, before), ["moving_colour", "direction"])
-    updater = FrameUpdate(FACTORY, SceneSettings(), SETTINGS, hierarchy, None, before, parts)
-    return updater.run(before, views(), None, 1.0, seed=1, options=AttemptOptions(stopping=Stopping(24), compare=True))
+    return updater(before, CpuEngine()).run(
+        before, views(), None, 1.0, seed=1, options=AttemptOptions(stopping=Stopping(24), compare=True)
+    )
+
+
+def probed(state: Gaussians) -> float:
+    """Mean error of a state in the probe views."""
+    engine = CpuEngine()
+    updater(state, engine)
+    found = ProbeViews(FACTORY, engine, views())
+    engine.load_views(views(), found.views)
+    engine.load_state(state)
+    return mean(found.errors(moved=False, learnt=False))
 
 
 def mean(errors: dict[str, float]) -> float:
@@ -55,7 +71,7 @@ def mean(errors: dict[str, float]) -> float:
 
 
 def test_the_candidates_of_an_update_have_the_gloss_that_they_are_committed_with() -> None:
-    plain = mean(ProbeViews(FACTORY, PICTURE, views()).errors(PLAIN))
+    plain = probed(PLAIN)
     known = run(BALL).trace.errors
     assert mean(known[Candidate.STILL]) < CLOSE * plain
     assert BALL.environment is not None
@@ -65,35 +81,39 @@ def test_the_candidates_of_an_update_have_the_gloss_that_they_are_committed_with
     assert state.environment is not None
     assert state.environment.any()
     # The gloss of the committed state is turned with its neighbourhood, that of the candidate with each Gaussian.
-    assert mean(errors) == pytest.approx(mean(ProbeViews(FACTORY, PICTURE, views()).errors(state)), rel=0.02)
-    assert mean(errors) < 0.98 * mean(ProbeViews(FACTORY, PICTURE, views()).errors(state.replace(gloss=None)))
+    assert mean(errors) == pytest.approx(probed(state), rel=0.02)
+    assert mean(errors) < 0.98 * probed(state.replace(gloss=None))
 
 
 def test_a_candidate_is_seen_with_its_normals_turned() -> None:
-    hierarchy = build_hierarchy(BALL.means, BALL.moving, (2,), SMALLEST_CLUSTER)
-    deformation = CpuDeformation(hierarchy, None, np.ones((COUNT, 3), np.float32), "centred", "entangled")
-    deformation.start(BALL)
-    best = BestState(ProbeViews(FACTORY, PICTURE, views()), deformation, BALL, None, 1.0, 0.5)
+    engine = CpuEngine()
+    hierarchy = updater(BALL, engine, (2,)).hierarchy
+    probes = ProbeViews(FACTORY, engine, views())
+    engine.load_views(views(), probes.views)
+    engine.load_state(BALL)
+    best = BestState(probes, engine, hierarchy, None, 1.0, 0.5)
     best.start()
-    still = best.error(BALL)
-    deformation.clusters[0][:, :3] = [0.0, 0.4, 0.0]
-    turned = best.error(BALL)
+    still = best.error()
+    tables = Tables.still(hierarchy)
+    tables.clusters[0][:, :3] = [0.0, 0.4, 0.0]
+    engine.set_tables(tables)
+    turned = best.error()
     assert turned > still
-    deformation.turns[:] = [1, 0, 0, 0]
-    stays = mean(best._probes.errors(BALL.replace(means=deformation.means, factors=deformation.factors)))
+    moved = engine.state(learnt=False)
+    stays = probed(BALL.replace(means=moved.means, factors=moved.factors))
     assert abs(turned - stays) > 1e-3 * stays
 
 
 def test_cameras_that_are_looked_at_again_see_the_gloss() -> None:
-    solver = FrameSolver(None, FACTORY, PICTURE, SETTINGS)  # type: ignore[arg-type]
+    solver = FrameSolver(None, FACTORY, RENDERER, SETTINGS)  # type: ignore[arg-type]
     seen, plain = solver._measured(views(), BALL), solver._measured(views(), PLAIN)
     assert min(seen.values()) > max(plain.values())
     assert min(seen.values()) > 40
 
 
 def test_the_light_is_not_brighter_by_what_is_mirrored() -> None:
-    assert gain_of(PICTURE, BALL, views()) == pytest.approx(1.0, abs=0.005)
-    assert gain_of(PICTURE, PLAIN, views()) != pytest.approx(1.0, abs=0.02)
+    assert gain_of(RENDERER, BALL, views()) == pytest.approx(1.0, abs=0.005)
+    assert gain_of(RENDERER, PLAIN, views()) != pytest.approx(1.0, abs=0.02)
 
 
 def test_what_stands_is_not_taken_for_what_jumped_by_its_gloss() -> None:
@@ -101,20 +121,20 @@ def test_what_stands_is_not_taken_for_what_jumped_by_its_gloss() -> None:
     thing = Gaussians.of_points(0.1 * PLAIN.means[::10] + np.float32([0, -0.32, 0]), 0.02, [0.2, 0.9, 0.2])
     state = BALL.replace(foreground=np.zeros(COUNT, np.float32)).joined(thing)
     way = np.array([0.1, 0.0, 0.05])
-    jumped = find_jump(state, views(shifted(state, way)), PICTURE, rig())
+    jumped = find_jump(state, views(shifted(state, way)), RENDERER, rig())
     assert jumped is not None
     np.testing.assert_allclose(jumped, way, atol=0.02)
 
 
 def test_a_glossy_thing_has_nothing_new() -> None:
-    said = novelties(BALL.replace(foreground=np.zeros(COUNT, np.float32)), BALL.colours, views(), rig(), PICTURE)
+    said = novelties(BALL.replace(foreground=np.zeros(COUNT, np.float32)), BALL.colours, views(), rig(), RENDERER)
     assert sum(int(one.new.sum()) for one in said) == 0
     assert max(float(one.error.max()) for one in said) < 3e-3
 
 
 def test_what_is_born_is_fitted_beside_what_the_cameras_see() -> None:
     parameters = np.zeros((1, 15), np.float32)
-    fit = _Fit(BALL, parameters, views(), rig(), PICTURE)
+    fit = _Fit(BALL, parameters, views(), rig(), RENDERER)
     assert len(fit._crops) == 12
     for crop in fit._crops:
         rows = cKDTree(BALL.means).query(crop.means[: crop.others])[1]
@@ -125,7 +145,7 @@ def test_what_is_glossy_and_came_back_is_not_settled() -> None:
     grown = BALL.joined(Gaussians.of_points(BALL.means[:5] + np.float32(0.02), 0.01))
     rng = np.random.default_rng(0)
     rows = np.array([3, 4, COUNT + 1])
-    after = settled(grown, rows, views(), rig(), PICTURE, rng, FitTime())
+    after = settled(grown, rows, views(), rig(), RENDERER, rng, FitTime())
     assert np.array_equal(after.means[:COUNT], grown.means[:COUNT])
     assert not np.array_equal(after.means[COUNT + 1], grown.means[COUNT + 1])
-    assert settled(grown, rows[:2], views(), rig(), PICTURE, rng, FitTime()) is grown
+    assert settled(grown, rows[:2], views(), rig(), RENDERER, rng, FitTime()) is grown

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from box_scene import MOVING, make_box, make_rig, take_frame
 from effect_cases import builder, same, updated
-from scas4d_core.effects.appearance.colours import FASTER, Colours
 
 from scas4d_core.effects.appearance.light import change_of_light, orientation_and_place
 from scas4d_core.effects.switches import contradictions, first_switches, joined, names_on
@@ -14,7 +13,7 @@ from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings, UpdateSettings
-from scas4d_core.update.rates import Rates
+from scas4d_core.update.rates import FASTER_IN_CHANGING_LIGHT, Rates
 
 RIG = make_rig()
 BOX = make_box().replace(colours=np.random.default_rng(1).uniform(0.2, 0.6, (448, 3)).astype(np.float32))
@@ -49,15 +48,14 @@ def test_what_changes_together_is_light_and_noise_is_not() -> None:
 
 
 def test_colours_are_freer_while_the_light_changes() -> None:
-    parts = joined(builder(), ["moving_colour", "standing_colour", "light"])
+    colours = joined(builder(), ["moving_colour", "standing_colour", "light"]).plan.colours
     rates = Rates.of(UpdateSettings(rate_colour=0.002, rate_colour_standing=0.01), 2, 4.0)
-    colours = parts.find(Colours)
     assert colours is not None
-    assert colours.freed(rates) == (FASTER * 0.01, FASTER * 0.01)
-    colours.lit = False
-    assert colours.freed(rates) == (0.002, 0.01)
+    assert rates.of_colours(colours) == (FASTER_IN_CHANGING_LIGHT * 0.01, FASTER_IN_CHANGING_LIGHT * 0.01)
+    colours.changing_light = False
+    assert rates.of_colours(colours) == (0.002, 0.01)
     colours.moving = False
-    assert colours.freed(rates) == (0.0, 0.01)
+    assert rates.of_colours(colours) == (0.0, 0.01)
 
 
 def test_it_frees_no_colours_that_are_held() -> None:

@@ -73,7 +73,7 @@ def test_a_state_that_did_not_move_keeps_its_colours(
 ) -> None:
     asked: list[int] = []
     monkeypatch.setattr(shading, "follow_pictures", lambda state, *_: asked.append(1) or state)
-    monkeypatch.setattr("scas4d_core.update.best_state.BestState.end", lambda self, look, iterations, left_out: kept)
+    monkeypatch.setattr("scas4d_core.update.best_state.BestState.end", lambda self, iterations, left_out: kept)
     settings = Settings.model_validate({"update": {"clusters": (2, 12), "iterations": 3}})
     scene = Reconstruction.start(RIG, take_frame(0, 0.0, BOX, RIG), settings, static=StaticResult(BOX, {}, []))
     scene.step(take_frame(1, 0.1, turned(1), RIG))
@@ -91,12 +91,12 @@ def test_steps_are_those_of_a_dense_twin() -> None:
         sums, weights = np.zeros((len(BOX), 3)), np.full(len(BOX), closed_form.FEW)
         for view in from_all_sides(views)[first::SUBSETS]:
             features = state.features(state.colours)
-            residual = view.target[:3].astype(np.float64) - picture.render(state, features, view).features[:3]
+            residual = view.target[:3].astype(np.float64) - picture.render(state, view.camera, features).features[:3]
             residual = residual.clip(-MOST, MOST)
             for row in rows:
                 marked = np.zeros_like(features)
                 marked[row] = 1
-                share = picture.render(state, marked, view).features[3].astype(np.float64)
+                share = picture.render(state, view.camera, marked).features[3].astype(np.float64)
                 sums[row] += (share * residual).sum(axis=(1, 2))
                 weights[row] += share.sum()
         state = state.replace(colours=(state.colours + sums / weights[:, None]).astype(np.float32))
@@ -109,14 +109,14 @@ def test_steps_are_those_of_a_dense_twin() -> None:
 
 def pictures(shown: Gaussians) -> tuple[list, CpuRenderer]:  # type: ignore[type-arg]
     factory = ViewFactory(RIG)
-    return factory.views(take_frame(1, 0.1, shown, RIG), {}), CpuRenderer(factory, (0.1, 0.2, 0.3), 1.0, 0.0)
+    return factory.views(take_frame(1, 0.1, shown, RIG), {}), CpuRenderer((0.1, 0.2, 0.3))
 
 
 def test_the_pixels_that_move_alone_give_the_same_bits() -> None:
     views, whole = pictures(turned(2, 0.05))
     rows = np.flatnonzero(BOX.moving)
-    part = ChangedPixels(ViewFactory(RIG), (0.1, 0.2, 0.3), 1.0, 0.0, rows, len(BOX))
-    part.begin(BOX)
+    part = ChangedPixels((0.1, 0.2, 0.3), 1.0, 0.0, rows, len(BOX))
+    part.load_state(BOX)
     for one, other in zip(
         *(follow_pictures(BOX, views, by, MOVES).arrays().values() for by in (whole, part)), strict=True
     ):

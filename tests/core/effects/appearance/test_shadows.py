@@ -9,7 +9,7 @@ import pytest
 from box_scene import make_box, make_rig, take_frame
 
 from scas4d_core.effects.appearance.shadows import NAME
-from scas4d_core.effects.switches import contradictions, first_switches
+from scas4d_core.effects.switches import first_switches
 from scas4d_core.engines.views import SIDE
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_outcome import Candidate
@@ -90,17 +90,15 @@ def test_a_scene_in_which_all_moves_has_none() -> None:
     assert not scene._prepared.carried.switches[NAME].on
 
 
-def test_on_a_gpu_colours_follow_in_every_iteration_instead() -> None:
-    switches = first_switches(Settings(device="cuda"), 0)
-    assert (switches[NAME].on, switches["standing_colour"].on) == (False, True)
+def test_colours_of_what_stands_follow_in_every_iteration_only_where_that_is_pinned() -> None:
     assert not first_switches(Settings(), 0)["standing_colour"].on
-    assert [name for name, *_ in contradictions(Settings(device="cuda", effects={NAME: "on"}))] == [NAME]
+    assert first_switches(Settings(effects={"standing_colour": "on"}), 0)["standing_colour"].on
 
 
 def test_an_update_that_is_not_kept_teaches_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     truth = shaded(0.3)
     monkeypatch.setattr(
-        "scas4d_core.update.best_state.BestState.end", lambda self, look, iterations, left_out: Candidate.STILL
+        "scas4d_core.update.best_state.BestState.end", lambda self, iterations, left_out: Candidate.STILL
     )
     np.testing.assert_array_equal(followed("on", truth, frames=1).history.newest.colours, STATE.colours)
 

@@ -16,7 +16,7 @@ from scas4d_core.cameras import Rig
 from scas4d_core.effects.cameras.alignment import Equations, adjoint, in_pixels, motion_of, of_the_world, offset_of
 from scas4d_core.effects.cameras.pose_drift import LEAST, NAME, TURN, Poses, bounded, centred, posed, stepped
 from scas4d_core.effects.effect import effect
-from scas4d_core.effects.switches import IDLE, contradictions, first_switches, kept_of
+from scas4d_core.effects.switches import IDLE, kept_of
 from scas4d_core.engines.views import CameraArrays
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.reconstruction import Reconstruction
@@ -263,12 +263,6 @@ def test_evidence_of_nothing() -> None:
 def test_poses_that_are_not_known_are_those_of_the_calibration() -> None:
     assert posed(RIG, {}) is RIG
     assert posed(RIG, {NAME: Poses.of({}, 6).arrays()}) is RIG
-
-
-def test_another_device_is_refused() -> None:
-    settings = Settings.model_construct(device="cuda", effects={NAME: "on"})
-    assert [name for name, *_ in contradictions(settings)] == [NAME]
-    assert first_switches(Settings(device="cuda"), 0)[NAME].text == "device is 'cuda'"
 
 
 def test_a_few_cameras_teach_nothing() -> None:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
-from box_scene import look_at, make_box, take_frame
-from effect_cases import BEFORE, UPDATE, builder, same, updated
-from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
+from box_scene import look_at, make_box, moved, take_frame
+from effect_cases import BEFORE, UPDATE, builder, same, updated, updater_of
+from effect_cases import RIG as BOX_RIG
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Rig
-from scas4d_core.effects.coherence.bending import EFFECT, PATCH, Bends, bend, turns_of
+from scas4d_core.effects.coherence.bending import EFFECT, PATCH, bend, turns_of
 from scas4d_core.effects.switches import contradictions, first_switches, joined, names_on
+from scas4d_core.engines.cpu.engine import CpuEngine
+from scas4d_core.engines.engine import StepScalars
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.presets import PRESETS
@@ -147,21 +151,29 @@ def test_presets_contradict_nothing() -> None:
 
 def test_it_leaves_rotation_out_and_lets_rigidity_fall() -> None:
     usual = list(names_on(first_switches(Settings(), 0)))
-    parts = joined(builder(), [*usual, "bending"])
-    terms = parts.find(NeighbourTerms)
-    falls = parts.find(Bends)
-    assert terms is not None
-    assert falls is not None
-    assert terms.strengths == [4.0, 6.0, 0.0]
-    found = []
-    for iteration in range(4):
-        falls.step(None, iteration, 4)  # type: ignore[arg-type]
-        found.append(terms.strengths[0])
-    np.testing.assert_allclose(found, [2 + 2 * np.cos(np.pi * k / 4) for k in (1, 2, 3, 4)], atol=1e-12)
-    falls.start(None)  # type: ignore[arg-type]
-    assert terms.strengths == [4.0, 6.0, 0.0]
+    built = joined(builder(update=UPDATE.model_copy(update={"iterations": 4})), [*usual, "bending"])
+    plan = built.plan
+    assert (plan.rigidity, plan.isometry, plan.rotation) == (4.0, 6.0, 0.0)
+    engine = Weighing()
+    updater = updater_of(built, engine)
+    views = built.factory.views(take_frame(1, 1.0, moved(BEFORE), BOX_RIG), {})
+    for _ in range(2):  # the next update begins with the whole weight
+        engine.rigidity.clear()
+        updater.run(BEFORE, views, None, 1.0, seed=3)
+        np.testing.assert_allclose(engine.rigidity, [2 + 2 * np.cos(np.pi * k / 4) for k in range(4)], atol=1e-12)
     loose = joined(builder(), [name for name in usual if name != "rigidity"] + ["bending"])
-    assert loose.find(Bends) is None
+    assert not loose.plan.rigidity_fades
+
+
+class Weighing(CpuEngine):
+    """Notes the weight of rigidity in each iteration."""
+
+    def __init__(self) -> None:
+        self.rigidity: list[float] = []
+
+    def iterate(self, views: Sequence[int], step: StepScalars) -> None:
+        self.rigidity.append(step.rigidity)
+        super().iterate(views, step)
 
 
 def test_its_updates_are_others_and_the_same_again() -> None:

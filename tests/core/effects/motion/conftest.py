@@ -18,6 +18,6 @@ from scas4d_core.settings import Settings
 def preparation() -> Callable[[Settings], Preparation]:
     """Of the box, with settings."""
     factory = builder().factory
-    picture = CpuRenderer(factory, (0, 0, 0), 1.0, 0.0)
+    renderer = CpuRenderer((0, 0, 0))
     assert factory.rig is RIG
-    return lambda settings: Preparation(factory, settings, WorldFrame(np.zeros(3)), picture)
+    return lambda settings: Preparation(factory, settings, WorldFrame(np.zeros(3)), renderer)

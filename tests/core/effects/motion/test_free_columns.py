@@ -8,21 +8,20 @@ from functools import cache
 import numpy as np
 import pytest
 from box_scene import MOVING, moved, take_frame
-from effect_cases import BEFORE, RIG, UPDATE, builder, same
-from scas4d_core.effects.coherence.neighbour_terms import NeighbourTerms
-from scas4d_core.engines.torch.device_update import DeviceUpdate
+from effect_cases import BEFORE, RIG, UPDATE, builder, same, updater_of
 
 from scas4d_core.checkpoint import CarryOver
 from scas4d_core.effects.motion.free_columns import MOVES
 from scas4d_core.effects.switches import first_switches, joined, names_on
-from scas4d_core.engines.cpu.deformation import CpuDeformation
+from scas4d_core.engines.cpu import engine as cpu_engine
+from scas4d_core.engines.cpu.adam import Adam
+from scas4d_core.engines.cpu.engine import CpuEngine
+from scas4d_core.engines.engine import UpdateEngine
+from scas4d_core.engines.torch.engine import TorchEngine
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.presets import SettingError, preset
 from scas4d_core.settings import Settings, UpdateSettings
-from scas4d_core.structure.neighbours import build_neighbours
-from scas4d_core.update import frame_update
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.rates import Adam, Rates
 from scas4d_core.update.result import AS_SET, AttemptOptions, UpdateResult
 from scas4d_core.update.warm_start import Motion
 
@@ -45,21 +44,11 @@ def without(*names: str) -> list[str]:
     return [name for name in usual() if name not in names]
 
 
-def updater(
-    effects: Sequence[str], update: UpdateSettings = UPDATE, kind: type = FrameUpdate, **options: str
-) -> FrameUpdate | DeviceUpdate:
-    parts = joined(builder(update=update), effects)
-    rows = parts.hierarchy.rows
-    neighbours = build_neighbours(BEFORE.means[rows], 20, 200.0) if parts.find(NeighbourTerms) else None
-    made: FrameUpdate | DeviceUpdate = kind(
-        parts.factory, parts.scene, update, parts.hierarchy, neighbours, BEFORE, parts, **options
-    )
-    return made
+def updater(effects: Sequence[str], update: UpdateSettings = UPDATE, engine: UpdateEngine | None = None) -> FrameUpdate:
+    return updater_of(joined(builder(update=update), effects), engine)
 
 
-def run(
-    made: FrameUpdate | DeviceUpdate, motion: Motion | None = None, options: AttemptOptions = AS_SET
-) -> UpdateResult:
+def run(made: FrameUpdate, motion: Motion | None = None, options: AttemptOptions = AS_SET) -> UpdateResult:
     views = builder().factory.views(take_frame(1, 1.0, moved(BEFORE), RIG, True), {})
     return made.run(BEFORE, views, motion, 1.0, seed=3, options=options)
 
@@ -75,21 +64,12 @@ def found_motion() -> Motion:
 class PlainTable:
     """A table as the loop stepped it before: Adam over all columns, those of rate 0 included."""
 
-    def __init__(self, table: np.ndarray, gradients: np.ndarray, columns: list[float], plan: Rates, *times: float):
-        self._adam, self._gradients = Adam(table, columns, plan, *times), gradients
+    def __init__(self, table: np.ndarray, columns: list[float], betas: tuple[float, float]) -> None:
+        self._adam = Adam(table, columns, betas)
         self.guards = self._adam.guards
 
-    def step(self, iteration: int, planned: int) -> None:
-        self._adam.step(self._gradients, iteration, planned)
-
-
-def plain_tables(deformation: CpuDeformation, rates: Rates) -> list[PlainTable]:
-    columns = [[r] * 3 + [t] * 3 + [scaling] * 4 for r, t, scaling in rates.layers]
-    columns.append([rates.position] * 3 + [rates.rotation] * 3 + [rates.scale] * 3)
-    layers = [(rates.start_of(layer), rates.rest_of(layer)) for layer in range(len(rates.layers))]
-    tables, gradients = [*deformation.clusters, deformation.deltas], deformation.cluster_gradients
-    given = zip(tables, [*gradients, deformation.delta_gradients], columns, [*layers, (rates.start,)], strict=True)
-    return [PlainTable(table, g, column, rates, *times) for table, g, column, times in given]
+    def step(self, gradients: np.ndarray, factor: float) -> None:
+        self._adam.step(gradients, factor)
 
 
 @pytest.mark.parametrize("off", [(), ("cluster_scaling", "own_rotation"), MOVES[3:], MOVES[:3]], ids=str)
@@ -99,32 +79,34 @@ def test_the_state_is_that_of_steps_over_all_columns(
 ) -> None:
     motion = None if cold else found_motion()
     found = run(updater(without(*off)), motion).gaussians.arrays()
-    monkeypatch.setattr(frame_update, "free_tables", plain_tables)
+    monkeypatch.setattr(cpu_engine, "FreeColumns", PlainTable)
     assert same(found, run(updater(without(*off)), motion).gaussians.arrays())
     assert same(found, run(updater(usual()), motion).gaussians.arrays()) == (not off)
 
 
 @pytest.mark.parametrize("name", MOVES)
-@pytest.mark.parametrize("kind", [FrameUpdate, DeviceUpdate])
-def test_columns_that_are_off_stay_exactly_0_and_no_others(name: str, kind: type) -> None:
+@pytest.mark.parametrize("kind", [CpuEngine, TorchEngine])
+def test_columns_that_are_off_stay_exactly_0_and_no_others(name: str, kind: type[UpdateEngine]) -> None:
     short = UPDATE.model_copy(update={"iterations": 3, "own_start": 0.0, "momentum": 0.5})
-    made = updater(without(name), short, kind, **({} if kind is FrameUpdate else {"device": "cpu"}))
-    run(made, found_motion())
+    engine = kind()
+    run(updater(without(name), short, engine), found_motion())
+    tables = engine.tables()
     for other, columns in COLUMNS.items():
-        layers = made._deformation.clusters[:1]  # the finer ones have not begun
-        for table in layers if other.startswith("cluster") else [made._deformation.deltas]:
+        layers = tables.clusters[:1]  # the finer ones have not begun
+        for table in layers if other.startswith("cluster") else [tables.deltas]:
             assert table[:, columns].any() == (other != name), other
 
 
 def test_what_is_off_is_in_no_optimizer() -> None:
-    made = updater(["cluster_translation", "own_scale"])
-    assert isinstance(made, FrameUpdate)
-    tables = frame_update.free_tables(made._deformation, made._rates)
+    stepped = []
+    for effects in (["cluster_translation", "own_scale"], ["own_position"]):
+        engine = CpuEngine()
+        run(updater(effects, engine=engine))
+        stepped.append([table for table in (*engine._layer_columns, engine._own_columns) if table is not None])
+    tables, clusters_off = stepped
     assert [table._adam._first.shape[1] for table in tables] == [3, 3, 3]
     assert all(table._values.flags.c_contiguous for table in tables)  # else the kernel is compiled again for them
-    clusters_off = updater(["own_position"])
-    assert isinstance(clusters_off, FrameUpdate)
-    assert len(frame_update.free_tables(clusters_off._deformation, clusters_off._rates)) == 1
+    assert len(clusters_off) == 1
 
 
 def test_a_rigid_motion_is_found_by_clusters_that_turn_and_shift_alone() -> None:
@@ -141,22 +123,20 @@ def test_torch_obeys_the_same_freedoms() -> None:
     update = UPDATE.model_copy(update={"iterations": 3, "own_start": 0.0})
     ties = ("rigidity", "isometry", "rotation")
     off = without("cluster_rotation", "own_position", *ties)
-    on_cpu, on_device = run(updater(off, update)), run(updater(off, update, DeviceUpdate, device="cpu"))
-    np.testing.assert_allclose(on_device.trace.losses, on_cpu.trace.losses, rtol=2e-4)
-    apart = np.linalg.norm(on_device.gaussians.means - on_cpu.gaussians.means, axis=1)[:MOVING]
+    on_cpu, in_torch = (run(updater(off, update, engine)) for engine in (CpuEngine(), TorchEngine()))
+    np.testing.assert_allclose(in_torch.trace.losses, on_cpu.trace.losses, rtol=2e-4)
+    apart = np.linalg.norm(in_torch.gaussians.means - on_cpu.gaussians.means, axis=1)[:MOVING]
     free = run(updater(without(*ties), update)).gaussians.means
     assert np.median(apart) < 0.05 * np.median(np.linalg.norm(free - on_cpu.gaussians.means, axis=1)[:MOVING])
 
 
-@pytest.mark.parametrize("kind", [FrameUpdate, DeviceUpdate])
-def test_without_prediction_an_update_starts_where_the_frame_before_ended(kind: type) -> None:
-    short, options = UPDATE.model_copy(update={"iterations": 2}), {} if kind is FrameUpdate else {"device": "cpu"}
-    still = run(updater(without("prediction"), short, kind, **options), found_motion(), COMPARED)
+@pytest.mark.parametrize("kind", [CpuEngine, TorchEngine])
+def test_without_prediction_an_update_starts_where_the_frame_before_ended(kind: type[UpdateEngine]) -> None:
+    short = UPDATE.model_copy(update={"iterations": 2})
+    still = run(updater(without("prediction"), short, kind()), found_motion(), COMPARED)
     assert set(still.trace.errors) == {Candidate.STILL, Candidate.END}
-    assert same(
-        still.gaussians.arrays(), run(updater(usual(), short, kind, **options), None, COMPARED).gaussians.arrays()
-    )
-    warm = run(updater(usual(), short, kind, **options), found_motion(), COMPARED)
+    assert same(still.gaussians.arrays(), run(updater(usual(), short, kind()), None, COMPARED).gaussians.arrays())
+    warm = run(updater(usual(), short, kind()), found_motion(), COMPARED)
     assert Candidate.WARM in warm.trace.errors
     assert not same(still.gaussians.arrays(), warm.gaussians.arrays())
 
@@ -204,16 +184,16 @@ def test_each_may_be_off_and_they_are_on_where_the_settings_allow_them() -> None
 
 def test_without_motion_of_clusters_there_is_no_cascade(preparation) -> None:  # type: ignore[no-untyped-def]
     settings = Settings(update=UPDATE, effects=dict.fromkeys(MOVES[:3], "off"))
-    made, structure = preparation(settings).updater(BEFORE, first_switches(settings, 0))
-    other, with_layers = preparation(Settings(update=UPDATE)).updater(BEFORE, first_switches(Settings(), 0))
-    assert (made.hierarchy.sizes, other.hierarchy.sizes) == ((), (2, 12))
-    assert np.array_equal(made.hierarchy.rows, other.hierarchy.rows)
-    assert structure != with_layers  # a motion of the one is none of the other
+    made = preparation(settings).first(BEFORE, first_switches(settings, 0))
+    other = preparation(Settings(update=UPDATE)).first(BEFORE, first_switches(Settings(), 0))
+    assert (made.updater.hierarchy.sizes, other.updater.hierarchy.sizes) == ((), (2, 12))
+    assert np.array_equal(made.updater.hierarchy.rows, other.updater.hierarchy.rows)
+    assert made.carried.structure != other.carried.structure  # a motion of the one is none of the other
 
 
 def test_switches_of_an_earlier_version_are_joined_by_those_of_new_effects(preparation) -> None:  # type: ignore[no-untyped-def]
     settings = Settings(update=UPDATE, effects={"own_scale": "off"})
     switches = first_switches(settings, 0)
     before = {name: switches[name] for name in ("isometry", "rigidity")}
-    _, carried = preparation(settings).again(BEFORE, CarryOver(switches=before))
-    assert dict(carried.switches) == switches
+    prepared = preparation(settings).again(BEFORE, CarryOver(switches=before))
+    assert dict(prepared.carried.switches) == switches

@@ -7,12 +7,15 @@ import pytest
 
 from scas4d_core.effects.presence.catching import Catching
 from scas4d_core.effects.presence.entering import EFFECT, NAME
-from scas4d_core.engines.cpu.deformation import CpuDeformation
+from scas4d_core.engines.cpu.engine import CpuEngine
+from scas4d_core.engines.engine import Tables
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
-from scas4d_core.update.parts import PartsBuilder, Work
+from scas4d_core.update.frame_update import structure_of
+from scas4d_core.update.parts import Attempt, PlanBuilder
+from scas4d_core.update.rates import Rates
 from scas4d_core.update.view_factory import ViewFactory
 from tests.helpers.effect_cases.visited_room import CENTRE, known, scene, seen, visitor
 
@@ -30,16 +33,18 @@ def test_an_attempt_from_where_another_ended_moves_it_no_second_time() -> None:
     state, young = result.gaussians, np.arange(len(before), len(result.gaussians))
     now = seen(state, scene(known(), visitor(CENTRE + WAY)), 6)
     hierarchy = build_hierarchy(state.means, state.moving, (2, 12), SMALLEST_CLUSTER)
-    builder = PartsBuilder(SceneSettings(), UpdateSettings(), ViewFactory(now.rig), hierarchy, state)
+    builder = PlanBuilder(SceneSettings(), UpdateSettings(), ViewFactory(now.rig), hierarchy, state)
 
     def caught(start: Gaussians) -> np.ndarray:
         """[Y, 3] where the start of an attempt from a state puts the young."""
-        deformation = CpuDeformation(hierarchy, None, np.ones((len(hierarchy.rows), 3), np.float32), "centred")
-        deformation.start(start)
-        views = list(now.views)
-        Catching(builder, NAME).start(Work(start, deformation, None, views, now.picture, dict(result.carried)))  # type: ignore[arg-type]
-        deformation.forward()
-        return deformation.means[young]
+        engine, still = CpuEngine(), Tables.still(hierarchy)
+        engine.bind(builder.plan, structure_of(hierarchy, None, state))
+        engine.load_state(start)
+        rates, carried = Rates.of(builder.update, len(hierarchy.sizes), now.rig.reach), dict(result.carried)
+        attempt = Attempt(engine, now.renderer, start, now.views, rates, still, carried)
+        Catching(builder, NAME).begin(attempt)
+        engine.set_tables(attempt.tables)
+        return engine.state(learnt=False).means[young]
 
     away = state.means[young].mean(axis=0) + WAY
     np.testing.assert_allclose(caught(state).mean(axis=0), away, atol=0.02)

@@ -109,7 +109,7 @@ def test_the_young_are_settled_and_then_left_alone() -> None:
 def test_no_voxel_is_free_to_a_camera() -> None:
     state = scene(known())
     frame = seen(state, scene(known(), visitor()))
-    says = novelties(state, state.colours, frame.views, frame.rig, frame.picture)
+    says = novelties(state, state.colours, frame.views, frame.rig, frame.renderer)
     hull = carve_new(says)
     for one in says:
         uv, _ = one.camera.project(hull.points)

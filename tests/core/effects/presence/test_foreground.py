@@ -21,7 +21,7 @@ def usual() -> list[str]:
 
 def test_without_the_mask_term_masks_pull_at_nothing() -> None:
     without = [name for name in usual() if name != "mask_term"]
-    assert joined(builder(), without).mask == 0 < joined(builder(), usual()).mask
+    assert joined(builder(), without).plan.mask == 0 < joined(builder(), usual()).plan.mask
     off = UPDATE.weights.model_copy(update={"mask": 0.0, "mask_alone": 0.0})
     weightless = UPDATE.model_copy(update={"weights": off})
     assert same(updated(without), updated(usual(), weightless.model_copy(update={"use_masks": False})))

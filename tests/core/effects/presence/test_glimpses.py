@@ -2,30 +2,40 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from box_scene import moved, take_frame
+from effect_cases import BEFORE, RIG, UPDATE, builder, updater_of
 
 from scas4d_core.effects.evidence import Seen
 from scas4d_core.effects.presence import entering, novelty, uncovered
 from scas4d_core.effects.presence.novelty import GLANCE, glance
+from scas4d_core.effects.switches import joined
+from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.engine import KEPT_PICTURES, KEPT_ROWS, IterationLog, StepScalars, Thinned
 from scas4d_core.engines.renderer import Picture
-from scas4d_core.engines.views import TrainingView
+from scas4d_core.engines.views import CameraArrays
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.update.result import ROWS, SHOWN, UpdateTrace
-from tests.helpers.effect_cases.visited_room import known, scene, seen, visitor
+from scas4d_core.update.result import UpdateTrace
+from tests.helpers.effect_cases.visited_room import known, make_rig, scene, seen, visitor
+
+ROOM = make_rig()
 
 
-def shown(frame: Seen, kept: Candidate = Candidate.END, most: int = SHOWN) -> Seen:
+def shown(frame: Seen, kept: Candidate = Candidate.END, most: int = KEPT_PICTURES) -> Seen:
     """The frame with the renderings that an update leaves, of every other camera."""
-    trace, state = UpdateTrace(kept=kept), frame.result.gaussians
-    features = state.features(state.colours)
-    for left, view in enumerate(frame.views[::2][:most]):
-        frame.picture.measure(state.means, state.factors, state.opacities, features, view)
-        trace.see(view, frame.picture, left)
+    log, state = IterationLog(), frame.result.gaussians
+    for number in range(0, len(frame.views), 2)[:most]:
+        frame.renderer.compare(state, frame.views[number])
+        log.keep(number, Thinned.of(*frame.renderer.shown(frame.views[number])))  # type: ignore[attr-defined]
+    trace = UpdateTrace(kept=kept)
+    trace.take(log, frame.views)
     return replace(frame, result=replace(frame.result, trace=trace))
 
 
@@ -33,13 +43,14 @@ def shown(frame: Seen, kept: Candidate = Candidate.END, most: int = SHOWN) -> Se
 def rendered(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Names of the cameras whose pictures are rendered for the evidence."""
     names: list[str] = []
-    render = CpuRenderer.render
+    render, cameras = (
+        CpuRenderer.render,
+        {CameraArrays.of(camera).pose.tobytes(): camera.name for camera in ROOM.cameras},
+    )
 
-    def counted(
-        self: CpuRenderer, state: Gaussians, features: np.ndarray, view: TrainingView, depth_channel: int = -1
-    ) -> Picture:
-        names.append(view.name)
-        return render(self, state, features, view, depth_channel)
+    def counted(self: CpuRenderer, state: Gaussians, camera: CameraArrays, *given: Any, **named: Any) -> Picture:
+        names.append(cameras[camera.pose.tobytes()])
+        return render(self, state, camera, *given, **named)
 
     monkeypatch.setattr(CpuRenderer, "render", counted)
     return names
@@ -105,40 +116,50 @@ def test_a_region_counts_without_its_rims() -> None:
 
 def test_a_trace_keeps_the_last_views_and_thins_large_pictures() -> None:
     frame = seen(scene(known()), scene(known()))
-    trace, state = UpdateTrace(), frame.result.gaussians
-    given = (state.means, state.factors, state.opacities, state.features(state.colours))
-    for left in (SHOWN + 1, SHOWN):
-        frame.picture.measure(*given, frame.views[0])
-        trace.see(frame.views[0], frame.picture, left)
+    log, state = IterationLog(), frame.result.gaussians
+    trace = UpdateTrace()
+    trace.take(log, frame.views)
     assert trace.shown == {}
-    order = [*range(10), 1]  # more than were planned, and one of them again
-    for left, number in zip((2, 1, 0, 5, 4, 3, 2, 1, 0, 0, 0), order, strict=True):
-        frame.picture.measure(*given, frame.views[number])
-        trace.see(frame.views[number], frame.picture, left)
+
+    def drawn(number: int) -> Picture:
+        features, rest = frame.renderer.render(state, frame.views[number].camera)
+        return Picture(features.copy(), rest.copy())
+
+    for number in [*range(10), 1]:  # more than are kept, and one of them again
+        log.keep(number, Thinned.of(*drawn(number)))
+    trace.take(log, frame.views)
     assert list(trace.shown) == [frame.views[number].name for number in (3, 4, 5, 6, 7, 8, 9, 1)]
     every, planes = trace.shown[frame.views[1].name]
     assert every == 1
-    np.testing.assert_array_equal(planes[:4], frame.picture.shown(frame.views[1]).features)
-    np.testing.assert_array_equal(planes[4], frame.picture.shown(frame.views[1]).rest)
-    large = frame.picture.shown(frame.views[1])
+    large = drawn(1)
+    np.testing.assert_array_equal(planes[:4], large.features)
+    np.testing.assert_array_equal(planes[4], large.rest)
     tiled = Picture(np.tile(large.features, (1, 6, 8)), np.tile(large.rest, (6, 8)))
-    trace.see(frame.views[1], Large(tiled), 0)  # type: ignore[arg-type]
+    log.keep(1, Thinned.of(*tiled))
+    trace.take(log, frame.views)
     every, planes = trace.shown[frame.views[1].name]
-    assert every == 480 // ROWS == 3
+    assert every == 480 // KEPT_ROWS == 3
     assert planes.shape == (5, 160, 214)
     np.testing.assert_array_equal(planes[0], tiled.features[0, ::3, ::3])
 
 
-class Large:
-    """A picture loss that has rendered something larger."""
+def test_an_update_keeps_the_renderings_of_its_last_iterations() -> None:
+    built = joined(builder(update=UPDATE.model_copy(update={"iterations": KEPT_PICTURES + 2})))
+    views = built.factory.views(take_frame(1, 1.0, moved(BEFORE), RIG, True), {})
+    engine = Noting()
+    found = updater_of(built, engine).run(BEFORE, views, None, 1.0, seed=3)
+    assert [step.keep_pictures for _, step in engine.steps] == [False] * 2 + [True] * KEPT_PICTURES
+    last = [views[index].name for taken, _ in engine.steps[2:] for index in taken]
+    assert len(set(last)) < len(last)  # some twice: the newest counts
+    assert list(found.trace.shown) == sorted(set(last), key=lambda name: len(last) - last[::-1].index(name))
 
-    psnr = 30.0
 
-    def __init__(self, shown: Picture) -> None:
-        self._shown = shown
+class Noting(CpuEngine):
+    """Notes the views and numbers of each iteration."""
 
-    def shown(self, view: TrainingView) -> Picture:
-        return self._shown
+    def __init__(self) -> None:
+        self.steps: list[tuple[Sequence[int], StepScalars]] = []
 
-    def colour_shift(self, view: TrainingView) -> tuple[float, float, float]:
-        return 0.0, 0.0, 0.0
+    def iterate(self, views: Sequence[int], step: StepScalars) -> None:
+        self.steps.append((views, step))
+        super().iterate(views, step)

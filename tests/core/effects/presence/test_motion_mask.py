@@ -10,6 +10,7 @@ from box_scene import MOVING, make_box, make_rig, moved, take_frame
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.captures.frame import Frame
+from scas4d_core.effects.presence import motion_mask
 from scas4d_core.effects.presence.motion_mask import INSIDE_SHARE, changed_pixels, first_labels, with_reliable_labels
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.first_frame.static_result import StaticResult
@@ -17,9 +18,7 @@ from scas4d_core.frame_outcome import FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings, UpdateSettings
-from scas4d_core.structure import motion_mask
 from scas4d_core.update.result import camera_fit
-from scas4d_core.update.view_factory import ViewFactory
 
 RIG = make_rig()
 BOX = make_box()
@@ -125,7 +124,7 @@ def test_labels_are_learnt_of_enough(moving: int, new: int, learnt: bool, monkey
     monkeypatch.setattr(motion_mask, "moving_between", lambda *_: found)
     many = Gaussians.of_points(np.zeros((10_000, 3)), radius=0.1)
     known = np.arange(10_000) < moving if moving else None
-    labels = motion_mask.labels_learnt(many, known, (), (), CpuRenderer(ViewFactory(RIG), (0, 0, 0), 1, 0))
+    labels = motion_mask.labels_learnt(many, known, (), (), CpuRenderer((0, 0, 0)))
     assert (labels is not None) == learnt
     assert labels is None or labels.sum() == moving + new
 

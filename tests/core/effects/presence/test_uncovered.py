@@ -23,7 +23,7 @@ def _small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_points_lie_on_the_floor_in_the_hole() -> None:
     frame = seen(scene(known(ASIDE), hole=HOLE), scene(known(ASIDE)))
-    found = uncovered(said(frame, frame.views), frame.result.gaussians, frame.picture)
+    found = uncovered(said(frame, frame.views), frame.result.gaussians, frame.renderer)
     assert len(found.points) > 20
     assert np.abs(found.points[:, 1] - FLOOR).max() < 0.03
     assert np.hypot(*(found.points - BOX)[:, [0, 2]].T).max() < HOLE + 0.03

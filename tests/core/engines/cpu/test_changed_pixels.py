@@ -10,18 +10,22 @@ from box_scene import make_box, make_rig, moved, take_frame
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Camera, Rig
+from scas4d_core.effects.switches import joined
+from scas4d_core.engines.cpu import changed_pixels
+from scas4d_core.engines.cpu import engine as cpu_engine
 from scas4d_core.engines.cpu.blocks import as_blocks, as_grid
-from scas4d_core.engines.cpu.changed_pixels import ChangedPixels, reached
+from scas4d_core.engines.cpu.changed_pixels import ChangedPixels, taken
+from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
-from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.cpu.renderer import CpuRenderer, blocks_of
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels import image_loss
 from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.structure.neighbours import build_neighbours
-from scas4d_core.update import changed_pixels, frame_update
 from scas4d_core.update.frame_update import FrameUpdate
+from scas4d_core.update.parts import PlanBuilder
 from scas4d_core.update.result import AttemptOptions, UpdateResult
 from scas4d_core.update.view_factory import ViewFactory
 
@@ -46,17 +50,18 @@ def displaced(state: Gaussians, shift: float) -> Gaussians:
 
 
 def updater(state: Gaussians, most: float, monkeypatch: pytest.MonkeyPatch) -> tuple[FrameUpdate, ViewFactory]:
-    monkeypatch.setattr(frame_update, "MOST", most)
+    monkeypatch.setattr(cpu_engine, "MOST", most)
     factory = ViewFactory(RIG)
     hierarchy = build_hierarchy(state.means, state.moving, SETTINGS.clusters, SMALLEST_CLUSTER)
     neighbours = build_neighbours(state.means[hierarchy.rows], 6, 200.0)
-    return FrameUpdate(factory, SceneSettings(), SETTINGS, hierarchy, neighbours, state), factory
+    built = joined(PlanBuilder(SceneSettings(), SETTINGS, factory, hierarchy, state))
+    return FrameUpdate(CpuEngine(), built, neighbours), factory
 
 
 def frames(state: Gaussians, most: float, monkeypatch: pytest.MonkeyPatch, masks: bool) -> list[UpdateResult]:
     """Three frames, the last of them a jump out of what was drawn so far."""
     made, factory = updater(state, most, monkeypatch)
-    assert isinstance(made._picture, ChangedPixels) == (most > 0)
+    assert isinstance(made._engine.renderer, ChangedPixels) == (most > 0)
     results: list[UpdateResult] = []
     for index, shift in enumerate((0.02, 0.04, 0.3), 1):
         views = factory.views(take_frame(index, float(index), displaced(state, shift), RIG, masks), {})
@@ -149,9 +154,9 @@ def test_less_is_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_view_in_which_nothing_moves_has_no_gradient() -> None:
     state = few_move().replace(foreground=np.zeros(len(BOX), np.float32))
     factory = ViewFactory(RIG)
-    picture = ChangedPixels(factory, (0.0, 0.0, 0.0), 1.0, 0.1, np.zeros(0, np.int64), len(BOX))
-    whole = CpuRenderer(factory, (0.0, 0.0, 0.0), 1.0, 0.1)
-    picture.begin(state)
+    picture = ChangedPixels((0.0, 0.0, 0.0), 1.0, 0.1, np.zeros(0, np.int64), len(BOX))
+    whole = CpuRenderer((0.0, 0.0, 0.0), 1.0, 0.1)
+    picture.load_state(state)
     features = np.concatenate([state.colours, state.foreground[:, None]], axis=1)
     given = (state.means, state.factors, state.opacities, features)
     view = factory.views(take_frame(0, 0.0, BOX, RIG), {})[0]
@@ -164,7 +169,7 @@ def test_a_view_in_which_nothing_moves_has_no_gradient() -> None:
 def test_blocks_and_their_grid_are_the_same() -> None:
     camera = ViewFactory(RIG).views(take_frame(0, 0.0, BOX, RIG), {})[0].camera
     state = (BOX.means, BOX.factors, BOX.opacities, np.zeros((len(BOX), 4), np.float32))
-    blocks = reached(CpuRasterizer(), state, np.arange(MOVES), camera)
+    blocks = blocks_of(CpuRasterizer(), *taken(state, np.arange(MOVES)), camera)
     grid = as_grid(blocks, camera)
     np.testing.assert_array_equal(as_blocks(grid, camera), blocks)
     alone = [array[:MOVES] for array in (BOX.means, BOX.factors, BOX.opacities)]
