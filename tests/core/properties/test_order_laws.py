@@ -14,7 +14,8 @@ from hypothesis import given
 from law_cases import law, seeds
 
 from scas4d_core.cameras import Rig
-from scas4d_core.engines.views import TrainingView
+from scas4d_core.effects.switches import joined
+from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.settings import SceneSettings, UpdateSettings
@@ -22,6 +23,7 @@ from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.structure.neighbours import build_neighbours
 from scas4d_core.update import schedule
 from scas4d_core.update.frame_update import FrameUpdate
+from scas4d_core.update.parts import PlanBuilder
 from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.schedule import ViewPlan
 from scas4d_core.update.view_factory import ViewFactory
@@ -51,14 +53,12 @@ def updated(state: Gaussians, hierarchy: Hierarchy, rig: Rig, monkeypatch: pytes
 
     sequence = iter(SEQUENCE)
 
-    def take(plan: ViewPlan) -> list[TrainingView]:
-        name = next(sequence)
-        return [view for view in plan._views if view.name == name]
-
-    monkeypatch.setattr(ViewPlan, "take", take)
     factory = ViewFactory(rig)
-    made = FrameUpdate(factory, SceneSettings(), SETTINGS, hierarchy, NEIGHBOURS, state)
-    return made.run(state, factory.views(FRAME, {}), None, 1.0, seed=1)
+    views = factory.views(FRAME, {})
+    names = [view.name for view in views]
+    monkeypatch.setattr(ViewPlan, "take", lambda plan: [names.index(next(sequence))])
+    built = joined(PlanBuilder(SceneSettings(), SETTINGS, factory, hierarchy, state))
+    return FrameUpdate(CpuEngine(), built, NEIGHBOURS).run(state, views, None, 1.0, seed=1)
 
 
 @pytest.fixture(scope="module")

@@ -122,6 +122,6 @@ def test_a_frame_without_effects_has_none() -> None:
 
 def test_what_is_large_is_not_committed_with_each_frame() -> None:
     left = {"frames": np.zeros(9), "share": np.array(0.3)}
-    kept = kept_of({"leaving": left, "shadows": {"c0": np.zeros(3)}, "gone": {"x": np.zeros(1)}, "entering": NOBODY})
+    kept = kept_of({"leaving": left, "shadows": {"c0": np.zeros(3)}, "entering": NOBODY})
     assert {name: set(own) for name, own in kept.items()} == {"leaving": {"share"}, "entering": set(NOBODY)}
     assert effect("shadows").kept == ()

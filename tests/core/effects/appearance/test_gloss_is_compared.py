@@ -5,14 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from effect_cases.glossy_ball import COUNT, frame, rig, sphere
-from scipy.spatial import cKDTree
 
 from scas4d_core.effects.evidence import FitTime
-from scas4d_core.effects.presence.growing import _Fit, settled
+from scas4d_core.effects.presence.growing import settled
 from scas4d_core.effects.presence.novelty import novelties
 from scas4d_core.effects.switches import joined
 from scas4d_core.engines.cpu.engine import CpuEngine
-from scas4d_core.engines.cpu.gloss import colours_seen
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.engine import Tables
 from scas4d_core.engines.views import TrainingView
@@ -130,15 +128,6 @@ def test_a_glossy_thing_has_nothing_new() -> None:
     said = novelties(BALL.replace(foreground=np.zeros(COUNT, np.float32)), BALL.colours, views(), rig(), RENDERER)
     assert sum(int(one.new.sum()) for one in said) == 0
     assert max(float(one.error.max()) for one in said) < 3e-3
-
-
-def test_what_is_born_is_fitted_beside_what_the_cameras_see() -> None:
-    parameters = np.zeros((1, 15), np.float32)
-    fit = _Fit(BALL, parameters, views(), rig(), RENDERER)
-    assert len(fit._crops) == 12
-    for crop in fit._crops:
-        rows = cKDTree(BALL.means).query(crop.means[: crop.others])[1]
-        np.testing.assert_allclose(crop.features[: crop.others, :3], colours_seen(BALL, crop.view.camera)[rows])
 
 
 def test_what_is_glossy_and_came_back_is_not_settled() -> None:
