@@ -9,7 +9,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 WITHOUT_KERNELS = (
     "tests/core/captures", "tests/client/importers", "tests/core/metrics", "tests/docker", "tests/server/connections",
-    "tests/core/torch_backend/test_losses.py", "tests/core/torch_backend/test_deformation.py",
+    "tests/core/engines/torch",
     "tests/test_docs.py", "tests/test_imports.py", "tests/test_wheel.py",
 )  # fmt: skip
 """Tests that run no kernel, in no process: they go on while another process compiles."""
@@ -44,7 +44,7 @@ SERVICE_STARTERS = {"Running", "Service", "serving", "serving_with", "stub"}
 SLOW = "tests/studies/"
 BROWSER = "tests/browser/"
 SECOND_PROCESSOR = (
-    "tests/core/kernels/", "tests/core/properties/", "tests/core/engines/", "tests/core/torch_backend/",
+    "tests/core/kernels/", "tests/core/properties/", "tests/core/engines/",
     "tests/studies/hard_cases/",
 )  # fmt: skip
 """The same folders are named in .ci/run."""

@@ -1,4 +1,4 @@
-"""How far float32 on the CPU is from the float64 twin, stage by stage: the table of docs/stability.md.
+"""How far float32 on the CPU is from the float64 reference, stage by stage: the table of docs/stability.md.
 
 ``pytest tests/core/properties/test_precision.py -s -q`` prints what is found beside what is allowed.
 """
@@ -13,16 +13,18 @@ import pytest
 import torch
 from box_scene import MOVING, make_box, make_rig, moved, take_frame
 from law_cases import doubles
-from scas4d_core.engines.torch.device_update import DeviceUpdate
 from torch import Tensor
 
+from scas4d_core.effects.switches import joined
 from scas4d_core.engines.cpu.deformation import CpuDeformation
+from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.engine import UpdateEngine
 from scas4d_core.engines.torch import losses
 from scas4d_core.engines.torch import rasterizer as twin
 from scas4d_core.engines.torch.deformation import ClusterParams, Deltas, Layer, deform
+from scas4d_core.engines.torch.engine import TorchEngine
 from scas4d_core.engines.torch.rasterizer import CameraParams
-from scas4d_core.engines.views import TrainingView
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels import projection
 from scas4d_core.kernels.adam import EVERY_ROW, adam
@@ -32,6 +34,7 @@ from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.structure.neighbours import build_neighbours
 from scas4d_core.update import schedule
 from scas4d_core.update.frame_update import FrameUpdate
+from scas4d_core.update.parts import PlanBuilder
 from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import Motion
@@ -95,7 +98,7 @@ def pictures(found: dict[str, float]) -> None:
     """Projection, rendering and the image loss, over all six cameras; the largest of each."""
     state = (BOX.means, BOX.factors, BOX.opacities, features_of(BOX))
     given = [doubles(array) for array in state]
-    loss = CpuRenderer(FACTORY, (0.0, 0.0, 0.0), 1.0, 0.3)
+    loss = CpuRenderer((0.0, 0.0, 0.0), 1.0, 0.3)
 
     def worst(name: str, value: float) -> None:
         found[name] = max(found.get(name, 0.0), value)
@@ -189,12 +192,11 @@ def optimizer(found: dict[str, float]) -> None:
     found["Adam: 100 steps, in steps"] = largest(parameters, leaf.detach().numpy()) / float(rate)
 
 
-def updated(kind: type, iterations: int, state: Gaussians = BOX, **options: object) -> UpdateResult:
+def updated(engine: UpdateEngine, iterations: int, state: Gaussians = BOX) -> UpdateResult:
     settings = SETTINGS.model_copy(update={"iterations": iterations})
-    made = kind(FACTORY, SceneSettings(), settings, HIERARCHY, NEIGHBOURS, BOX, **options)
-    views: list[TrainingView] = FACTORY.views(FRAME, {})
-    result: UpdateResult = made.run(state, views, disturbed_motion(), 1.0, seed=2)
-    return result
+    built = joined(PlanBuilder(SceneSettings(), settings, FACTORY, HIERARCHY, BOX))
+    views = FACTORY.views(FRAME, {})
+    return FrameUpdate(engine, built, NEIGHBOURS).run(state, views, disturbed_motion(), 1.0, seed=2)
 
 
 def disturbed_motion() -> Motion:
@@ -219,14 +221,14 @@ def apart(a: UpdateResult, b: UpdateResult) -> tuple[float, float, float]:
 def whole(found: dict[str, float]) -> None:
     """The update as it is run, against the same in float64."""
     for iterations, of in ((1, "update of 1 iteration: loss"), (10, "update of 10 iterations: losses")):
-        cpu = updated(FrameUpdate, iterations)
-        value, median, decibels = apart(cpu, updated(DeviceUpdate, iterations, device="cpu", dtype=torch.float64))
+        cpu = updated(CpuEngine(), iterations)
+        value, median, decibels = apart(cpu, updated(TorchEngine(), iterations))
         name = of.split(":")[0]
         found[f"{of}, relative"] = value
         found[f"{name}: means, median metres"] = median
     found[f"{name}: PSNR, dB"] = decibels
     rounded = BOX.replace(means=np.nextafter(BOX.means, np.float32(9)))
-    print("the CPU against itself after one rounding, 10 iterations:", apart(updated(FrameUpdate, 10, rounded), cpu))
+    print("the CPU against itself after one rounding, 10 iterations:", apart(updated(CpuEngine(), 10, rounded), cpu))
 
 
 @pytest.fixture(scope="module")

@@ -6,42 +6,42 @@ other turn the loss stays and its gradients turn along.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import permutations, product
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from law_cases import doubles, law, seeds, some_rotation
-from scas4d_core.engines.torch.arrays import ClusterArrays, DeltaArrays, Graph, TermWeights, TorchView
-from scas4d_core.engines.torch.update import TorchUpdate
 from scipy.spatial.transform import Rotation
 
-from scas4d_core.cameras import Camera
-from scas4d_core.effects.coherence.floor import FloorPart
+from scas4d_core.engines.engine import AttemptStart, StepScalars, Tables
+from scas4d_core.engines.freedom import Freedom
+from scas4d_core.engines.plan import ColourPlan, Structure, UpdatePlan
 from scas4d_core.engines.torch import deformation
-from scas4d_core.engines.torch import update as update_torch
+from scas4d_core.engines.torch.engine import TorchEngine
+from scas4d_core.engines.views import CameraArrays, TrainingView
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.update.rates import Rates
+from scas4d_core.structure.hierarchy import Hierarchy
+from scas4d_core.structure.neighbours import Neighbours
 
 MOVING, STANDING, NEAREST = 24, 6, 4
 CLOSE = 1e-9
 """Relative to the largest of each table."""
 PULL = 1e-6
 """Share of the largest gradient of a table from which one counts as more than rounding."""
-RATES = Rates(
-    layers=((0.02, 0.008, 0.002), (0.01, 0.002, 0.002)), position=5e-4, rotation=2e-3, scale=1e-3, colour=2e-3,
-    colour_standing=1e-2,
-)  # fmt: skip
 FLOOR = (0.1, 1.0, 0.2, 0.05)
-
-
-def floor_twin(plane: tuple[float, ...]) -> Callable[[torch.Tensor], torch.Tensor | None]:
-    """The term of a floor with weight 2."""
-    return FloorPart(plane, np.arange(MOVING), 2.0).twin  # type: ignore[arg-type]
+PLAN = UpdatePlan(
+    cameras=("0", "1", "2"), soft_colour=0.01, mask=3.0, axis_length=10.0, neighbour_terms=True, rigidity=4.0,
+    isometry=2.0, rotation=4.0, floor=FLOOR, floor_weight=2.0, freedom=Freedom(True, True, True, True, True, True),
+    colours=ColourPlan(moving=True, standing=True), whole_pictures=True,
+)  # fmt: skip
+STEP = StepScalars(
+    resting=0, layers=(1.0, 1.0), own=1.0, colour=1.0, gloss=1.0, smooth_gloss=False, rigidity=4.0, sample=0,
+    keep_pictures=False,
+)  # fmt: skip
+WIDTH, HEIGHT = 16, 12
 
 
 AXES = [
@@ -57,11 +57,11 @@ AXES = [matrix for matrix in AXES if np.linalg.det(matrix) > 0]
 class Case:
     """Θ_{t−1} in float64, the pictures of three cameras, and where the iteration starts."""
 
-    update: TorchUpdate
+    plan: UpdatePlan
+    structure: Structure
     state: Gaussians
-    views: list[TorchView]
-    start: list[ClusterArrays]
-    deltas: DeltaArrays
+    views: list[TrainingView]
+    start: Tables
     rows: np.ndarray
 
 
@@ -81,37 +81,31 @@ def some_case(seed: int) -> Case:
     distances = np.linalg.norm(means[:MOVING, None] - means[:MOVING], axis=-1)
     nearest = np.argsort(distances, axis=1)[:, 1 : NEAREST + 1]
     lengths = np.take_along_axis(distances, nearest, axis=1)
-    update = TorchUpdate(
-        moving=np.arange(MOVING),
-        labels=[np.arange(MOVING) // 12, np.arange(MOVING) // 4],
-        graph=Graph(nearest, np.exp(-20 * lengths**2), 1.1 * lengths),
-        first_lengths=np.full((MOVING, 3), 0.03),
-        rates=RATES,
-        weights=TermWeights(),
-        terms=(floor_twin(FLOOR),),
-        dtype=torch.float64,
-    )
+    labels = np.arange(MOVING) // 12, np.arange(MOVING) // 4
+    hierarchy = Hierarchy(np.arange(MOVING), labels, (np.arange(0, 25, 12), np.arange(0, 25, 4)))  # type: ignore[arg-type]
+    neighbours = Neighbours(nearest, np.exp(-20 * lengths**2), 1.1 * lengths)  # type: ignore[arg-type]
+    structure = Structure(hierarchy, neighbours, means, np.full((MOVING, 3), 0.03))  # type: ignore[arg-type]
     views = []
     for index in range(3):
-        pose = np.eye(4)
-        pose[:3, :3], pose[2, 3] = some_rotation(seed + index), 1.5
-        camera = Camera(str(index), np.array([[24.0, 0, 8], [0, 24, 6], [0, 0, 1]]), pose, 16, 12)
-        views.append(TorchView(camera, rng.uniform(0, 1, (12, 16, 3)), (rng.uniform(size=(12, 16)) > 0.5) * 1.0))
+        pose = np.concatenate([some_rotation(seed + index), [[0], [0], [1.5]]], axis=1)
+        camera = CameraArrays(pose, np.array([24.0, 24, 8, 6, WIDTH, HEIGHT]), WIDTH, HEIGHT)
+        picture = rng.uniform(0, 1, (HEIGHT, WIDTH, 3))
+        mask = (rng.uniform(size=(HEIGHT, WIDTH)) > 0.5) * 1.0
+        target = np.concatenate([np.moveaxis(picture, -1, 0), mask[None]])
+        views.append(TrainingView(str(index), camera, target, np.tile([1.0, 0.0], (4, 1))))
     scale = np.repeat([0.05, 0.02, 0.2, 0.05], [3, 3, 3, 1])
     tables = [scale * rng.normal(size=(size, 10)) for size in (2, 6)]
-    start = [ClusterArrays(p[:, :3], p[:, 3:6], p[:, 6:9], p[:, 9]) for p in tables]
-    deltas = DeltaArrays(*(0.02 * rng.normal(size=(3, MOVING, 3))))
-    return Case(update, state, views, start, deltas, np.sort(rng.choice(MOVING, 12, replace=False)))
+    start = Tables(tables, np.concatenate(0.02 * rng.normal(size=(3, MOVING, 3)), axis=1))
+    return Case(PLAN, structure, state, views, start, np.sort(rng.choice(MOVING, 12, replace=False)))
 
 
 def placed(case: Case, turn: np.ndarray, shift: np.ndarray) -> Case:
     """The same world and rig elsewhere: x → turn x + shift."""
 
-    def camera(view: TorchView) -> TorchView:
-        pose = view.camera.world_to_camera.copy()
-        pose[:3, :3] = view.camera.rotation @ turn.T
-        pose[:3, 3] = view.camera.translation - pose[:3, :3] @ shift
-        return view._replace(camera=replace(view.camera, world_to_camera=pose))
+    def camera(view: TrainingView) -> TrainingView:
+        rotation = view.camera.pose[:, :3] @ turn.T
+        pose = np.concatenate([rotation, view.camera.pose[:, 3:] - (rotation @ shift)[:, None]], axis=1)
+        return replace(view, camera=view.camera._replace(pose=pose))
 
     normal = turn @ FLOOR[:3]
     floor = (*normal, FLOOR[3] - normal @ shift)
@@ -120,44 +114,56 @@ def placed(case: Case, turn: np.ndarray, shift: np.ndarray) -> Case:
     state = case.state.replace(
         means=case.state.means @ turn.T + shift, factors=turn @ case.state.factors, rotations=rotations.numpy()
     )
-    start = [ClusterArrays(r @ turn.T, t @ turn.T, c @ turn.T, s) for r, t, c, s in case.start]
-    dp, dr, ds = case.deltas
-    return Case(
-        replace(case.update, terms=(floor_twin(floor),)), state, [camera(view) for view in case.views], start,
-        DeltaArrays(dp @ turn.T, dr @ turn.T, ds), case.rows,
-    )  # fmt: skip
+    plan, structure = replace(case.plan, floor=floor), replace(case.structure, roots=state.means)
+    start = Tables([along(table, turn, 3) for table in case.start.clusters], along(case.start.deltas, turn, 2))
+    return Case(plan, structure, state, [camera(view) for view in case.views], start, case.rows)
+
+
+def along(table: np.ndarray, turn: np.ndarray, vectors: int) -> np.ndarray:
+    """The columns of a table that are vectors, turned: the first so many times three."""
+    parts = np.split(table, [3 * k for k in range(1, vectors + 1)], axis=1)
+    return np.concatenate([*(part @ turn.T for part in parts[:vectors]), parts[vectors]], axis=1)
 
 
 @dataclass
 class Iteration:
-    """Loss and gradients of an iteration, and the parameters that Adam leaves; vectors first, then what has no axes."""
+    """Loss and gradients of an iteration, and the parameters that Adam leaves: two layers, own, colours."""
 
     loss: float
     gradients: list[np.ndarray]
     parameters: list[np.ndarray]
 
 
-VECTORS = 3
+VECTORS = (3, 3, 2)
+"""Of the columns of each layer, and of the Gaussians' own."""
 
 
 def iterate(case: Case, view: int = 0) -> Iteration:
-    scene = update_torch._Scene.of(case.update, case.state, case.views, case.start, case.deltas)
-    groups = scene.parameter_groups(case.update.rates)
-    optimizer = torch.optim.Adam(groups, eps=update_torch.ADAM_EPSILON)
-    loss = scene.loss(view, torch.tensor(case.rows))
-    loss.backward()
-    vectors = [tensor for _, params in scene.layers for tensor in params[:VECTORS]] + list(scene.deltas[:2])
-    others = [params.s for _, params in scene.layers] + [scene.deltas.ds, *scene.free_colours]
-    tensors = [*vectors, *others]
-    gradients = [tensor.grad.numpy().copy() for tensor in tensors]
-    optimizer.step()
-    return Iteration(loss.item(), gradients, [tensor.detach().numpy() for tensor in tensors])
+    engine = TorchEngine()
+    engine.bind(case.plan, case.structure)
+    engine.load_views(case.views, [])
+    engine.load_state(case.state)
+    engine.set_tables(case.start)
+    start = AttemptStart(
+        layers=((0.02, 0.008, 0.002), (0.01, 0.002, 0.002)), position=5e-4, rotation=2e-3, scale=1e-3, colour=2e-3,
+        colour_standing=1e-2, beta1=0.9, beta2=0.999, samples=[case.rows],
+    )  # fmt: skip
+    engine.begin(start)
+    engine.iterate([view], STEP)
+    gradients, parameters = engine.gradients(), engine._parameters  # in float64; states and tables are float32
+    tables = [
+        np.concatenate([values.detach().numpy().reshape(len(p.s), -1) for values in p], axis=1)
+        for p in parameters.clusters
+    ]
+    tables.append(np.concatenate([values.detach().numpy() for values in parameters.deltas], axis=1))
+    colours = np.concatenate([parameters.moving_colours.detach().numpy(), parameters.standing_colours.detach().numpy()])
+    names = ("cluster 0", "cluster 1", "deltas", "colours")
+    return Iteration(engine.log().losses[0], [gradients[name] for name in names], [*tables, colours])
 
 
 def turned(tables: list[np.ndarray], turn: np.ndarray) -> list[np.ndarray]:
-    """What has axes is turned: three tables a layer, and Δp, Δr."""
-    count = 2 * VECTORS + 2
-    return [table @ turn.T for table in tables[:count]] + tables[count:]
+    """What has axes is turned; colours have none."""
+    return [along(table, turn, count) for table, count in zip(tables, VECTORS, strict=False)] + tables[3:]
 
 
 def assert_tables(found: list[np.ndarray], wanted: list[np.ndarray]) -> None:
@@ -193,6 +199,6 @@ def test_a_whole_iteration_goes_along_where_axes_go_to_axes(seed: int, turn: np.
 def test_the_published_map_does_not_go_along() -> None:
     """What the laws are there to find: it scales about the world's origin."""
     case = some_case(1)
-    case = replace(case, update=replace(case.update, cluster_map="published"))
+    case = replace(case, plan=replace(case.plan, cluster_map="published"))
     shifted = iterate(placed(case, np.eye(3), np.ones(3)))
     assert abs(shifted.loss / iterate(case).loss - 1) > 1e-3

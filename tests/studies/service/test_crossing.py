@@ -19,5 +19,5 @@ def files(tmp_path_factory):
 
 def test_the_files_are_those_that_run(files):
     assert {"server/routes/frames.py", "scas4d_core/reconstruction.py"} <= set(files["frame"])
-    assert {"server/routes/render.py", "scas4d_core/rasterize/cpu.py"} <= set(files["render"])
+    assert {"server/routes/render.py", "scas4d_core/engines/cpu/rasterizer.py"} <= set(files["render"])
     assert not [name for names in files.values() for name in names if not (SAMPLE.parents[1] / name).is_file()]

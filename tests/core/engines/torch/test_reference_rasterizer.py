@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 import torch
-from scas4d_core.rasterize import cuda, twin
 
 from scas4d_core.cameras import Camera
-from scas4d_core.engines.limits import DEFAULT, GSPLAT
+from scas4d_core.engines.limits import DEFAULT, Limits
+from scas4d_core.engines.torch import rasterizer as twin
 from scas4d_core.engines.torch.rasterizer import CameraParams
 
 WIDTH, HEIGHT = 12, 9
@@ -75,7 +75,9 @@ def test_cap_and_no_gradient_through_it() -> None:
     picture = twin.render(tensor([[0, 0, 2]]), balls(0.1, 1), opacities, tensor([RED]), PARAMS, BLACK)
     assert picture.alpha[4, 5].item() == pytest.approx(0.99)
     assert torch.autograd.grad(picture.alpha[4, 5], opacities)[0].item() == 0
-    other = twin.render(tensor([[0, 0, 2]]), balls(0.1, 1), opacities, tensor([RED]), PARAMS, BLACK, GSPLAT)
+    other = twin.render(
+        tensor([[0, 0, 2]]), balls(0.1, 1), opacities, tensor([RED]), PARAMS, BLACK, Limits(alpha_cap=0.999)
+    )
     assert other.alpha[4, 5].item() == pytest.approx(0.999)
 
 
@@ -166,100 +168,3 @@ def test_projected_means_carry_the_screen_gradient() -> None:
     (picture.features**2).sum().backward()
     assert picture.means.grad is not None
     assert picture.means.grad.abs().max() > 0
-
-
-class FakeGsplat:
-    """gsplat's three calls with the shapes that its 1.5.3 asserts, worked out densely on the CPU."""
-
-    def fully_fused_projection(
-        self, means, covars, quats, scales, viewmats, Ks, width, height,
-        *, eps2d, near_plane, packed, opacities,
-    ):  # fmt: skip
-        count = len(means)
-        assert covars.shape == (count, 6)
-        assert quats is None
-        assert scales is None
-        assert viewmats.shape == (1, 4, 4)
-        assert Ks.shape == (1, 3, 3)
-        assert opacities.shape == (count,)
-        assert not packed
-        full = covars[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(count, 3, 3)
-        k = Ks[0]
-        camera = CameraParams(
-            viewmats[0, :3, :3], viewmats[0, :3, 3], float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]),
-            width, height,
-        )  # fmt: skip
-        limits = GSPLAT._replace(low_pass=eps2d, near=near_plane)
-        uv, covariances, depths = twin.project(means, torch.linalg.cholesky(full), camera, limits)
-        inverse = torch.linalg.inv(covariances)
-        conics = torch.stack([inverse[:, 0, 0], inverse[:, 0, 1], inverse[:, 1, 1]], dim=-1)
-        radii = torch.full((1, count, 2), 100, dtype=torch.int32)
-        return radii, uv[None], depths[None], conics[None], None
-
-    def isect_tiles(self, means2d, radii, depths, tile_size, tile_width, tile_height, *, packed):
-        assert (tile_width, tile_height) == (1, 1)
-        assert depths.shape == radii.shape[:-1] == means2d.shape[:-1]
-        flat = torch.argsort(depths[0].detach(), stable=True)
-        return None, flat, flat
-
-    def isect_offset_encode(self, isect_ids, n_images, tile_width, tile_height):
-        return torch.zeros(n_images, tile_height, tile_width, dtype=torch.int32)
-
-    def rasterize_to_pixels(
-        self, means2d, conics, colors, opacities, width, height, tile_size, isect_offsets, flatten_ids,
-        *, backgrounds, packed,
-    ):  # fmt: skip
-        count, channels = means2d.shape[1], colors.shape[-1]
-        assert conics.shape == (1, count, 3)
-        assert colors.shape == (1, count, channels)
-        assert opacities.shape == (1, count)
-        assert backgrounds.shape == (1, channels)
-        assert isect_offsets.shape == (1, 1, 1)
-        o = flatten_ids
-        v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-        pixels = torch.stack([u, v], dim=-1).reshape(-1, 2).to(means2d.dtype)
-        colours, alpha = twin._composite(
-            pixels, means2d[0, o], conics[0, o], opacities[0, o], colors[0, o], backgrounds[0], GSPLAT
-        )
-        return colours.reshape(1, height, width, channels), alpha.reshape(1, height, width, 1)
-
-
-def test_cuda_path_hands_gsplat_what_it_asks_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cuda, "_gsplat", FakeGsplat)
-    pose = np.eye(4)
-    pose[:3, :3] = [[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]]
-    pose[:3, 3] = [-0.9, 0.05, 0.3]
-    params = CameraParams.of(Camera("turned", CAMERA.intrinsics, pose, WIDTH, HEIGHT))
-    inputs, background = some_gaussians(7), tensor([0.2, 0.4, 0.1, 0.3])
-    found, expected = (module.render(*inputs, params, background, GSPLAT) for module in (cuda, twin))
-    assert expected.alpha.max() > 0.3
-    for a, b in zip(found, expected, strict=True):
-        torch.testing.assert_close(a, b)
-
-
-def test_cuda_path_refuses_limits_that_gsplat_compiled_in(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cuda, "_gsplat", FakeGsplat)
-    with pytest.raises(ValueError, match="GSPLAT"):
-        cuda.render(*some_gaussians(2), PARAMS, torch.zeros(4, dtype=torch.float64), DEFAULT)
-
-
-def test_missing_gsplat_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "gsplat", None)
-    with pytest.raises(ImportError, match=r"pip install -e '.\[cuda\]'"):
-        cuda.render(*some_gaussians(2), PARAMS, torch.zeros(4, dtype=torch.float64))
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_gsplat_agrees_with_the_twin() -> None:
-    pytest.importorskip("gsplat")
-    inputs = [x.requires_grad_() for x in some_gaussians(40)]
-    background = tensor([0.2, 0.4, 0.1, 0.3])
-    on_device = [x.detach().float().cuda().requires_grad_() for x in inputs]
-    found = cuda.render(*on_device, CameraParams.of(CAMERA, torch.float32, "cuda"), background.float().cuda())
-    expected = twin.render(*inputs, PARAMS, background, GSPLAT)
-    torch.testing.assert_close(found.features.double().cpu(), expected.features, rtol=0, atol=1e-4)
-    torch.testing.assert_close(found.alpha.double().cpu(), expected.alpha, rtol=0, atol=1e-4)
-    theirs = torch.autograd.grad((found.features**2).sum(), on_device)
-    ours = torch.autograd.grad((expected.features**2).sum(), inputs)
-    for a, b in zip(theirs, ours, strict=True):
-        torch.testing.assert_close(a.double().cpu(), b, rtol=1e-2, atol=1e-3 * b.abs().max().item())

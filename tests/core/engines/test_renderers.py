@@ -1,0 +1,82 @@
+"""The renderer of the CPU against that of the reference."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from engine_cases import case, gaussians, rig
+
+from scas4d_core.engines.cpu.renderer import CpuRenderer
+from scas4d_core.engines.limits import Limits
+from scas4d_core.engines.torch.renderer import TorchRenderer
+from scas4d_core.engines.views import LABEL, CameraArrays
+
+BACKGROUND, LIMITS = (0.1, 0.2, 0.3), Limits(near=0.2)
+MINE, TRUE = CpuRenderer(BACKGROUND, limits=LIMITS), TorchRenderer(BACKGROUND, LIMITS)
+CAMERA = CameraArrays.of(rig().cameras[1])
+CLOSE = 1e-4
+"""Relative to the norm: float32 against float64."""
+
+
+def apart(mine: np.ndarray, true: np.ndarray) -> float:
+    return float(np.linalg.norm(np.float64(mine) - true) / np.linalg.norm(true))
+
+
+@pytest.mark.parametrize("glossy", [False, True])
+def test_pictures(glossy: bool) -> None:
+    state = gaussians(glossy=glossy)
+    mine, true = MINE.render(state, CAMERA), TRUE.render(state, CAMERA)
+    assert mine.features.shape == true.features.shape == (4, 40, 48)
+    assert apart(mine.features, true.features) < CLOSE
+    assert apart(mine.rest, true.rest) < CLOSE
+    if glossy:
+        dull = TRUE.render(state.replace(gloss=None, environment=None), CAMERA)
+        assert apart(dull.features, true.features) > 0.01
+
+
+def test_depth_features_and_another_background() -> None:
+    state, rng = gaussians(), np.random.default_rng(0)
+    given = rng.uniform(size=(len(state), 4)).astype(np.float32)
+    behind = np.float32([0.4, 0, 0.9, 7])
+    mine, true = (
+        renderer.render(state, CAMERA, given.copy(), depth_channel=LABEL, background=behind)
+        for renderer in (MINE, TRUE)
+    )
+    assert apart(mine.features, true.features) < CLOSE
+    assert true.features[LABEL].max() > 1.5  # metres
+
+
+def test_comparisons() -> None:
+    scene = case(gaussians())
+    for view in scene.views[:3]:
+        mine, true = (renderer.compare(scene.previous, view) for renderer in (MINE, TRUE))
+        assert mine.psnr == pytest.approx(true.psnr, abs=1e-3)
+        assert mine.image_loss == pytest.approx(true.image_loss, rel=CLOSE)
+        assert mine.colour_shift == pytest.approx(true.colour_shift, abs=1e-6)
+
+
+def test_sums_over_pixels() -> None:
+    state, rng = gaussians(), np.random.default_rng(3)
+    planes = rng.uniform(-1, 1, (3, 40, 48)).astype(np.float32)
+    planes[0] = 1
+    mine, true = (renderer.gather(state, CAMERA, planes) for renderer in (MINE, TRUE))
+    assert mine.shape == (len(state), 3)
+    assert apart(mine, true) < CLOSE
+
+
+def test_residuals_of_some_gaussians() -> None:
+    scene = case(gaussians())
+    learnt = (np.arange(len(scene.previous)) % 3 == 0).astype(np.uint8)
+    mine, true = (renderer.residuals(scene.previous, scene.views[2], learnt, 0.05) for renderer in (MINE, TRUE))
+    assert apart(mine[0][learnt == 1], true[0][learnt == 1]) < 1e-3  # small differences of pictures
+    assert apart(mine[1][learnt == 1], true[1][learnt == 1]) < CLOSE
+    assert not true[1][learnt == 0].any()
+
+
+def test_blocks_that_are_reached() -> None:
+    state = gaussians()
+    rows = np.arange(0, 40)
+    mine, true = (renderer.reached(state, rows, CAMERA) for renderer in (MINE, TRUE))
+    assert mine.shape == true.shape
+    assert not (true & ~mine).any()  # a support may pass between the centres of pixels
+    assert (mine & ~true).sum() <= 0.2 * mine.sum()
