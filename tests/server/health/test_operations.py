@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import signal
@@ -60,8 +61,9 @@ def children(pid):
     """Processes of the service, and those of them."""
     found = []
     for task in Path(f"/proc/{pid}/task").glob("*/children"):
-        for child in task.read_text().split():
-            found += [int(child), *children(child)]
+        with contextlib.suppress(FileNotFoundError):  # a thread that ended meanwhile
+            for child in task.read_text().split():
+                found += [int(child), *children(child)]
     return found
 
 

@@ -238,9 +238,8 @@ def test_a_scene_whose_states_are_lost_begins_again(tmp_path):
         before = committed(tmp_path, id)["states"]
     states = DataFolder(tmp_path).scene(id).states
     for name in ("fixed.npz", "fixed.copy.npz"):
-        content = bytearray((states / name).read_bytes())
-        content[len(content) // 2] ^= 1
-        (states / name).write_bytes(content)
+        content = (states / name).read_bytes()
+        (states / name).write_bytes(content[: len(content) // 2])
     with serving(tmp_path) as (http, sdk):
         wait_for(lambda: status(http, id)["state"] == "failed")
         found = status(http, id)
