@@ -19,6 +19,7 @@ from waiting import HANG_S
 
 from client.wire import RigModel
 from scas4d_core.captures import InitialPoints
+from scas4d_core.storage.npz import write_npz
 from server.storage import recovery
 from server.storage.definition import FORMAT
 from server.storage.frame_table import LOST
@@ -197,6 +198,24 @@ def test_a_scene_of_another_format_is_refused_by_name_and_left_as_it_is(tmp_path
         document = problem(http.get(f"/v1/scenes/{id}"), 404)
         assert f"format {FORMAT + 1}" in document["detail"]
         assert "open it with the version that wrote it" in document["detail"]
+        assert http.get("/v1/scenes").json()["scenes"] == []
+    assert contents(folder) == before
+
+
+def test_states_of_another_format_are_no_damage(tmp_path):
+    with serving(tmp_path) as (http, _):
+        id = create(http)
+        put(http, id, 0)
+        settled(http, id)
+    folder = tmp_path / "scenes" / id
+    for name in ("fixed.npz", "fixed.copy.npz"):
+        with np.load(folder / "states" / name) as file:
+            arrays = {key: file[key] for key in file.files}
+        write_npz(folder / "states" / name, {**arrays, "format": np.int64(99)})
+    before = contents(folder)
+    with serving(tmp_path) as (http, _):
+        document = problem(http.get(f"/v1/scenes/{id}"), 404)
+        assert "states, a folder of states, has format 99" in document["detail"]
         assert http.get("/v1/scenes").json()["scenes"] == []
     assert contents(folder) == before
 
