@@ -160,7 +160,7 @@ class Preparation:
         """The updater on the engine of ``settings.device``, and the digest of its clusters and neighbours.
 
         Args:
-            roots: with the labels of what moves.
+            roots: with the labels of the moving Gaussians.
         """
         hierarchy = self._clusters(roots)
         builder = PlanBuilder(self._scene, self._settings.update, self._factory, hierarchy, roots)
@@ -203,7 +203,7 @@ class Preparation:
         return self.again(prepared.roots, replace(carried, labels=labels, motion=None))
 
     def followed(self, prepared: Prepared, seen: Seen, populates: bool) -> tuple[UpdateResult, Prepared]:
-        """What follows from a frame that was learnt: its result, and what the next update starts from.
+        """The result of a frame that was learnt, and what the next update starts from.
 
         Args:
             seen: the frame. populates: whether Gaussians may come and go.

@@ -258,7 +258,7 @@ class Reconstruction(CommittedScene):
         watch.lap("judge")
 
     def _prepare(self, context: FrameContext) -> None:
-        """Labels what moves, where no masks do, and gathers the input of the update."""
+        """Finds the moving Gaussians where no masks name them, and gathers the input of the update."""
         observed, frame, prepared, newest = context.observed, context.frame, self._prepared, self.history.newest
         believed, learns = observed.believed, observed.steady and self._learns_labels
         if learns and prepared.carried.seen:
@@ -289,13 +289,13 @@ class Reconstruction(CommittedScene):
         )
 
     def _solve(self, context: FrameContext) -> None:
-        """Updates Θ_{t−1} to the frame; of a frame that is not believed nothing stays."""
+        """Updates Θ_{t−1} to the frame; a frame that is rejected changes nothing."""
         solver = FrameSolver(context.prepared.updater, self._factory, self._renderer, self._update)
         result, context.past = solver.run(context.given)
         context.judging = solver.judging
         context.watch.lap("update")
         context.watch.move("update", "judge", solver.judging)
-        if result.outcome.held:  # motion that seemed to be in its pictures is as little believed as they are
+        if result.outcome.held:  # motion seen in pictures that are rejected is rejected with them
             carried = self._prepared.carried
             context.prepared = self._prepared
             result = replace(result, gaussians=self.history.newest, motion=carried.motion, carried=carried.effects)
@@ -312,7 +312,7 @@ class Reconstruction(CommittedScene):
         context.notes = {"cold": context.given.motion is None, "relabelled": relabelled, **context.notes}
         context.prepared = replace(context.prepared, carried=carried)
         context.fits = FitTime(self._budget.end_of_births(context.watch.began))
-        if not result.outcome.learnt or result.exposure != 1.0:  # in a light that is taken out again much looks new
+        if not result.outcome.learnt or result.exposure != 1.0:  # where a change of light was taken out, much looks new
             return
         learnt = [view for view in result.views or believed if view.name not in result.trace.left_out]
         names = {view.name for view in learnt}
@@ -350,7 +350,7 @@ class Reconstruction(CommittedScene):
 
     @property
     def _learns_labels(self) -> bool:
-        """True where motion says what moves: no masks do, and the effects ask for it."""
+        """True where moving Gaussians are found from motion: there are no masks, and an effect asks for it."""
         return self._prepared.plan.learns_labels and not self._fixed.masked
 
     def _seconds_to(self, frame: Frame) -> float:

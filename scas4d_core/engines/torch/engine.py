@@ -144,7 +144,7 @@ class TorchEngine:
 
     def _neighbour_terms(self, moved: Moved, step: StepScalars) -> list[Tensor]:
         plan, scene = self._plan, self._scene
-        middle = scene.means[scene.rows[scene.sound]].mean(dim=0)  # stands in for what is held back, at weight 0
+        middle = scene.means[scene.rows[scene.sound]].mean(dim=0)  # replaces places that are not finite, at weight 0
         now, before = (
             torch.where(scene.sound[:, None], means[scene.rows], middle) for means in (moved.means, scene.means)
         )
