@@ -262,6 +262,13 @@ class UpdateEngine(Protocol):
             learnt: with the colours, gloss and environment learnt so far, else those of Θ_{t−1}.
         """
 
+    def gradients(self) -> dict[str, Array]:
+        """Gradients of the last iteration's loss, before its step: for tests, before anything else is rendered.
+
+        By table: "cluster 0" and so on [K, 10] and "deltas" [M, 9] in the columns of ``Tables``; where they are learnt,
+        "colours" [N, 3], "gloss" [M, 3] and "environment".
+        """
+
     def exposures(self) -> Mapping[str, Array]:
         """[C, 2] gain and offset of each camera that has views, by name, as they are now."""
 

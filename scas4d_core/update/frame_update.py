@@ -97,13 +97,14 @@ class FrameUpdate:
             stopping = Stopping(0)
         watch.lap("start")
         rendered: set[int] = set()
-        iteration = fade = 0
+        iteration = planned_before = 0
         while iteration < (planned := stopping.planned(iteration)):
             if stopping.end is not None:
                 engine.wait(iteration)
             chosen = order.take()
-            engine.iterate(chosen, self._step(rates, iteration, planned, fade or planned, len(samples)))
-            iteration, fade = iteration + 1, planned
+            step = self._step(rates, iteration, planned, planned_before or planned, len(samples))
+            engine.iterate(chosen, step)  # cascade, render, compare, backward, Adam
+            iteration, planned_before = iteration + 1, planned
             trace.moments.append(watch.total)
             watch.lap(REPORT)
             all_seen = len(rendered) == len(views)
@@ -151,16 +152,16 @@ class FrameUpdate:
             samples=samples, gains=gains, curve=self.curve, lap=watch.lap,
         )  # fmt: skip
 
-    def _step(self, rates: Rates, iteration: int, planned: int, fade: int, samples: int) -> StepScalars:
+    def _step(self, rates: Rates, iteration: int, planned: int, planned_before: int, samples: int) -> StepScalars:
         """The numbers of an iteration.
 
         Args:
-            planned: iterations in all. fade: the same as it was planned one iteration before.
+            planned: iterations in all. planned_before: the same, as it was before the iteration before this one.
             samples: number of samples of neighbourhoods.
         """
         rigidity = self.plan.rigidity
         if self.plan.rigidity_fades:  # at the end of an update positions are better known than turns
-            rigidity *= 0.5 * (1 + cos(pi * min(1.0, iteration / fade)))
+            rigidity *= 0.5 * (1 + cos(pi * min(1.0, iteration / planned_before)))
         return StepScalars(
             resting=rates.resting(iteration, planned),
             layers=tuple(

@@ -264,11 +264,7 @@ class CpuEngine:
         return self._gains.gains.copy()
 
     def gradients(self) -> dict[str, Array]:
-        """Gradients of the last iteration's loss, before its step, for tests: nothing may be rendered in between.
-
-        By table: "cluster 0" and so on [K, 10] and "deltas" [M, 9] in the columns of ``Tables``; where they are learnt,
-        "colours" [N, 3], "gloss" [M, 3] and "environment". Those of resting layers are not up to date.
-        """
+        """See ``UpdateEngine.gradients``; those of resting layers are not up to date."""
         deformation = self._deformation
         tables = {f"cluster {layer}": g.copy() for layer, g in enumerate(deformation.cluster_gradients)}
         tables["deltas"] = deformation.delta_gradients.copy()

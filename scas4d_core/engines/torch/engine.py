@@ -242,7 +242,7 @@ class TorchEngine:
         return self._gains.gains.copy()
 
     def gradients(self) -> dict[str, Array]:
-        """Gradients of the last iteration's loss, before its step, for tests; see ``CpuEngine.gradients``."""
+        """See ``UpdateEngine.gradients``; in float64."""
         return tables_of_gradients(self._gradients, self._scene, len(self._parameters.clusters))
 
     def _named(self) -> dict[str, Tensor]:

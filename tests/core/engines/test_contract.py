@@ -21,6 +21,8 @@ from scas4d_core.update.schedule import Stopping
 from scas4d_core.update.view_factory import ViewFactory
 
 ENGINES: dict[str, Callable[[], UpdateEngine]] = {"cpu": CpuEngine, "torch": TorchEngine}
+TESTED = {name: made for name, made in ENGINES.items() if name != "torch"}
+"""The engines that are compared with the reference; a new one is a line of ``ENGINES``."""
 PLANS = {**EFFECTS, "all together": TOGETHER}
 TOLERANCE = 1e-4
 """Relative to the norm: float32 against float64, of each stage's values and gradients."""
@@ -39,13 +41,14 @@ def apart(mine: np.ndarray, true: np.ndarray) -> float:
 # Values and gradients against the reference.
 
 
+@pytest.mark.parametrize("tested", TESTED)
 @pytest.mark.parametrize("effect", PLANS)
-def test_an_iteration_has_the_values_and_gradients_of_the_reference(effect: str) -> None:
+def test_an_iteration_has_the_values_and_gradients_of_the_reference(effect: str, tested: str) -> None:
     scene = case(**PLANS[effect])
-    mine, true = loaded(CpuEngine(), scene), loaded(TorchEngine(), scene)
+    mine, true = loaded(TESTED[tested](), scene), loaded(TorchEngine(), scene)
     for engine in (mine, true):
         engine.iterate([0], step())
-    gradients, expected = mine.gradients(), true.gradients()  # type: ignore[attr-defined]
+    gradients, expected = mine.gradients(), true.gradients()
     assert mine.log().losses == pytest.approx(true.log().losses, rel=TOLERANCE)
     assert set(gradients) >= {"cluster 0", "cluster 1", "deltas"}
     for name in gradients:
@@ -54,10 +57,11 @@ def test_an_iteration_has_the_values_and_gradients_of_the_reference(effect: str)
         assert apart(gradients[name][rows], expected[name][rows]) < TOLERANCE, name
 
 
+@pytest.mark.parametrize("tested", TESTED)
 @pytest.mark.parametrize("effect", PLANS)
-def test_states_and_probes_are_those_of_the_reference(effect: str) -> None:
+def test_states_and_probes_are_those_of_the_reference(effect: str, tested: str) -> None:
     scene = case(**PLANS[effect])
-    mine, true = loaded(CpuEngine(), scene), loaded(TorchEngine(), scene)
+    mine, true = loaded(TESTED[tested](), scene), loaded(TorchEngine(), scene)
     for moved in (False, True):
         errors = [engine.probe(range(len(scene.probes)), moved=moved, learnt=False) for engine in (mine, true)]
         assert errors[0] == pytest.approx(errors[1], rel=TOLERANCE)
@@ -67,21 +71,23 @@ def test_states_and_probes_are_those_of_the_reference(effect: str) -> None:
             assert apart(states[0][name], array) < TOLERANCE, name
 
 
-def test_the_mean_over_views_is_that_of_the_reference() -> None:
+@pytest.mark.parametrize("tested", TESTED)
+def test_the_mean_over_views_is_that_of_the_reference(tested: str) -> None:
     scene = case(**TOGETHER)
-    mine, true = loaded(CpuEngine(), scene), loaded(TorchEngine(), scene)
+    mine, true = loaded(TESTED[tested](), scene), loaded(TorchEngine(), scene)
     for engine in (mine, true):
         engine.iterate([3, 0, 2], step())
-    gradients, expected = mine.gradients(), true.gradients()  # type: ignore[attr-defined]
+    gradients, expected = mine.gradients(), true.gradients()
     for name in gradients:
         assert apart(gradients[name], expected[name]) < TOLERANCE, name
     assert [row.view for row in mine.log().rendered] == [row.view for row in true.log().rendered] == [3, 0, 2]
 
 
+@pytest.mark.parametrize("tested", TESTED)
 @pytest.mark.parametrize("effect", PLANS)
-def test_an_update_of_eight_iterations_ends_where_the_reference_does(effect: str) -> None:
+def test_an_update_of_eight_iterations_ends_where_the_reference_does(effect: str, tested: str) -> None:
     scene = case(**PLANS[effect])
-    ends = [updated(scene, made()) for made in ENGINES.values()]
+    ends = [updated(scene, engine) for engine in (TESTED[tested](), TorchEngine())]
     (mine, losses, gains), (true, expected, true_gains) = ends
     assert losses == pytest.approx(expected, rel=0.01)
     assert np.median(np.linalg.norm(mine.means - true.means, axis=1)[scene.rows]) < 1e-3
