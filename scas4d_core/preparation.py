@@ -130,15 +130,6 @@ class Preparation:
         exposures = known_gains(fixed, effects, self._factory.rig.names)
         return self._factory.views(self._factory.scaled(frame), exposures, prepared.plan.mask > 0)
 
-    def first(self, roots: Gaussians, switches: Switches) -> Prepared:
-        """Prepares the first update of a scene.
-
-        Args:
-            roots: Θ_0. switches: of the effects.
-        """
-        updater, structure = self._updater(roots, switches)
-        return Prepared(updater, CarryOver(structure=structure, switches=switches), roots)
-
     def again(self, roots: Gaussians, carried: CarryOver) -> Prepared:
         """Prepares the next update anew; a motion that belongs to other clusters is dropped from the carry-over.
 

@@ -137,7 +137,7 @@ class Reconstruction(CommittedScene):
         fixed = len(frame.masks) > 0, result.exposures, axis_lengths(result.gaussians), self.settings.scene.behind
         self._fixed = FirstFrame(*fixed)
         switches, effects = self._preparation.begun(scaled, result)
-        self._prepared = self._preparation.first(result.gaussians, switches)
+        self._prepared = self._preparation.again(result.gaussians, CarryOver(switches=switches))
         seen = self._factory.views(scaled, {}, False) if self._learns_labels else ()
         load = {} if started is None else {"load": began - started}
         stages = {"calibration": checked - began, "fit": fitted - checked, "prepare": perf_counter() - fitted}

@@ -34,13 +34,12 @@ class Comparison(NamedTuple):
     """A state compared with the picture of a view.
 
     Attributes:
-        psnr: dB. image_loss: 0.8 L1 + 0.2 (1 − SSIM). mask_loss: the same of label and mask, weighted.
+        psnr: dB. image_loss: 0.8 L1 + 0.2 (1 − SSIM), weighted.
         colour_shift: [3] mean of the picture minus mean of the rendering, RGB in 0…1, exposure included.
     """
 
     psnr: float
     image_loss: float
-    mask_loss: float
     colour_shift: tuple[float, float, float]
 
 

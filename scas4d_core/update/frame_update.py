@@ -126,7 +126,7 @@ class FrameUpdate:
         trace.whole = best.whole
         watch.lap("end")
         state = previous if trace.kept is Candidate.STILL else engine.state(learnt=trace.kept is Candidate.END)
-        views, attempt.views = self._exposed(views), self._exposed(attempt.views)
+        attempt.views = self._exposed(attempt.views)
         for part in self._parts:
             state = part.end(attempt, state)
         after = Motion.of(engine.tables(), self.hierarchy, best.seconds)

@@ -111,6 +111,11 @@ def moved(state: Gaussians) -> Gaussians:
     return state.replace(means=means, colours=np.float32(1.04) * state.colours)
 
 
+def apart(mine: np.ndarray, true: np.ndarray) -> float:
+    """Distance of two arrays, relative to the norm of the second."""
+    return float(np.linalg.norm(np.asarray(mine, np.float64) - true) / max(np.linalg.norm(true), 1e-12))
+
+
 def case(previous: Gaussians | None = None, **plan: object) -> Case:
     """A scene with a plan of images and all parameters of the deformation, and what ``plan`` adds."""
     glossy = bool(plan.get("gloss"))

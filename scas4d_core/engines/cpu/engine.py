@@ -51,8 +51,6 @@ class CpuEngine:
         self._camera_rows = {name: row for row, name in enumerate(plan.cameras)}
         self._views: list[TrainingView] = []
         self._probes: list[TrainingView] = []
-        self._gloss: LearntGloss | None = None
-        self._gains: CameraGains | None = None
 
     def load_views(self, views: Sequence[TrainingView], probes: Sequence[TrainingView]) -> None:
         """See ``UpdateEngine.load_views``; where gains are followed, the views get exposures of their own."""
@@ -71,7 +69,8 @@ class CpuEngine:
         self.renderer.load_state(previous)
         self._colours = previous.colours.copy()
         self._features = previous.features(previous.colours)
-        self._gloss, self._gains = None, None
+        self._gloss: LearntGloss | None = None
+        self._gains: CameraGains | None = None
         self._colour_table: Colours | None = None
         self._layer_columns: list[FreeColumns | None] = []
         self._own_columns: FreeColumns | None = None

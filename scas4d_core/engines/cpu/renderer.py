@@ -92,7 +92,7 @@ class CpuRenderer:
         """See ``Renderer.compare``."""
         shown = features_seen(state, view.camera) if features is None else features
         self.measure(state.means, state.factors, state.opacities, shown, view)
-        return Comparison(self.psnr, self.image_part, self.mask_part, self.colour_shift(view))
+        return Comparison(self.psnr, self.image_part, self.colour_shift(view))
 
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
         """See ``Renderer.gather``."""

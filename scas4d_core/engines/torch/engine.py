@@ -11,11 +11,19 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from scas4d_core.engines.cpu.gloss import (
+    NEIGHBOURS,
+    SAME_SIDE,
+    UPDATE_RATE_ENVIRONMENT,
+    UPDATE_RATE_GLOSS,
+    UPDATE_RATE_NEARNESS,
+    gloss_rate,
+)
 from scas4d_core.engines.engine import AttemptStart, IterationLog, Rendered, StepScalars, Tables, Thinned
 from scas4d_core.engines.gains import CameraGains
 from scas4d_core.engines.plan import MAX_SCALE, Structure, UpdatePlan
 from scas4d_core.engines.torch import losses
-from scas4d_core.engines.torch.gloss import RATES, SAME_SIDE, SMOOTH_OVER, cell_shares, gloss_rate
+from scas4d_core.engines.torch.gloss import cell_shares, no_turns
 from scas4d_core.engines.torch.parameters import GlossParameters, Parameters, deformation_of, leaf
 from scas4d_core.engines.torch.rasterizer import CameraParams, render
 from scas4d_core.engines.torch.renderer import TorchRenderer
@@ -68,10 +76,10 @@ class TorchEngine:
         """See ``UpdateEngine.begin``."""
         self._start, self._log, previous = start, IterationLog(), self._scene.previous
         if self._plan.gloss and previous.gloss is not None and previous.environment is not None:
-            rate, environment = gloss_rate(RATES[0], previous.gloss), leaf(previous.environment)
+            rate, environment = gloss_rate(UPDATE_RATE_GLOSS, previous.gloss), leaf(previous.environment)
             self._parameters.gloss = GlossParameters(
                 leaf(previous.gloss), environment[:MIDDLE].clone(), environment[NEARNESS:].clone(),
-                environment[MIDDLE:NEARNESS].clone(), (rate, *RATES[1:]),
+                environment[MIDDLE:NEARNESS].clone(), (rate, UPDATE_RATE_ENVIRONMENT, UPDATE_RATE_NEARNESS),
             )  # fmt: skip
         if start.gains is not None:
             self._gains = CameraGains(start.gains, self._camera_rows, self._views)
@@ -177,7 +185,7 @@ class TorchEngine:
         if self._smoothing is None:
             count = len(gloss)
             roots = self._structure.roots[:count]
-            index = torch.as_tensor(cKDTree(roots).query(roots, min(SMOOTH_OVER, count))[1].reshape(count, -1))
+            index = torch.as_tensor(cKDTree(roots).query(roots, min(NEIGHBOURS, count))[1].reshape(count, -1))
             normals = gloss / gloss.norm(dim=1, keepdim=True).clamp(min=1e-9)
             alike = (torch.einsum("nkc,nc->nk", normals[index], normals) > SAME_SIDE).double()
             alike[:, 0] = 1
@@ -196,9 +204,7 @@ class TorchEngine:
     def probe(self, which: Sequence[int], *, moved: bool, learnt: bool) -> list[float]:
         """See ``UpdateEngine.probe``."""
         scene, previous = self._scene, self._scene.previous
-        still = torch.zeros(len(scene.rows), 4, dtype=torch.float64)
-        still[:, 0] = 1
-        now = scene.moved(self._parameters) if moved else Moved(scene.means, scene.factors, still)
+        now = scene.moved(self._parameters) if moved else Moved(scene.means, scene.factors, no_turns(len(scene.rows)))
         colours, looks = scene.colours, self._parameters.gloss
         gloss = None if previous.gloss is None else leaf(previous.gloss)
         environment = None if previous.environment is None else leaf(previous.environment)

@@ -2,28 +2,32 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from scas4d_core.engines.torch.deformation import quaternion_matrices
 from scas4d_core.kernels.appearance.direction import CELLS, DARK, DULL, FALL, MIDDLE, NEARNESS, OVER, SHEEN, SIDE
 
-RATES = (2e-3, 1e-2, 1e-3)
-"""Adam's, of gloss (``gloss_rate``), light and nearness in an update."""
-STRENGTH = 0.5
-"""Strength of the gloss for which the rate of the gloss is given."""
-SMOOTH_OVER = 16
-"""Neighbours over which changes of the gloss are averaged."""
-SAME_SIDE = 0.5
-"""Cosine between normals above which neighbours are of one surface."""
+
+def no_turns(count: int) -> Tensor:
+    """[count, 4] quaternions that turn nothing."""
+    turns = torch.zeros(count, 4, dtype=torch.float64)
+    turns[:, 0] = 1
+    return turns
 
 
-def gloss_rate(rate: float, gloss: NDArray[np.floating]) -> float:
-    """The rate of a gloss [M, 3] that turns its normals as fast as ``rate`` those of a strength of ``STRENGTH``."""
-    strengths = np.linalg.norm(gloss.astype(np.float64), axis=1)
-    return float(rate * np.square(strengths).sum() / max(strengths.sum(), 1e-9) / STRENGTH)
+def colours_seen(
+    means: Tensor, turns: Tensor, colours: Tensor, gloss: Tensor | None, environment: Tensor | None, centre: Tensor
+) -> Tensor:
+    """[N, 3] colours as a camera at ``centre`` [3] sees them: those given where nothing is glossy.
+
+    Args:
+        gloss: [M, 3] of the first M; the others are dull. The rest are as of ``shade``.
+    """
+    if gloss is None or environment is None:
+        return colours
+    dull = torch.zeros(len(means) - len(gloss), 3, dtype=torch.float64)
+    return shade(means, torch.cat([gloss, dull]), turns, colours, environment, centre)
 
 
 def cell_shares() -> Tensor:

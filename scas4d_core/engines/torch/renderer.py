@@ -10,7 +10,7 @@ from torch import Tensor
 from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.engines.renderer import BLOCK, Comparison, Picture
 from scas4d_core.engines.torch import losses
-from scas4d_core.engines.torch.gloss import shade
+from scas4d_core.engines.torch.gloss import colours_seen, no_turns
 from scas4d_core.engines.torch.parameters import leaf
 from scas4d_core.engines.torch.rasterizer import CameraParams, Rendered, project, render
 from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView
@@ -48,13 +48,13 @@ class TorchRenderer:
         return Picture(picture.features.permute(2, 0, 1).float().numpy(), (1 - picture.alpha).float().numpy())
 
     def compare(self, state: Gaussians, view: TrainingView, features: Array | None = None) -> Comparison:
-        """See ``Renderer.compare``; no mask is compared."""
+        """See ``Renderer.compare``."""
         planes = leaf(self.render(state, view.camera, features).features[:LABEL])
         shown = planes * leaf(view.exposure[:3, 0])[:, None, None] + leaf(view.exposure[:3, 1])[:, None, None]
         picture, target = shown.permute(1, 2, 0), leaf(view.target[:LABEL]).permute(1, 2, 0)
         red, green, blue = (view.mean - shown.mean(dim=(1, 2)).numpy()).tolist()
         loss = float(losses.image_loss(picture, target))
-        return Comparison(float(losses.psnr(picture, target)), loss, 0.0, (red, green, blue))
+        return Comparison(float(losses.psnr(picture, target)), loss, (red, green, blue))
 
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
         """See ``Renderer.gather``: the gradient of a weighted sum of the pixels, for features that it is linear in."""
@@ -99,13 +99,11 @@ class TorchRenderer:
 
     def _seen(self, state: Gaussians, camera: CameraArrays) -> Tensor:
         """[N, 4] RGB with gloss, and the label."""
-        colours = leaf(state.colours)
-        if state.gloss is not None and state.environment is not None:
-            turns = torch.zeros(len(state), 4, dtype=torch.float64)
-            turns[:, 0] = 1
-            gloss = torch.cat([leaf(state.gloss), torch.zeros(len(state) - len(state.gloss), 3, dtype=torch.float64)])
-            colours = shade(leaf(state.means), gloss, turns, colours, leaf(state.environment), leaf(camera.centre))
-        return torch.cat([colours, leaf(state.foreground)[:, None]], dim=1)
+        gloss = None if state.gloss is None else leaf(state.gloss)
+        environment = None if state.environment is None else leaf(state.environment)
+        means, colours = leaf(state.means), leaf(state.colours)
+        seen = colours_seen(means, no_turns(len(state)), colours, gloss, environment, leaf(camera.centre))
+        return torch.cat([seen, leaf(state.foreground)[:, None]], dim=1)
 
     def _drawn(self, state: Gaussians, camera: CameraArrays, features: Tensor, background: Array | None) -> Rendered:
         behind = torch.zeros(features.shape[1], dtype=torch.float64)

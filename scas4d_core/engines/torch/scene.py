@@ -10,7 +10,7 @@ from torch import Tensor
 
 from scas4d_core.engines.plan import Structure, UpdatePlan
 from scas4d_core.engines.torch.deformation import Layer, deform, material_rotations
-from scas4d_core.engines.torch.gloss import shade
+from scas4d_core.engines.torch.gloss import colours_seen, no_turns
 from scas4d_core.engines.torch.parameters import Parameters, leaf
 from scas4d_core.engines.views import CameraArrays
 from scas4d_core.gaussians import Gaussians
@@ -65,12 +65,10 @@ class Scene:
         deltas = type(parameters.deltas)(*(values[self.sound] for values in parameters.deltas))
         plan = self.plan
         now = deform(self.means[chosen], self.factors[chosen], layers, deltas, plan.cluster_map, plan.covariance)
-        still = torch.zeros(len(self.rows), 4, dtype=torch.float64)
-        still[:, 0] = 1
         return Moved(
             self.means.index_copy(0, chosen, now.means),
             self.factors.index_copy(0, chosen, now.factors),
-            still.index_copy(0, torch.nonzero(self.sound)[:, 0], now.turns),
+            no_turns(len(self.rows)).index_copy(0, torch.nonzero(self.sound)[:, 0], now.turns),
         )
 
     def all_colours(self, parameters: Parameters) -> Tensor:
@@ -82,15 +80,9 @@ class Scene:
         self, moved: Moved, colours: Tensor, gloss: Tensor | None, environment: Tensor | None, camera: CameraArrays
     ) -> Tensor:
         """[N, 4] features as a camera sees them: RGB with gloss, and the label; no gradient to places and turns."""
-        if gloss is not None and environment is not None:
-            turns = torch.zeros(len(self.means), 4, dtype=torch.float64)
-            turns[:, 0] = 1
-            turns = turns.index_copy(0, self.rows, moved.turns.detach())
-            dull = torch.zeros(len(self.means) - len(gloss), 3, dtype=torch.float64)
-            colours = shade(
-                moved.means.detach(), torch.cat([gloss, dull]), turns, colours, environment, leaf(camera.centre)
-            )
-        return torch.cat([colours, self.labels[:, None]], dim=1)
+        turns = no_turns(len(self.means)).index_copy(0, self.rows, moved.turns.detach())
+        seen = colours_seen(moved.means.detach(), turns, colours, gloss, environment, leaf(camera.centre))
+        return torch.cat([seen, self.labels[:, None]], dim=1)
 
     def state(self, moved: Moved, parameters: Parameters | None) -> Gaussians:
         """Θ_t with material rotations; ``parameters``: with the looks that were learnt, else those of Θ_{t−1}."""

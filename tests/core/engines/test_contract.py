@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from engine_cases import CLUSTERS, EFFECTS, TOGETHER, Case, case, gaussians, loaded, random_tables, rig, step
+from engine_cases import CLUSTERS, EFFECTS, TOGETHER, Case, apart, case, gaussians, loaded, random_tables, rig, step
 
 from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.engine import KEPT_PICTURES, EngineError, Tables, UpdateEngine
@@ -31,11 +31,6 @@ TOLERANCE = 1e-4
 @pytest.fixture(params=ENGINES)
 def engine(request) -> UpdateEngine:
     return ENGINES[request.param]()
-
-
-def apart(mine: np.ndarray, true: np.ndarray) -> float:
-    """Distance of two arrays, relative to the norm of the second."""
-    return float(np.linalg.norm(np.asarray(mine, np.float64) - true) / max(np.linalg.norm(true), 1e-12))
 
 
 # Values and gradients against the reference.

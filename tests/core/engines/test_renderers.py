@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from engine_cases import case, gaussians, rig
+from engine_cases import apart, case, gaussians, rig
 
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.limits import Limits
@@ -16,10 +16,6 @@ MINE, TRUE = CpuRenderer(BACKGROUND, limits=LIMITS), TorchRenderer(BACKGROUND, L
 CAMERA = CameraArrays.of(rig().cameras[1])
 CLOSE = 1e-4
 """Relative to the norm: float32 against float64."""
-
-
-def apart(mine: np.ndarray, true: np.ndarray) -> float:
-    return float(np.linalg.norm(np.float64(mine) - true) / np.linalg.norm(true))
 
 
 @pytest.mark.parametrize("glossy", [False, True])

@@ -184,8 +184,8 @@ def test_each_may_be_off_and_they_are_on_where_the_settings_allow_them() -> None
 
 def test_without_motion_of_clusters_there_is_no_cascade(preparation) -> None:  # type: ignore[no-untyped-def]
     settings = Settings(update=UPDATE, effects=dict.fromkeys(MOVES[:3], "off"))
-    made = preparation(settings).first(BEFORE, first_switches(settings, 0))
-    other = preparation(Settings(update=UPDATE)).first(BEFORE, first_switches(Settings(), 0))
+    made = preparation(settings).again(BEFORE, CarryOver(switches=first_switches(settings, 0)))
+    other = preparation(Settings(update=UPDATE)).again(BEFORE, CarryOver(switches=first_switches(Settings(), 0)))
     assert (made.updater.hierarchy.sizes, other.updater.hierarchy.sizes) == ((), (2, 12))
     assert np.array_equal(made.updater.hierarchy.rows, other.updater.hierarchy.rows)
     assert made.carried.structure != other.carried.structure  # a motion of the one is none of the other
