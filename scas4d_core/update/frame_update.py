@@ -22,7 +22,7 @@ from scas4d_core.structure.neighbours import Neighbours
 from scas4d_core.update.best_state import BestState, ProbeViews
 from scas4d_core.update.parts import NOTHING, Arrays, Attempt, PlanBuilder
 from scas4d_core.update.rates import Rates
-from scas4d_core.update.result import AS_SET, AttemptOptions, Stopwatch, UpdateResult, UpdateTrace
+from scas4d_core.update.result import AS_SET, AttemptOptions, Gate, Stopwatch, UpdateResult, UpdateTrace
 from scas4d_core.update.schedule import Stopping, ViewPlan, plan_samples
 from scas4d_core.update.warm_start import Motion, predicted
 
@@ -110,12 +110,7 @@ class FrameUpdate:
             all_seen = len(rendered) == len(views)
             rendered.update(chosen)
             if options.gate is not None and not all_seen and len(rendered) == len(views):
-                trace.take(engine.log(), views)
-                trace.left_out.update(options.gate(trace.first))
-                out = [index for index, view in enumerate(views) if view.name in trace.left_out]
-                order.leave_out(out)
-                engine.leave_out(out)
-                attempt.views = [view for view in views if view.name not in trace.left_out]
+                self._exclude_outliers(options.gate, attempt, order, trace)
                 watch.lap("judge")
             if stopping.looks(iteration):
                 stopping.saw(iteration, best.error())
@@ -125,15 +120,31 @@ class FrameUpdate:
         trace.kept = attempt.kept = best.end(iteration, trace.left_out)
         trace.whole = best.whole
         watch.lap("end")
-        state = previous if trace.kept is Candidate.STILL else engine.state(learnt=trace.kept is Candidate.END)
-        attempt.views = self._exposed(attempt.views)
-        for part in self._parts:
-            state = part.end(attempt, state)
+        state = self._finish(attempt)
         after = Motion.of(engine.tables(), self.hierarchy, best.seconds)
         trace.guards = engine.log().guards
         watch.lap("commit")
         trace.seconds = watch.seconds
         return UpdateResult(state, after, trace, carried=attempt.carried, views=self._exposed(views))
+
+    def _exclude_outliers(self, gate: Gate, attempt: Attempt, order: ViewPlan, trace: UpdateTrace) -> None:
+        """Exclude cameras that do not fit from the rest of an attempt; called once each camera was rendered."""
+        trace.take(self._engine.log(), attempt.views)
+        trace.left_out.update(gate(trace.first))
+        excluded = [index for index, view in enumerate(attempt.views) if view.name in trace.left_out]
+        order.leave_out(excluded)
+        self._engine.leave_out(excluded)
+        attempt.views = [view for view in attempt.views if view.name not in trace.left_out]
+
+    def _finish(self, attempt: Attempt) -> Gaussians:
+        """The state of the candidate that was chosen, after each effect has changed it."""
+        state = attempt.previous
+        if attempt.kept is not Candidate.STILL:
+            state = self._engine.state(learnt=attempt.kept is Candidate.END)
+        attempt.views = self._exposed(attempt.views)
+        for part in self._parts:
+            state = part.end(attempt, state)
+        return state
 
     def _rates_of(self, options: AttemptOptions, motion: Motion | None, best: BestState) -> Rates:
         """The rates of an attempt: as set, and by how near the motion before leads."""

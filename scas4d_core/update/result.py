@@ -18,6 +18,9 @@ from scas4d_core.update.parts import Arrays
 from scas4d_core.update.schedule import Stopping
 from scas4d_core.update.warm_start import Motion
 
+Gate = Callable[[Mapping[str, float]], Mapping[str, str]]
+"""Judges cameras: takes the first PSNR of each in dB, and returns the cameras to exclude with a reason."""
+
 
 class Stopwatch:
     """Seconds by stage. What the timers take themselves is booked to ``REPORT``.
@@ -80,7 +83,7 @@ class AttemptOptions:
     several: bool = False
     faster: float = 1.0
     stopping: Stopping | None = None
-    gate: Callable[[Mapping[str, float]], Mapping[str, str]] | None = None
+    gate: Gate | None = None
     compare: bool = False
     enough: Mapping[str, float] | None = None
     confirm: Callable[[], bool] | None = None
