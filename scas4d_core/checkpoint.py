@@ -26,7 +26,6 @@ from scas4d_core.engines.views import TrainingView
 from scas4d_core.errors import message_of
 from scas4d_core.frame_outcome import FrameOutcome
 from scas4d_core.robust.outliers import Past
-from scas4d_core.storage.faults import OtherFormatError, other_format
 from scas4d_core.storage.frame_files import checkpoint_file, checkpoint_of
 from scas4d_core.storage.history import NEWEST_KEPT, History, HistoryError
 from scas4d_core.storage.npz import read_npz, write_npz
@@ -34,9 +33,6 @@ from scas4d_core.update.parts import Arrays
 from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import Motion
-
-FORMAT = 2
-"""Of a checkpoint's file; a scene with one of another format is not resumed."""
 
 
 class CheckpointError(ValueError):
@@ -117,7 +113,7 @@ class Checkpoints:
 
         Without masks that includes the pictures of the frame, 3 bytes a pixel.
         """
-        arrays: dict[str, Any] = {"format": np.int64(FORMAT), "structure": np.int64(carry_over.structure)}
+        arrays: dict[str, Any] = {"structure": np.int64(carry_over.structure)}
         if carry_over.motion is not None:
             arrays |= _packed(carry_over.motion)
         arrays |= {f"past.{name}": array for name, array in carry_over.past.arrays().items()}
@@ -145,14 +141,11 @@ class Checkpoints:
             factory: of the scene's views; makes views of the pictures.
 
         Raises:
-            CheckpointError: it is not there, or damaged. OtherFormatError: it is of another format.
+            CheckpointError: it is not there, or damaged.
         """
         file = self._file(index)
         try:
             arrays = read_npz(file)
-            written = int(arrays["format"]) if "format" in arrays else None
-            if written != FORMAT:
-                raise other_format(f"{file.name}, a checkpoint,", written, FORMAT)
             names = {str(name) for name in arrays.pop("names")}
             missing = names ^ set(arrays)
             if missing:
@@ -167,8 +160,6 @@ class Checkpoints:
             return CarryOver(motion, labels, seen, structure, past, shown, switches, _by_effect(arrays))
         except FileNotFoundError:
             raise CheckpointError(f"{file.name} is missing") from None
-        except OtherFormatError:
-            raise
         except (ValueError, KeyError, TypeError) as error:
             raise CheckpointError(message_of(error)) from error
 
@@ -279,7 +270,7 @@ def find_commit(
         held: true for a committed frame whose pictures can be given again.
 
     Raises:
-        ResumeError: no state can be read, or a checkpoint is of another format.
+        ResumeError: no state can be read.
     """
     faults = list(history.damaged.values())
     whole: list[int] = []
@@ -291,8 +282,6 @@ def find_commit(
             whole.append(index)
             carry_over = checkpoints.load(index, factory)
             break
-        except OtherFormatError as error:
-            raise ResumeError(str(error)) from error
         except (HistoryError, CheckpointError) as error:
             faults.append(str(error))
             if index not in checkpoints.indices() and whole:

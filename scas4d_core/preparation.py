@@ -200,19 +200,18 @@ class Preparation:
             seen: the frame. populates: whether Gaussians may come and go.
         """
         on, seen = names_on(prepared.carried.switches), noted(prepared.carried.switches, self._settings, seen)
-        prepared = self._switched(prepared.carry(effects=seen.result.carried), seen)
-        if not populates:
-            return seen.result, prepared
-        result = self.populated(on, seen)
-        return result, prepared if result is seen.result else self._regrown(prepared, seen, result)
-
-    def _switched(self, prepared: Prepared, seen: Seen) -> Prepared:
-        """With the effects that a frame calls for."""
-        before = names_on(prepared.carried.switches)
-        prepared = prepared.carry(switches=decided(prepared.carried.switches, self._settings, seen))
-        if names_on(prepared.carried.switches) == before:
-            return prepared
-        return self.again(prepared.roots, prepared.carried)
+        switches = decided(prepared.carried.switches, self._settings, seen)
+        prepared = prepared.carry(effects=seen.result.carried, switches=switches)
+        result = self.populated(on, seen) if populates else seen.result
+        before, now = seen.result.gaussians, result.gaussians
+        other_rows = len(now) != len(before) or not np.array_equal(now.retired, before.retired)
+        if result is not seen.result:
+            prepared = _grown(prepared, before, result, other_rows)
+        if other_rows or names_on(switches) != on:
+            prepared = self.again(prepared.roots, prepared.carried)
+        if other_rows and prepared.carried.motion is None and self._goes_on(result):
+            prepared = _with_motion(prepared, seen, result)
+        return result, prepared
 
     def populated(self, names: Sequence[str], seen: Seen) -> UpdateResult:
         """The result of a frame with all that is born, retired or revived in it; what is not finite is left out.
@@ -234,36 +233,39 @@ class Preparation:
                     seen = replace(seen, result=result, room=max(0, seen.room - born))
         return seen.result
 
-    def _regrown(self, prepared: Prepared, seen: Seen, result: UpdateResult) -> Prepared:
-        """Prepared after a frame in which Gaussians have come or gone.
-
-        Args:
-            seen: the frame before they did. result: after.
-        """
-        before, now = seen.result.gaussians, result.gaussians
-        effects = {
-            name: {key: _lengthened(array, len(before), result.joins) for key, array in arrays.items()}
-            for name, arrays in result.carried.items()
-        }
-        prepared = prepared.carry(effects=effects)
-        if len(now) == len(before) and np.array_equal(now.retired, before.retired):
-            return prepared
-        roots, labels = grown_roots(prepared.roots, now, result.joins), prepared.carried.labels
-        if labels is not None:
-            labels = np.concatenate([labels, now.foreground[len(labels) :] > 0.5])
-        prepared = self.again(roots, replace(prepared.carried, labels=labels))
-        if prepared.carried.motion is None and seen.result.motion is not None and self._goes_on(result):
-            hierarchy = prepared.updater.hierarchy
-            known = np.zeros(len(now), np.bool_)
-            known[: len(before)] = seen.before.moving & before.moving
-            seconds = seen.result.motion.seconds
-            motion = motion_between(hierarchy, seen.before, now, known[hierarchy.rows], seconds)
-            prepared = prepared.carry(motion=motion)
-        return prepared
-
     def _goes_on(self, result: UpdateResult) -> bool:
         """Whether the difference of two states is a motion; a jump is none."""
         return self._settings.update.cluster_map == "centred" and result.outcome is not FrameOutcome.RELOCATED
+
+
+def _grown(prepared: Prepared, before: Gaussians, result: UpdateResult, other_rows: bool) -> Prepared:
+    """With the roots, labels and arrays of effects of the Gaussians of a result.
+
+    Args:
+        before: the Gaussians before any came or went. other_rows: whether any did.
+    """
+    now, labels = result.gaussians, prepared.carried.labels
+    effects = {
+        name: {key: _lengthened(array, len(before), result.joins) for key, array in arrays.items()}
+        for name, arrays in result.carried.items()
+    }
+    if not other_rows:
+        return prepared.carry(effects=effects)
+    if labels is not None:
+        labels = np.concatenate([labels, now.foreground[len(labels) :] > 0.5])
+    prepared = prepared.carry(effects=effects, labels=labels)
+    return replace(prepared, roots=grown_roots(prepared.roots, now, result.joins))
+
+
+def _with_motion(prepared: Prepared, seen: Seen, result: UpdateResult) -> Prepared:
+    """With the motion between the two states, in the clusters of the updater."""
+    if seen.result.motion is None:
+        return prepared
+    before, now, hierarchy = seen.result.gaussians, result.gaussians, prepared.updater.hierarchy
+    known = np.zeros(len(now), np.bool_)
+    known[: len(before)] = seen.before.moving & before.moving
+    motion = motion_between(hierarchy, seen.before, now, known[hierarchy.rows], seen.result.motion.seconds)
+    return prepared.carry(motion=motion)
 
 
 def _check_rows(name: str, before: UpdateResult, after: UpdateResult) -> None:

@@ -36,13 +36,13 @@ class Effect:
     """An effect; its module has one instance, called ``EFFECT``.
 
     Attributes:
-        name: as in ``registry.EFFECTS``. group: of the effects that it stands beside.
+        name: as in ``effect_names.EFFECTS``. group: of the effects that it stands beside.
         says: a sentence for users. gauge: that which fixes it against the effects that could explain the same pixels.
         cost: of an update with it, against one without.
         auto: whether it waits for evidence; else it is on wherever it is not refused.
         on_above, off_below: share of ``Evidence`` from which it is switched on, and below which it is switched off.
         without_masks: whether it is anything in a scene whose first frame has no masks.
-        kept: names of its arrays in ``work.carried`` that are committed with each frame: a cold start, without a
+        kept: names of its arrays in ``Attempt.carried`` that are committed with each frame: a cold start, without a
             checkpoint, has these, and those of ``began``. They are small.
     """
 

@@ -43,7 +43,9 @@ KEPT_ROWS = 128
 
 
 class EngineError(ValueError):
-    """An engine cannot do what a plan asks for; raised by ``UpdateEngine.bind``, never later.
+    """An engine cannot do what a plan asks for.
+
+    ``UpdateEngine.bind`` and ``FitEngine.load_table`` raise it; nothing later does.
 
     Args:
         engine: name of the engine. asked: what it cannot do, one item a field of the plan.

@@ -1,4 +1,4 @@
-"""Normals of the surfaces of a state, from its rendered depth: the direction to mirror in (``rasterize.shading``)."""
+"""Normals of the surfaces of a state, from its rendered depth: the direction to mirror in (``engines.cpu.gloss``)."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ from scas4d_core.storage.frame_arrays import Arrays, Stamp
 from scas4d_core.storage.npz import read_npz, sync_folder, verify, write_npz
 
 FORMAT = 1
-"""Of a folder of states, in ``fixed.npz``; a folder of another format is refused."""
+"""Format of a folder of states and its checkpoints, in ``fixed.npz``; a folder of another format is refused."""
 _FORMAT = "format"
 INDEX = "index"
 """Array in the copy of the first frame: its index."""

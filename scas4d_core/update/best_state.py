@@ -96,7 +96,7 @@ class ProbeViews:
         self._engine, self._looked = engine, self.whole
 
     def errors(self, *, moved: bool, learnt: bool) -> dict[str, float]:
-        """The image loss (``losses.image_loss``) of a state in each view, by the camera's name.
+        """The image loss of a state in each view, by the camera's name.
 
         Args:
             moved, learnt: which state, see ``UpdateEngine.probe``.

@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from scas4d_core.engines.limits import scene_limits
 from scas4d_core.engines.plan import UpdatePlan
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.update import schedule
 
 if TYPE_CHECKING:
     from scas4d_core.engines.engine import Tables, UpdateEngine
@@ -89,9 +91,6 @@ class PlanBuilder:
     parts: list[Part] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        from scas4d_core.engines.limits import scene_limits
-        from scas4d_core.update import schedule
-
         self.plan = UpdatePlan(
             cameras=self.factory.rig.names,
             background=self.scene.behind,

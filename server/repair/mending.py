@@ -115,6 +115,7 @@ class Mending:
         self._deaths: dict[int, int] = {}
         self._timers: dict[str, asyncio.TimerHandle] = {}
         self._full_until = 0.0
+        self._stopped = False
         self.at_work: int | None = None
         for index, reason in remake.items():
             self._decide(index, reason)
@@ -231,6 +232,8 @@ class Mending:
 
     def _ask_later(self, name: str) -> None:
         """Asks about a file again after a while; there is one timer a file, however often it is asked about."""
+        if self._stopped:
+            return
         if (timer := self._timers.pop(name, None)) is not None:
             timer.cancel()
         self._timers[name] = asyncio.get_running_loop().call_later(AGAIN_S, self._ask_again, name)
@@ -247,7 +250,8 @@ class Mending:
                 self._ledger.frames.set_unreadable(index, False)
 
     def stop(self) -> None:
-        """Cancels the timers."""
+        """Cancels the timers, and starts no other."""
+        self._stopped = True
         for timer in self._timers.values():
             timer.cancel()
 

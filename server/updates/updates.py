@@ -89,8 +89,9 @@ class Updates:
         self.first = first
         self._index: int | None = None
         self._holding = 0
+        self._stopped = False
         self._rule: IngestSettings | None = None
-        """For states, that the worker has not confirmed yet."""
+        """The retention rule of states that the worker has not confirmed yet."""
         self._rule_sent = False
         self._mending_again: asyncio.TimerHandle | None = None
         """Begins again where mending waits for room on the disk."""
@@ -118,6 +119,8 @@ class Updates:
 
     def begin(self) -> None:
         """Gives the worker its next frame, if it is idle and one waits; to be called whenever that may have changed."""
+        if self._stopped:
+            return
         self._publisher.changed()
         ledger = self._ledger
         if self._index is not None or self._holding or self._mending.at_work is not None:
@@ -331,7 +334,8 @@ class Updates:
         self.worker.start_in(delay)
 
     def stop(self) -> None:
-        """Starts no worker again, and tries no mending again."""
+        """Starts no worker, gives no frame and tries no mending any more."""
+        self._stopped = True
         self.worker.close()
         self._mending.stop()
         if self._mending_again is not None:

@@ -1,8 +1,8 @@
 """The deformation of one frame in plain torch: cluster map, its Jacobian, cascade, deltas of single Gaussians.
 
 Equation numbers are those of the SCas4D paper: (5) transport of a Gaussian, (6) the cluster map, (7) the cascade.
-Everything is vectorized, differentiable, and of the dtype and on the device of its inputs; in float64 it is the twin
-that the fused CPU kernels are tested against, in float32 on a GPU it is the CUDA path.
+Everything is vectorized, differentiable, and of the dtype and on the device of its inputs; in float64 it is the
+reference that the kernels of other engines are tested against.
 Quaternions are (w, x, y, z). Lengths are metres in the inside world.
 """
 

@@ -83,7 +83,7 @@ class TorchEngine:
             )  # fmt: skip
         if start.gains is not None:
             self._gains = CameraGains(start.gains, self._camera_rows, self._views)
-        self._parameters.free(start)
+        self._parameters.free(start, self._plan.colours)
 
     def iterate(self, views: Sequence[int], step: StepScalars) -> None:
         """See ``UpdateEngine.iterate``."""
@@ -249,7 +249,10 @@ class TorchEngine:
 
     def gradients(self) -> dict[str, Array]:
         """See ``UpdateEngine.gradients``; in float64."""
-        return tables_of_gradients(self._gradients, self._scene, len(self._parameters.clusters))
+        tables = tables_of_gradients(self._gradients, self._scene, len(self._parameters.clusters))
+        if self._plan.colours is None:
+            del tables["colours"]
+        return tables
 
     def _named(self) -> dict[str, Tensor]:
         parameters, gloss = self._parameters, self._parameters.gloss

@@ -1,4 +1,4 @@
-"""Losses of an update in plain torch: the twins of the fused CPU kernels, and the CUDA path.
+"""Losses of an update in plain torch, the reference for the kernels of other engines.
 
 Weights and forms follow the SCas4D paper (equation (8): scale loss) and Dynamic3DGaussians, whose local rigidity,
 isometry and rotation terms it takes over. Every function returns a scalar of its inputs' dtype, unweighted.

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from scas4d_core.engines.engine import AttemptStart, StepScalars, Tables
+from scas4d_core.engines.plan import ColourPlan
 from scas4d_core.engines.torch.deformation import ClusterParams, Deltas
 from scas4d_core.guards import ADAM_EPSILON
 
@@ -71,8 +72,12 @@ class Parameters:
             torch.cat(list(self.deltas), dim=1).detach().float().numpy(),
         )
 
-    def free(self, start: AttemptStart) -> None:
-        """Give each parameter whose rate is above 0 an optimizer, with moments of zero."""
+    def free(self, start: AttemptStart, learnt: ColourPlan | None) -> None:
+        """Give each parameter whose rate is above 0 an optimizer, with moments of zero.
+
+        Args:
+            learnt: colours that are free; None: none.
+        """
         betas = start.beta1, start.beta2
         self.optimizers = []
         for layer, (params, (rotation, translation, scaling)) in enumerate(
@@ -81,8 +86,10 @@ class Parameters:
             rates = zip(params, (rotation, translation, scaling, scaling), strict=True)
             self._free(rates, betas, f"layer {layer}")
         self._free(zip(self.deltas, (start.position, start.rotation, start.scale), strict=True), betas, "own")
-        colours = (self.moving_colours, start.colour), (self.standing_colours, start.colour_standing)
-        self._free(iter(colours), betas, "colour")
+        if learnt is not None:
+            self._free(iter([(self.moving_colours, start.colour)]), betas, "colour")
+            if learnt.standing:
+                self._free(iter([(self.standing_colours, start.colour_standing)]), betas, "colour")
         if self.gloss is not None:
             own = (self.gloss.gloss, self.gloss.light, self.gloss.nearness)
             self._free(zip(own, self.gloss.rates, strict=True), GLOSS_BETAS, "gloss")
