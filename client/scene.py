@@ -158,10 +158,10 @@ class Scene:
         low, high = frame_range(frames)
         with ExitStack() as stack:
             given = stack.enter_context(opened(str(source), low, high, False, url, token))
-            found = cls(given, low, high, stack)
-            found._asked = (str(source), url, token) if is_scene_id(str(source)) else None
-            found._closing = stack.pop_all()
-        return found
+            scene = cls(given, low, high, stack)
+            scene._asked = (str(source), url, token) if is_scene_id(str(source)) else None
+            scene._closing = stack.pop_all()
+        return scene
 
     def __enter__(self) -> Self:
         return self
@@ -248,14 +248,14 @@ class Scene:
         """
         count = len(next(self.states(str(self.frames[-1]))).ids)
         if self._asked is None:
-            found = self._given.parts()
+            given_labels = self._given.parts()
         else:
             id, url, token = self._asked
             with Client(url, token=token, outage=0) as client:
-                found = np.array(client.parts(id).labels, np.int64)
+                given_labels = np.array(client.parts(id).labels, np.int64)
         labels = np.full(count, -1, np.int64)
-        if found is not None:
-            labels[: len(found)] = found[:count]
+        if given_labels is not None:
+            labels[: len(given_labels)] = given_labels[:count]
         return labels
 
     def part_poses(self, frames: str | None = None) -> PartPoses:
@@ -300,10 +300,10 @@ class Scene:
     def _within(self, frames: str | None) -> dict[int, float]:
         """Index and time of the frames of a range, of those that were opened."""
         low, high = frame_range(frames)
-        found = {index: time for index, time in self._times.items() if low <= index <= high}
-        if not found:
+        times = {index: time for index, time in self._times.items() if low <= index <= high}
+        if not times:
             raise InputError(f"frames {frames} are not there", f"frames {self.frames[0]} to {self.frames[-1]} are")
-        return found
+        return times
 
     def _rows(self, ids: ArrayLike | None, last: int) -> tuple[NDArray[np.intp], Int]:
         state = next(self.states(str(last)))

@@ -162,11 +162,11 @@ class Gaussians:
         ``opacities`` are those that the Gaussians have of their own. ``retired`` is left out where none is, and so is
         a field that is None.
         """
-        found = {item.name: getattr(self, item.name) for item in fields(self)}
-        found["opacities"] = found.pop("own_opacities")
+        arrays_by_name = {item.name: getattr(self, item.name) for item in fields(self)}
+        arrays_by_name["opacities"] = arrays_by_name.pop("own_opacities")
         if not self.retired.any():
-            del found["retired"]
-        return {name: array for name, array in found.items() if array is not None}
+            del arrays_by_name["retired"]
+        return {name: array for name, array in arrays_by_name.items() if array is not None}
 
 
 FIXED = tuple(item.name for item in fields(Gaussians) if item.metadata.get("once"))

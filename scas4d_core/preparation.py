@@ -109,8 +109,8 @@ class Preparation:
         """
         switches = first_switches(self._settings, frame.index, result.evidence or {}, len(frame.masks) > 0)
         views = self._factory.views(frame, result.exposures, use_masks=False)
-        found = UpdateResult(result.gaussians, None, UpdateTrace())
-        seen = Seen(frame.index, result.gaussians, found, self._factory.rig, views, self._renderer)
+        unmoved = UpdateResult(result.gaussians, None, UpdateTrace())
+        seen = Seen(frame.index, result.gaussians, unmoved, self._factory.rig, views, self._renderer)
         arrays = began(switches, self._settings, seen)
         return switched_by(arrays, switches, seen), arrays
 

@@ -161,10 +161,10 @@ def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, An
 
 def _setting_error(error: ValidationError) -> SettingError:
     """The first error of a validation, with the nearest known name as the remedy for an unknown one."""
-    found = error.errors(include_url=False)
-    first = found[0]
+    details = error.errors(include_url=False)
+    first = details[0]
     setting = _place(first["loc"])
-    others = len({_place(one["loc"]) for one in found}) - 1  # members of a union each say why they do not match
+    others = len({_place(one["loc"]) for one in details}) - 1  # members of a union each say why they do not match
     more = f" (and {others} more)" if others else ""
     remedy = "docs/settings.md lists all settings"
     if first["type"] == "extra_forbidden":

@@ -127,9 +127,9 @@ class Reconstruction(CommittedScene):
             check_rig(rig, settings.scene, None if points is None else points.positions)
         began, told = perf_counter(), progress or (lambda _: None)
         frame = replace(frame, images=dict(frame.images))  # decoded once
-        found = first_calibration(rig, frame, settings.static, told, measured=static is None)
+        calibration = first_calibration(rig, frame, settings.static, told, measured=static is None)
         settings, checked = with_background(settings, frame.images), perf_counter()
-        self = cls(rig, settings, History() if history is None else history, found)
+        self = cls(rig, settings, History() if history is None else history, calibration)
         scaled = self._factory.scaled(frame)
         result = static or fit_first(scaled, points, self._factory, self.settings, self.world, told)
         self.static = result = replace(result, gaussians=first_labels(result.gaussians, self.rig, scaled.masks))
@@ -142,7 +142,7 @@ class Reconstruction(CommittedScene):
         load = {} if started is None else {"load": began - started}
         stages = {"calibration": checked - began, "fit": fitted - checked, "prepare": perf_counter() - fitted}
         rows = len(self._prepared.updater.hierarchy.rows)
-        report = report_of_first(frame, result, self.rig.names, rows, {**load, **stages}, dropped, found)
+        report = report_of_first(frame, result, self.rig.names, rows, {**load, **stages}, dropped, calibration)
         psnr, shown = {name: fit["psnr"] for name, fit in result.cameras.items()}, fingerprints(frame.images)
         past = replace(first_watched(Past.of_first(psnr, brightness(frame.images)), frame.images), fitted=frame.time)
         prepared = self._prepared.carry(seen=seen, past=past, shown=shown, effects=effects)

@@ -20,10 +20,10 @@ CPU_INFO = Path("/proc/cpuinfo")
 def machine() -> dict[str, Any]:
     """Processor, cores this process may use, memory, system and Python, for a row of a study."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    found: dict[str, Any] = {"processor": processor(), "cores": cores}
+    facts: dict[str, Any] = {"processor": processor(), "cores": cores}
     if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
-        found["memory_gb"] = round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9, 1)
-    return found | {"system": platform.system(), "python": platform.python_version()}
+        facts["memory_gb"] = round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9, 1)
+    return facts | {"system": platform.system(), "python": platform.python_version()}
 
 
 def in_words(of: Mapping[str, Any]) -> str:

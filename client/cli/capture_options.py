@@ -98,8 +98,8 @@ def takes_capture(command: Callable[..., None]) -> Callable[..., None]:
 def _parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
     """The parameters of a function by name; their annotations are values, not strings."""
     hints = get_type_hints(function, include_extras=True)
-    found = inspect.signature(function).parameters
-    return {name: parameter.replace(annotation=hints[name]) for name, parameter in found.items()}
+    parameters = inspect.signature(function).parameters
+    return {name: parameter.replace(annotation=hints[name]) for name, parameter in parameters.items()}
 
 
 def opened(folder: Path, options: CaptureOptions, **more: Any) -> Capture:

@@ -175,19 +175,19 @@ def budget(
         raise ValueError("--as-made stands for no other budget; leave it out, or the others")
     with Client(url, token=token, outage=0) as client:
         if as_made or any(value is not None for value in given):
-            found = client.set_budget(
+            budget_now = client.set_budget(
                 scene, iterations=iterations, budget_ms=milliseconds, stop_gain=stop_gain, still=still
             )
         else:
-            found = client.budget(scene)
-    now = found.effective
+            budget_now = client.budget(scene)
+    now = budget_now.effective
     many = (
         f"{now.iterations} iterations"
         if now.budget_ms is None
         else f"as many iterations as fit into {now.budget_ms:g} ms"
     )
     stops = f", or fewer: stop gain {now.stop_gain:g}" if now.stop_gain else ""
-    console.print(f"{many} a frame{stops}; still {now.still:g}; from frame {found.since} on", highlight=False)
+    console.print(f"{many} a frame{stops}; still {now.still:g}; from frame {budget_now.since} on", highlight=False)
 
 
 def begin_again(

@@ -314,8 +314,8 @@ def save_parts(reconstruction: Committed, capture: Capture, index: int, labels: 
     for camera in rig.cameras:
         if camera.name in truth.label_cameras:
             true = truth.labels(camera.name, index)
-            found = np.where(true > 0, render_parts(reconstruction, camera, index, labels), 0)
-            shown = np.concatenate([true, found], axis=1).astype(np.uint8)
+            picture = np.where(true > 0, render_parts(reconstruction, camera, index, labels), 0)
+            shown = np.concatenate([true, picture], axis=1).astype(np.uint8)
             pictures.save(folder / f"parts{index:04d}_camera{camera.name}.png", pictures.coloured(shown))
 
 

@@ -51,15 +51,15 @@ def evaluate_states(
     """
     if not source.exists():
         raise InputError(f"there is no {str(source)!r}", "give a .s4d file, or an export with ids (docs/exports.md)")
-    found = of_path(source, rate)
+    states = of_path(source, rate)
     truth = options.open(folder, image_scale=Settings().scene.image_scale)
     unseen = truth.full_test_rig is not None
     truth = truth if unseen else truth.measured_on_training()
-    for remark in [*found.of.remarks, *([] if found.of.damage is None else [found.of.damage])]:
+    for remark in [*states.of.remarks, *([] if states.of.damage is None else [states.of.damage])]:
         report(remark)
     if not unseen:
         report("no test cameras: the scores are those of the training cameras (--test holds some out)")
-    row = _measure(found, truth, Store(out), frames, report)
+    row = _measure(states, truth, Store(out), frames, report)
     row["preset"] = source.name
     row["measured_on"] = "test cameras" if unseen else TRAINING
     row["changes"] = "" if unseen else TRAINING

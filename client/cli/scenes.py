@@ -45,12 +45,12 @@ def listed(
     if context.invoked_subcommand is not None:
         return
     with Client(url, token=token, outage=0) as client:
-        found = client.scenes()
-    shown = [status for status in found if all or not status.archived]
+        summaries = client.scenes()
+    shown = [status for status in summaries if all or not status.archived]
     _say(*table(shown))
-    if hidden := len(found) - len(shown):
+    if hidden := len(summaries) - len(shown):
         _say(f"{hidden} archived; scas4d scenes --all lists them, too")
-    if not found:
+    if not summaries:
         _say("no scene yet; make one with: scas4d push CAPTURE")
 
 

@@ -48,14 +48,14 @@ def export(
             f"give a folder, or {out.stem}.zip",
         )
     with_parts = wanted.needs_parts or format in WITH_PARTS
-    with opened(source, low, high, with_parts, url, token, rate) as found, Bars() as bars:
-        given = found.of
-        target = out or found.beside / f"{found.name}-{format}{'' if wanted.numbered else wanted.suffixes[0]}"
+    with opened(source, low, high, with_parts, url, token, rate) as states, Bars() as bars:
+        given = states.of
+        target = out or states.beside / f"{states.name}-{format}{'' if wanted.numbered else wanted.suffixes[0]}"
         for remark in given.remarks:
             console.print(remark, soft_wrap=True)
         if given.damage is not None:
             console.print(f"only a part can be read: {given.damage}", soft_wrap=True)
-        chosen = list(found.within(low, high))
+        chosen = list(states.within(low, high))
         count = len(chosen)
         if others := other_frames(target, wanted, chosen):
             raise InputError(

@@ -65,10 +65,10 @@ def _link(path: Path, root: Path, linked: dict[Path, str], within: tuple[Path, .
     exported += [name.strip() for match in _LIST.finditer(text) for name in match.group(1).split(",") if name.strip()]
 
     def imported(match: re.Match[str]) -> str:
-        found = (path.parent / match.group(2)).resolve()
-        _link(found, root, linked, (*within, path))
+        target = (path.parent / match.group(2)).resolve()
+        _link(target, root, linked, (*within, path))
         names = ", ".join(name.strip().replace(" as ", ": ") for name in match.group(1).split(",") if name.strip())
-        return f"const {{ {names} }} = modules[{_quoted(found, root)}];\n"
+        return f"const {{ {names} }} = modules[{_quoted(target, root)}];\n"
 
     body = _LIST.sub("", _EXPORT.sub("", _IMPORT.sub(imported, text)))
     if other := _OTHER.search(body):

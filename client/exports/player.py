@@ -136,8 +136,8 @@ def _facing(points: NDArray[np.float64]) -> Camera:
 
 def _held(files: Sequence[Path]) -> int:
     """Number of the frames in compact files, those by which others are told among them."""
-    found: set[int] = set()
+    indices: set[int] = set()
     for file in files:
         with CompactReader(file) as reader:
-            found.update(reader.frames)
-    return len(found)
+            indices.update(reader.frames)
+    return len(indices)

@@ -87,12 +87,12 @@ class Source:
         Raises:
             InputError: there is none.
         """
-        found = {index: time for index, time in zip(self.of.frames, self.of.times, strict=True) if low <= index <= high}
-        if not found:
+        times = {index: time for index, time in zip(self.of.frames, self.of.times, strict=True) if low <= index <= high}
+        if not times:
             held = f"frames {self.of.frames[0]} to {self.of.frames[-1]}" if self.of.frames else "no frame"
             asked = f"{low}:{'' if high == LAST else high}"
             raise InputError(f"frames {asked} are not in {self.name}", f"it has {held}")
-        return found
+        return times
 
     def some(self, indices: Sequence[int]) -> list[Gaussians]:
         """The states of the first, the middle and the last of some frames, each once."""
@@ -170,8 +170,8 @@ class CompactStates:
         for file in files:
             with CompactReader(file) as reader:
                 heads.append(reader.head)
-                found = zip(reader.frames, reader.times.tolist(), strict=True)
-                times |= {index: time for index, time in found if index >= first and index not in times}
+                moments = zip(reader.frames, reader.times.tolist(), strict=True)
+                times |= {index: time for index, time in moments if index >= first and index not in times}
                 damages += [] if reader.damage is None else [reader.damage]
         return cls(files, heads[0], list(times), list(times.values()), damages[0] if damages else None)
 

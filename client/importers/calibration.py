@@ -91,7 +91,9 @@ def calibration(
             )
         by_name[name].sort(key=lambda view: (view.time is not None, view.time or 0.0, natural(str(view.path))))
         cameras.append(_still(source, name, by_name[name]))
-    return Calibration(source, tuple(cameras), {name: tuple(found) for name, found in by_name.items()}, points, fps)
+    return Calibration(
+        source, tuple(cameras), {name: tuple(points_seen) for name, points_seen in by_name.items()}, points, fps
+    )
 
 
 def calibration_of_cameras(

@@ -83,8 +83,8 @@ class Curve:
         rays = self._outward(bent)
         for _ in range(ROUNDS):
             rays = self._outward(bent - _aside(self.lens, rays))
-        found = np.abs(self.bent(rays) - bent).max(axis=-1) < CLOSE
-        return np.where(found[:, None], rays, np.nan)
+        close = np.abs(self.bent(rays) - bent).max(axis=-1) < CLOSE
+        return np.where(close[:, None], rays, np.nan)
 
     def _outward(self, bent: Float) -> Float:
         """Undoes the radial part alone."""

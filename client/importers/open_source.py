@@ -41,10 +41,10 @@ class CaptureOptions:
     def changed(self) -> dict[str, Any]:
         """The options that are not the default, as JSON values; the encoding aside, which changes no pixel here."""
         usual, own = asdict(CaptureOptions()), asdict(self)
-        found = {name: value for name, value in own.items() if value != usual[name] and name != "encoding"}
+        changes = {name: value for name, value in own.items() if value != usual[name] and name != "encoding"}
         return {
             name: str(value) if isinstance(value, Path) else list(value) if isinstance(value, tuple) else value
-            for name, value in found.items()
+            for name, value in changes.items()
         }
 
 

@@ -96,7 +96,7 @@ def folders_of(root: Path, calibration: Calibration, *, what: str = "pictures") 
     for camera, files in by_camera.items():
         missing = [frame for frame in frames if frame not in files]
         if missing:
-            others = next(name for name, found in by_camera.items() if missing[0] in found)
+            others = next(name for name, paths in by_camera.items() if missing[0] in paths)
             raise CaptureError(
                 f"{root / camera}: has no {what} of {len(missing)} of {len(frames)} frames ({_some(missing)}), which "
                 f"{others!r} has; a frame's pictures have one name in the folders of all cameras"
@@ -105,17 +105,17 @@ def folders_of(root: Path, calibration: Calibration, *, what: str = "pictures") 
 
 
 def _pictures_in(folder: Path) -> dict[str, Path]:
-    found: dict[str, Path] = {}
+    pictures: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         end = path.suffix.lower()
         if path.name.startswith(".") or end not in PICTURE_LIKE:
             continue
         if end not in READ:
             raise CaptureError(f"{path}: {end} is not read; give JPEG, PNG, WebP or BMP")
-        if path.stem in found:
-            raise CaptureError(f"{path}: {found[path.stem].name} is the same frame; leave one of them")
-        found[path.stem] = path
-    return found
+        if path.stem in pictures:
+            raise CaptureError(f"{path}: {pictures[path.stem].name} is the same frame; leave one of them")
+        pictures[path.stem] = path
+    return pictures
 
 
 def named_files(folder: Path, calibration: Calibration) -> tuple[list[dict[str, Path]], list[float]]:

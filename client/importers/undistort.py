@@ -195,7 +195,7 @@ def _seen_rectangle(lens: LensCamera, curve: Curve) -> tuple[float, float, float
     """
     limit = min(np.tan(np.radians(WIDEST_DEGREES / 2)), curve.widest)
     rays = {side: straightened(lens, pixels, curve) for side, pixels in _edges(lens).items()}
-    seen = {side: found[~np.isnan(found).any(axis=-1)] for side, found in rays.items()}
+    seen = {side: points[~np.isnan(points).any(axis=-1)] for side, points in rays.items()}
     left, top = (seen[side][:, axis].max(initial=-limit) for axis, side in enumerate(("left", "top")))
     right, bottom = (seen[side][:, axis].min(initial=limit) for axis, side in enumerate(("right", "bottom")))
     if not (left < right and top < bottom):

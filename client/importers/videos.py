@@ -88,9 +88,9 @@ class Video:
             CaptureError: it cannot be decoded.
         """
         with self._lock:
-            for found in (self._last, self._kept):
-                if found is not None and found[0] == index:
-                    return found[1]
+            for cached in (self._last, self._kept):
+                if cached is not None and cached[0] == index:
+                    return cached[1]
             again = self._last is not None and index < self._last[0]
             picture = self._decoded(index)
             picture.setflags(write=False)
@@ -194,7 +194,7 @@ def find_videos(folder: Path, calibration: Calibration) -> dict[str, Path]:
         CaptureError: a camera has none, or two.
     """
     there = sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDS)
-    found = {}
+    videos = {}
     for camera in calibration.names:
         own = [path for path in there if path.stem == camera]
         if not own:
@@ -205,5 +205,5 @@ def find_videos(folder: Path, calibration: Calibration) -> dict[str, Path]:
             )
         if len(own) > 1:
             raise CaptureError(f"{folder}: has {own[0].name} and {own[1].name} of one camera; leave one of them")
-        found[camera] = own[0]
-    return found
+        videos[camera] = own[0]
+    return videos

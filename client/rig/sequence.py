@@ -65,16 +65,16 @@ class Sequence:
     def files(self, index: int) -> Files:
         """Returns the files of a frame; those of the next are made meanwhile."""
         future = self._ahead[1] if self._ahead and self._ahead[0] == index else self._reader.submit(self._files, index)
-        found = future.result()
+        files = future.result()
         if index + 1 < len(self):
             self._ahead = index + 1, self._reader.submit(self._files, index + 1)
-        return found
+        return files
 
     def _files(self, index: int) -> Files:
         place, names = self.place(index), self.source.full_rig.names
         images = dict(zip(names, self._pool.map(lambda name: self.source.encoded(place, name), names), strict=True))
-        found = dict(zip(names, self._pool.map(lambda name: self.source.encoded_mask(place, name), names), strict=True))
-        masks = {name: mask for name, mask in found.items() if mask is not None}
+        files = dict(zip(names, self._pool.map(lambda name: self.source.encoded_mask(place, name), names), strict=True))
+        masks = {name: mask for name, mask in files.items() if mask is not None}
         # The service takes masks of all cameras or of none.
         return Files(self.time(index), images, masks if len(masks) == len(images) else {})
 

@@ -56,8 +56,8 @@ class Clusters:
 
     def sums(self, columns: Iterable[NDArray[Any]]) -> Float:
         """[P, count] sums over each cluster of P columns [N]."""
-        found = [np.bincount(self.labels, column, minlength=self.count + 1)[1:] for column in columns]
-        return np.array(found, np.float64)
+        totals = [np.bincount(self.labels, column, minlength=self.count + 1)[1:] for column in columns]
+        return np.array(totals, np.float64)
 
     @cached_property
     def sizes(self) -> Float:
@@ -129,8 +129,8 @@ class ClusterMotion:
         weighted = [weights * arm for arm in arms]
         pairs = [(i, j) for i in range(4) for j in range(i, 4)]
         moments = np.zeros((clusters.count, 4, 4))
-        for (i, j), found in zip(pairs, clusters.sums(weighted[i] * arms[j] for i, j in pairs), strict=True):
-            moments[:, i, j] = moments[:, j, i] = found
+        for (i, j), second_moments in zip(pairs, clusters.sums(weighted[i] * arms[j] for i, j in pairs), strict=True):
+            moments[:, i, j] = moments[:, j, i] = second_moments
         right = clusters.sums(one * step for one in weighted for step in steps).reshape(4, 3, -1)
         # In units of 1/size², the pull of one Gaussian's own extent: its weight times its size squared is 1.
         moments[:, range(3), range(3)] += RIDGE * clusters.sizes[:, None]
@@ -192,10 +192,10 @@ def quaternions_of(turns: Float) -> Float:
         table[:, 0, 1 + i] = table[:, 1 + i, 0] = m[:, k, j] - m[:, j, k]
         table[:, 1 + i, 1 + i] = m[:, i, i] - m[:, j, j] - m[:, k, k]
         table[:, 1 + j, 1 + k] = table[:, 1 + k, 1 + j] = m[:, j, k] + m[:, k, j]
-    found = np.linalg.eigh(table)[1][:, :, 3]
-    first = np.argmax(np.abs(found) > 1e-9, axis=1)
-    signs = np.sign(found[np.arange(len(m)), first])[:, None]
-    return np.asarray(found * signs) + 0.0
+    vectors = np.linalg.eigh(table)[1][:, :, 3]
+    first = np.argmax(np.abs(vectors) > 1e-9, axis=1)
+    signs = np.sign(vectors[np.arange(len(m)), first])[:, None]
+    return np.asarray(vectors * signs) + 0.0
 
 
 def _k_means(points: Float, count: int) -> Ints:
@@ -215,8 +215,8 @@ def _k_means(points: Float, count: int) -> Ints:
 def _nearest(points: Float, centres: Float, piece: int = 512) -> Ints:
     """[N] index of the nearest centre; in pieces that stay in the cache, which takes a tenth of the time."""
     squares = np.square(centres).sum(axis=1)
-    found = [
+    nearest = [
         np.argmin(squares - 2 * points[begin : begin + piece] @ centres.T, axis=1)
         for begin in range(0, len(points), piece)
     ]
-    return np.concatenate(found).astype(np.int64)
+    return np.concatenate(nearest).astype(np.int64)

@@ -40,10 +40,10 @@ def pack(values: NDArray[Any]) -> bytes:
     >>> unpack(pack(np.array([0, -1, 3, 1000])), 4)[0]
     array([   0,   -1,    3, 1000], dtype=int32)
     """
-    found = np.asarray(values)
-    if len(found) and (int(found.max()) >= MOST or int(found.min()) <= -MOST):
+    numbers = np.asarray(values)
+    if len(numbers) and (int(numbers.max()) >= MOST or int(numbers.min()) <= -MOST):
         raise OverflowError(f"values of a plane are below {MOST} in size, and one of these is not")
-    small = found.astype(np.int32)
+    small = numbers.astype(np.int32)
     folded = np.empty(len(small), np.uint32)
     folded[:] = ((small << 1) ^ (small >> 31)).view(np.uint32)
     return _packed(folded)
@@ -114,12 +114,12 @@ def inflated(data: bytes | memoryview, size: int) -> bytes:
     try:
         if zstandard.frame_content_size(data) != size:
             raise PlaneError(f"{zstandard.frame_content_size(data)} bytes where {size} belong")
-        found: bytes = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
+        content: bytes = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
     except zstandard.ZstdError as error:
         raise PlaneError(f"no zstandard frame ({error})") from None
-    if len(found) != size:
-        raise PlaneError(f"{len(found)} bytes where {size} belong")
-    return found
+    if len(content) != size:
+        raise PlaneError(f"{len(content)} bytes where {size} belong")
+    return content
 
 
 def _bits(unsigned: Unsigned) -> int:

@@ -81,9 +81,9 @@ class CompactReader:
         try:
             if (begin := self._file.read(len(MAGIC))) != MAGIC[: len(begin)] or not begin:
                 raise FileError(f"{self.path.name}: no compact 4D file: it does not begin with {MAGIC!r}")
-            found = read_index(self._file, self.path.name)
-            if found is not None:
-                records, self.about = found
+            parts = read_index(self._file, self.path.name)
+            if parts is not None:
+                records, self.about = parts
                 self._whole = True
                 try:
                     for record in records:
@@ -200,17 +200,17 @@ class CompactReader:
 
     def parts(self, index: int | None = None) -> NDArray[np.int64] | None:
         """[N] part of each Gaussian, −1 for none, as it was last seen up to a frame; None where none was."""
-        found = [record for record in self._parts if index is None or record.frame <= index]
-        if not found:
+        records = [record for record in self._parts if index is None or record.frame <= index]
+        if not records:
             return None
-        body = read_body(self._file, found[-1], self.path.name)
+        body = read_body(self._file, records[-1], self.path.name)
         count = int.from_bytes(body[:4], "little")
         if count > self.count:
-            raise self._damaged(found[-1], PlaneError(f"parts of {count} Gaussians, there are {self.count}"))
+            raise self._damaged(records[-1], PlaneError(f"parts of {count} Gaussians, there are {self.count}"))
         try:
             return unpack(body, count, 4)[0].astype(np.int64) - 1
         except PlaneError as error:
-            raise self._damaged(found[-1], error) from None
+            raise self._damaged(records[-1], error) from None
 
     @property
     def whole(self) -> bool:

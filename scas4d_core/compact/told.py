@@ -86,8 +86,8 @@ class Told:
             if name == "rotations":
                 vectors = vectors_of(turns_between(state.rotations, self.state.rotations))
                 return np.asarray(np.rint(vectors / self._step(name)))
-            found = np.rint((getattr(state, name) - getattr(self.state, name)) / self._step(name))
-        return np.asarray(by_green(found) if name == "colours" else found)
+            levels = np.rint((getattr(state, name) - getattr(self.state, name)) / self._step(name))
+        return np.asarray(by_green(levels) if name == "colours" else levels)
 
     def having(self, name: str, residual: Ints) -> Told:
         """The same with another attribute."""

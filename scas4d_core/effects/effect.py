@@ -128,5 +128,5 @@ def effect(name: str) -> Effect:
     >>> effect("floor").group
     <Group.COHERENCE: 'coherence'>
     """
-    found: Effect = import_module(EFFECTS[name]).EFFECT
-    return found
+    instance: Effect = import_module(EFFECTS[name]).EFFECT
+    return instance

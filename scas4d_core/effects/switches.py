@@ -50,10 +50,10 @@ NONE_FOUND: Mapping[str, Evidence] = MappingProxyType({})
 def contradictions(settings: Settings) -> Iterator[tuple[str, Mode, str, str]]:
     """Name, mode, fault and remedy of each effect whose pin the settings contradict."""
     for name, mode in settings.effects.items():
-        if mode == "on" and (found := effect(name).refused(settings)) is not None:
-            yield name, mode, f"effects.{name} cannot be 'on': {found[0]}", f"{found[1]}, or leave it 'auto'"
-        if mode == "off" and (found := effect(name).needed(settings)) is not None:
-            yield name, mode, f"effects.{name} cannot be 'off': {found[0]}", found[1]
+        if mode == "on" and (refusal := effect(name).refused(settings)) is not None:
+            yield name, mode, f"effects.{name} cannot be 'on': {refusal[0]}", f"{refusal[1]}, or leave it 'auto'"
+        if mode == "off" and (refusal := effect(name).needed(settings)) is not None:
+            yield name, mode, f"effects.{name} cannot be 'off': {refusal[0]}", refusal[1]
 
 
 def first_switches(
@@ -117,26 +117,26 @@ def _decided(name: str, switch: Switch, settings: Settings, seen: Seen) -> Switc
     one = effect(name)
     if switch.pinned or not one.auto or one.refused(settings) is not None:
         return switch
-    found = one.evidence(seen)
-    if found is None:
+    evidence = one.evidence(seen)
+    if evidence is None:
         return switch
-    switch = replace(switch, share=found.share, text=found.text)
+    switch = replace(switch, share=evidence.share, text=evidence.text)
     if not switch.on:
-        return replace(switch, on=True, since=seen.index, idle=0) if found.share >= one.on_above else switch
-    idle = switch.idle + 1 if found.share < one.off_below else 0
+        return replace(switch, on=True, since=seen.index, idle=0) if evidence.share >= one.on_above else switch
+    idle = switch.idle + 1 if evidence.share < one.off_below else 0
     return replace(switch, on=False, since=seen.index, idle=0) if idle >= IDLE else replace(switch, idle=idle)
 
 
 def began(switches: Switches, settings: Settings, seen: Seen) -> dict[str, Arrays]:
     """Arrays that the effects keep of the first frame, by effect."""
-    found = {}
+    by_effect = {}
     for name, switch in switches.items():
         one = effect(name)
         if (switch.on or not switch.pinned) and effect(name).refused(settings) is None:
             arrays = one.began(seen)
             if arrays is not None:
-                found[name] = arrays
-    return found
+                by_effect[name] = arrays
+    return by_effect
 
 
 def noted(switches: Switches, settings: Settings, seen: Seen) -> Seen:
@@ -145,17 +145,17 @@ def noted(switches: Switches, settings: Settings, seen: Seen) -> Seen:
     Args:
         switches: with which it was updated. settings: of the scene. seen: the frame.
     """
-    found = {}
+    by_effect = {}
     for name, switch in switches.items():
         one = effect(name)
         asked = type(one).noted is not Effect.noted and (switch.on or not switch.pinned)
         if asked and effect(name).refused(settings) is None:
             arrays = one.noted(seen, switch.on)
             if arrays is not None:
-                found[name] = arrays
-    if not found:
+                by_effect[name] = arrays
+    if not by_effect:
         return seen
-    return replace(seen, result=replace(seen.result, carried={**seen.result.carried, **found}))
+    return replace(seen, result=replace(seen.result, carried={**seen.result.carried, **by_effect}))
 
 
 def kept_of(carried: Mapping[str, Arrays]) -> dict[str, Arrays]:

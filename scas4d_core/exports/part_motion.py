@@ -92,7 +92,7 @@ class PartMotion:
 
     def poses(self, gaussians: Gaussians) -> list[PartPose]:
         """Poses of the parts in a later frame, or in the first; a part of which no Gaussian is there has none."""
-        found = []
+        part_poses = []
         means = self._world.to_user(gaussians.means)
         for part in self.parts:
             rows = self.rows(part)
@@ -100,8 +100,8 @@ class PartMotion:
             if rows.size:
                 before, weights = self._start[rows] - self.origins[part], self._weights[rows]
                 material = self._material_turn(gaussians, rows, weights)
-                found.append(PartPose(part, *majority_motion(before, means[rows], weights, material)))
-        return found
+                part_poses.append(PartPose(part, *majority_motion(before, means[rows], weights, material)))
+        return part_poses
 
     def _material_turn(self, gaussians: Gaussians, rows: NDArray[np.intp], weights: Float) -> Float:
         """[3, 3] weighted mean of the Gaussians' rotations since the first frame; about a rotation."""

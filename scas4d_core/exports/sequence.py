@@ -139,8 +139,8 @@ def other_frames(out: Path, format: Format, frames: Collection[int]) -> list[Pat
     if not format.numbered or not out.is_dir():
         return []
     pattern = re.compile(rf"frame_(\d+){re.escape(format.suffixes[0])}")
-    found = ((path, pattern.fullmatch(path.name)) for path in sorted(out.iterdir()))
-    return [path for path, match in found if match and int(match[1]) not in frames]
+    names = ((path, pattern.fullmatch(path.name)) for path in sorted(out.iterdir()))
+    return [path for path, match in names if match and int(match[1]) not in frames]
 
 
 def _chained(

@@ -70,9 +70,9 @@ def fit_by_direction(
         before, trainer = trial.learnt(), make()
         losses = GlossyFit(trainer, before).train(progress)
         trainer.schedule.shortened |= before.schedule.shortened
-    found = {} if trial.evidence is None else {"direction": trial.evidence}
+    evidence = {} if trial.evidence is None else {"direction": trial.evidence}
     shortened = ["no trial of colours that depend on direction"] if trial.untried else []
-    return replace(trainer.result(losses), evidence=found, shortened=shortened)
+    return replace(trainer.result(losses), evidence=evidence, shortened=shortened)
 
 
 def gloss_seen(trainer: StaticTrainer, environment: Array | None) -> tuple[Array, Array]:

@@ -124,24 +124,24 @@ def initial_points(
         max_points, rig.radius, seed, limit,
     )  # fmt: skip
     spacing = SPACING * pixel_at(labelled, look_at_point(labelled))
-    found: FoundPoints | None = None
+    points: FoundPoints | None = None
     ways = _ways(first, masked=bool(masks))
     for way, search in ways:
-        found = _found(found, way, partial(agreed_points, search, on_progress), search.views, spacing)
-        if way != "pairs" and found is not None and found.covered >= ENOUGH:
-            return found
+        points = _found(points, way, partial(agreed_points, search, on_progress), search.views, spacing)
+        if way != "pairs" and points is not None and points.covered >= ENOUGH:
+            return points
     on_progress("plane", 0, 1)
-    found = _found(found, "plane", partial(plane_points, labelled), views, spacing)
+    points = _found(points, "plane", partial(plane_points, labelled), views, spacing)
     before = next((search.views for way, search in ways if way == "backdrop"), views)
     known = triangulate(before, tracks, min_views=2, seed=seed).positions
     distances = stage_distances(before, known, rig.radius)
-    confirmed = 0.0 if found is None else found.covered
-    if found is None or confirmed <= LITTLE:
-        found = joined(found, shared_volume(before, distances, seed), "volume", before, 4 * spacing)
+    confirmed = 0.0 if points is None else points.covered
+    if points is None or confirmed <= LITTLE:
+        points = joined(points, shared_volume(before, distances, seed), "volume", before, 4 * spacing)
     if before is views and not first.backdrop:  # else the backdrop's colour is what lies behind
-        found = joined(found, surroundings(before, distances), "surroundings", before, 0.0)
-        found = replace(found, stage=Stage.of(before, distances))
-    return replace(found, covered=confirmed)
+        points = joined(points, surroundings(before, distances), "surroundings", before, 0.0)
+        points = replace(points, stage=Stage.of(before, distances))
+    return replace(points, covered=confirmed)
 
 
 def _found(

@@ -59,14 +59,16 @@ def surface_normals(state: Gaussians, views: Sequence[TrainingView], renderer: R
         seen = renderer.gather(haze, camera, planes)
         total += seen
         outwards += seen[:, 3:] * _unit(camera.centre - means)
-    found = np.where(total[:, 3:] > 1e-3, total[:, :3], outwards)
-    found = _unit(np.where(np.linalg.norm(found, axis=1, keepdims=True) > TINY, found, _unit(means - means.mean(0))))
+    directions = np.where(total[:, 3:] > 1e-3, total[:, :3], outwards)
+    directions = _unit(
+        np.where(np.linalg.norm(directions, axis=1, keepdims=True) > TINY, directions, _unit(means - means.mean(0)))
+    )
     weight = np.minimum(total[:, 3], 5) + 1e-3
     near = cKDTree(means).query(means, min(NEAR, count))
     distance, index = (np.asarray(array).reshape(count, -1) for array in near)
     share = np.exp(-0.5 * np.square(distance / reach)) * weight[index]
-    share = share * (np.einsum("nkc,nc->nk", found[index], found) > 0)
-    return _unit(np.einsum("nkc,nk->nc", found[index], share)).astype(np.float32)
+    share = share * (np.einsum("nkc,nc->nk", directions[index], directions) > 0)
+    return _unit(np.einsum("nkc,nk->nc", directions[index], share)).astype(np.float32)
 
 
 def _pixel_normals(
@@ -88,5 +90,5 @@ def _pixel_normals(
 
 
 def _unit(vectors: NDArray[Any]) -> NDArray[Any]:
-    found: NDArray[Any] = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), TINY)
-    return found
+    unit: NDArray[Any] = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), TINY)
+    return unit

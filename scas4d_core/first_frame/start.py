@@ -50,13 +50,13 @@ def with_background(settings: Settings, images: Mapping[str, NDArray[np.uint8]])
     pictures = [image for image in pictures if min(image.shape[:2]) > EVERY]
     if not pictures:  # they are refused later, in words
         return settings
-    found = backdrop(pictures)
-    return _over(settings, _colour(mean_colour(pictures) if found is None else found))
+    backdrop_colour = backdrop(pictures)
+    return _over(settings, _colour(mean_colour(pictures) if backdrop_colour is None else backdrop_colour))
 
 
 def _colour(levels: NDArray[Any]) -> list[float]:
-    found: list[float] = np.round(levels / 255, 4).tolist()
-    return found
+    colour: list[float] = np.round(levels / 255, 4).tolist()
+    return colour
 
 
 def _over(settings: Settings, background: Sequence[float]) -> Settings:
@@ -165,11 +165,15 @@ def fit_first(
         load_stereo()
     static, limit = settings.static, TimeLimit(settings.static.seconds)
     if points is None:
-        found = initial_points(
+        first_points = initial_points(
             factory.rig, frame.images, frame.masks,
             lambda stage, done, total: on_progress(Progress(stage, done, total, _at_most(limit))), limit=limit,
         )  # fmt: skip
-        cloud, made, stage = _columns(found), FirstCloud(found.way, len(found), found.covered), found.stage
+        cloud, made, stage = (
+            _columns(first_points),
+            FirstCloud(first_points.way, len(first_points), first_points.covered),
+            first_points.stage,
+        )
     else:
         inside = replace(points, positions=world.to_inside(points.positions))
         cloud, made, stage = _columns(inside), FirstCloud("given", len(points)), None

@@ -98,8 +98,8 @@ def strengths_seen(
         about = _over(about, near, same)
     there = about[:, 0] / np.maximum(about[:, 1], TINY) * np.square(np.minimum(about[:, 1] / GLOSSY, 1))
     believed = np.minimum(clear / CLEAR, 1)
-    found = believed * slopes + (1 - believed) * there
-    strengths: Array = np.clip(found, FAINTEST, STRONGEST).astype(np.float32)[:, None]
+    seen_strengths = believed * slopes + (1 - believed) * there
+    strengths: Array = np.clip(seen_strengths, FAINTEST, STRONGEST).astype(np.float32)[:, None]
     return strengths
 
 

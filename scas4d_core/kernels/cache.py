@@ -37,11 +37,11 @@ GUARDS = Path(__file__).parent.parent / "guards.py"
 
 def digest(folder: Path = Path(__file__).parent) -> str:
     """Digest of the names and contents of the Python files in and below a folder, and of the guards."""
-    found = hashlib.sha256()
+    hasher = hashlib.sha256()
     for path in [*sorted(folder.rglob("*.py")), GUARDS]:
         name = os.path.relpath(path, folder)
-        found.update(f"{name}\0".encode() + hashlib.sha256(path.read_bytes()).digest())
-    return found.hexdigest()[:16]
+        hasher.update(f"{name}\0".encode() + hashlib.sha256(path.read_bytes()).digest())
+    return hasher.hexdigest()[:16]
 
 
 def base() -> Path:

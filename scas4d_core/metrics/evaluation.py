@@ -105,9 +105,11 @@ def measure_tracks(reconstruction: Committed, capture: Capture, indices: Sequenc
         if asked.any():
             uv, counted = true_uv[:, asked], visible[:, asked]
             diagonal = math.hypot(camera.width, camera.height)
-            found = reconstruction.tracks_of_pixels(camera, uv[0], indices[0], list(indices))
+            measured_tracks = reconstruction.tracks_of_pixels(camera, uv[0], indices[0], list(indices))
             oracle = metrics.oracle_tracks(camera.project(centroids)[0], uv, counted)
-            scores["mte_2d"] = _finite(metrics.median_trajectory_error(found.pixels(camera), uv, counted, diagonal))
+            scores["mte_2d"] = _finite(
+                metrics.median_trajectory_error(measured_tracks.pixels(camera), uv, counted, diagonal)
+            )
             scores["mte_2d_oracle"] = _finite(metrics.median_trajectory_error(oracle, uv, counted, diagonal))
         by_camera.append(scores)
     return {
@@ -159,8 +161,11 @@ def measure_flicker(reconstruction: Committed, capture: Capture, indices: Sequen
             mean = mean + before / count
             squares = squares + before * (shown - mean)
         deviations.append(255 * np.sqrt(squares / len(indices)))
-    found = np.concatenate(deviations)
-    return {"still_pixels": float(len(found)), "flicker": float(found.mean()) if len(found) >= FEWEST_STILL else None}
+    flicker = np.concatenate(deviations)
+    return {
+        "still_pixels": float(len(flicker)),
+        "flicker": float(flicker.mean()) if len(flicker) >= FEWEST_STILL else None,
+    }
 
 
 def render_parts(reconstruction: Committed, camera: Camera, index: int, labels: NDArray[Any]) -> NDArray[np.uint8]:

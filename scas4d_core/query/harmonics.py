@@ -40,13 +40,13 @@ def harmonics(gaussians: Gaussians) -> Float:
     away = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
     basis = basis_of(away)
     project = np.linalg.pinv(basis)  # exact for what harmonics can hold, however the directions lie
-    found = np.zeros((len(gaussians), COUNT, 3))
+    coefficients = np.zeros((len(gaussians), COUNT, 3))
     shown = np.empty((len(gaussians), 4), np.float32)
     given = gaussians.means, gaussians.gloss, without_turn(len(gaussians)), gaussians.colours, gaussians.environment
     for k, direction in enumerate(away):
         shade(*given, (-FAR_M * direction).astype(np.float32), shown)
-        found += project[:, k][:, None] * (shown[:, None, :3] - 0.5)
-    return found
+        coefficients += project[:, k][:, None] * (shown[:, None, :3] - 0.5)
+    return coefficients
 
 
 def basis_of(directions: NDArray[Any]) -> Float:

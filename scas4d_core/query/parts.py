@@ -171,8 +171,8 @@ def motion(history: History, rows: NDArray[np.intp], frames: int) -> tuple[NDArr
     unborn = np.isnan(positions[..., 0]) & (history.born_at[rows] > np.array(chosen)[:, None])
     late = np.flatnonzero(unborn.any(axis=0))
     if len(late):
-        found = _before_birth(history, rows[late], chosen)
-        for array, earlier in zip((positions, rotations), found, strict=True):
+        before_birth = _before_birth(history, rows[late], chosen)
+        for array, earlier in zip((positions, rotations), before_birth, strict=True):
             array[:, late] = np.where(unborn[:, late, None], earlier, array[:, late])
     return positions, rotations
 

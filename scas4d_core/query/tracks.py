@@ -199,15 +199,15 @@ def tracks_of_pixels(
         beside = np.flatnonzero(~met)[near]
         depth[beside], met[beside] = rendered[row[near], column[near]], True
     points = camera.unproject(uv[met], depth[met])
-    found = tracks_of_points(history, world, points, index, indices)
+    point_tracks = tracks_of_points(history, world, points, index, indices)
     tracks = Tracks(
         positions=np.full((len(indices), len(uv), 3), np.nan),
         confidence=np.zeros((len(indices), len(uv))),
         ids=np.full(len(uv), -1, dtype=np.int64),
-        indices=found.indices,
+        indices=point_tracks.indices,
     )
-    tracks.positions[:, met], tracks.confidence[:, met] = found.positions, found.confidence
-    tracks.ids[met] = found.ids
+    tracks.positions[:, met], tracks.confidence[:, met] = point_tracks.positions, point_tracks.confidence
+    tracks.ids[met] = point_tracks.ids
     return tracks.with_visibility(camera, render_depth, depth_tolerance(history, world, index))
 
 

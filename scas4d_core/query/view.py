@@ -107,15 +107,15 @@ class ViewRenderer:
             raise ValueError(
                 f"labels {labels.shape} must be [{len(gaussians)}], one a Gaussian, each in -1...{MOST_LABEL}"
             )
-        found = np.zeros((camera.height, camera.width), np.uint8)
-        most = np.full(found.shape, -1.0, np.float32)
+        painted = np.zeros((camera.height, camera.width), np.uint8)
+        most = np.full(painted.shape, -1.0, np.float32)
         black = np.zeros(CHANNELS, np.float32)
         for first in range(-1, int(labels.max(initial=-1)) + 1, CHANNELS):
             weights = (labels[:, None] == np.arange(first, first + CHANNELS)).astype(np.float32)
             picture = self._renderer.render(gaussians, camera, weights, background=black)
             best = picture.features.max(axis=0)
             wins = best > most
-            found[wins] = (first + 1 + picture.features.argmax(axis=0))[wins]
+            painted[wins] = (first + 1 + picture.features.argmax(axis=0))[wins]
             most[wins] = best[wins]
-        found[picture.rest > 1 - ALPHA_OF_A_SURFACE] = 0
-        return found
+        painted[picture.rest > 1 - ALPHA_OF_A_SURFACE] = 0
+        return painted

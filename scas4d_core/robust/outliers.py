@@ -183,12 +183,12 @@ def misfits(past: Past, psnr: Mapping[str, float], limit: float) -> dict[str, st
         psnr: dB by camera. limit: ``FIRST_DB`` or ``LAST_DB``.
     """
     limit += allowed(past)
-    found = {
+    outlying = {
         name: f"its picture fits {-off:.1f} dB worse than usual beside the others"
         for name, off in offsets(past, psnr).items()
         if off < limit
     }
-    return few(found, len(psnr))
+    return few(outlying, len(psnr))
 
 
 def allowed(past: Past) -> float:

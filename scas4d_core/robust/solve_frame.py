@@ -316,10 +316,10 @@ class FrameSolver:
         moved = trace.kept is not Candidate.STILL or given.past.updates > 0
         past = outliers.settle(given.past, psnr, given.brightness, result.exposure, len(trace.losses), moved)
         if trace.errors.get(Candidate.END):
-            found = by_size(trace.errors[trace.kept], trace.whole)
+            errors = by_size(trace.errors[trace.kept], trace.whole)
             if self._settings.still > -1 and slow(trace.errors, trace.kept):
-                found |= self._in_whole(result.views or given.views, result.gaussians)
-            past = replace(past, error=outliers.usual_errors(given.past.error, found))
+                errors |= self._in_whole(result.views or given.views, result.gaussians)
+            past = replace(past, error=outliers.usual_errors(given.past.error, errors))
         motion = result.motion if result.motion is not None and result.motion.finite else None
         return replace(result, motion=motion, offsets=outliers.offsets(given.past, psnr)), past
 

@@ -142,9 +142,9 @@ def noted(
         states = (ahead, back) if trace.kept is Candidate.END else (ahead, back, after)  # the end was shown
         here, there, *now = (_rendered(renderer, state, view)[:, ::every, ::every].copy() for state in states)
         shown = now[0] if now else planes[:3]
-        found = told(view.target[:3, ::every, ::every], *(_exposed(view, one) for one in (shown, here, there)))
+        shifts = told(view.target[:3, ::every, ::every], *(_exposed(view, one) for one in (shown, here, there)))
         known = replace(looks.get(view.name, Looks()), last=float(index))
-        looks[view.name] = known if found is None else known.with_look(found, way, frame)
+        looks[view.name] = known if shifts is None else known.with_look(shifts, way, frame)
     return replace(past, timing={name: astuple(one) for name, one in looks.items()})
 
 
@@ -157,13 +157,13 @@ def moments(before: Gaussians, after: Gaussians) -> tuple[Gaussians, Gaussians]:
     """Θ_t half of a frame on and half of it back, along the way from Θ_{t−1}; only places and shapes change."""
     rows = np.flatnonzero(after.moving)
     ways = [(name, HALF * (getattr(after, name)[rows] - getattr(before, name)[rows])) for name in ("means", "factors")]
-    found = []
+    states = []
     for sign in (1, -1):
         arrays = {name: getattr(after, name).copy() for name, _ in ways}
         for name, way in ways:
             arrays[name][rows] += np.float32(sign) * way
-        found.append(after.replace(**arrays))
-    return found[0], found[1]
+        states.append(after.replace(**arrays))
+    return states[0], states[1]
 
 
 def _rendered(renderer: Renderer, state: Gaussians, view: TrainingView) -> Array:

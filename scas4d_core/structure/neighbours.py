@@ -38,17 +38,17 @@ def build_neighbours(means: NDArray[Any], count: int, falloff: float) -> Neighbo
     """
     points = np.asarray(means, dtype=np.float64)
     total = len(points)
-    found = min(count, total - 1)
+    neighbour_count = min(count, total - 1)
     index = np.zeros((total, count), np.int32)
     weights = np.zeros((total, count), np.float32)
     distances = np.zeros((total, count), np.float32)
-    if found > 0:
-        far, near = (np.asarray(found_by) for found_by in cKDTree(points).query(points, k=found + 1))
+    if neighbour_count > 0:
+        far, near = (np.asarray(found_by) for found_by in cKDTree(points).query(points, k=neighbour_count + 1))
         # The point itself is usually first, but among coincident points it may be any, or none.
         own = near == np.arange(total)[:, None]
         own[~own.any(axis=1), -1] = True
-        near, far = near[~own].reshape(total, found), far[~own].reshape(total, found)
-        index[:, :found] = near
-        distances[:, :found] = far
-        weights[:, :found] = np.exp(-falloff * far**2)
+        near, far = near[~own].reshape(total, neighbour_count), far[~own].reshape(total, neighbour_count)
+        index[:, :neighbour_count] = near
+        distances[:, :neighbour_count] = far
+        weights[:, :neighbour_count] = np.exp(-falloff * far**2)
     return Neighbours(index, weights, distances)

@@ -19,8 +19,8 @@ from server.cluster.nodes import living_nodes
 from server.storage.fencing import PART
 
 PROBE = ".probe"
-PATIENCE_S = 30.0
-"""A node has so long to answer."""
+PATIENCE_S = 180.0
+"""Seconds that a node may take to answer: its first task starts a Python process, slow on a node with other work."""
 
 
 def check_folder(data: Path) -> None:

@@ -128,10 +128,10 @@ class Host:
 
     async def take(self) -> list[Any]:
         """The next messages of the process, one at least; `Gone` is the last."""
-        found = [await self._said.get()]
+        messages = [await self._said.get()]
         while not self._said.empty():
-            found.append(self._said.get_nowait())
-        return found
+            messages.append(self._said.get_nowait())
+        return messages
 
     async def stop(self, seconds: float) -> None:
         """Asks the process to end, waits for so long, then kills it."""

@@ -56,11 +56,11 @@ def needs_of(entry: Entry, spec: Any, server: ServerSettings) -> Needs | None:
     scene = spec if isinstance(spec, SceneSpec) else getattr(spec, "scene", None)
     if not isinstance(scene, SceneSpec):
         return None
-    found = estimate(RigModel.of(scene.rig), scene.settings, server)
+    sizes = estimate(RigModel.of(scene.rig), scene.settings, server)
     name, labels = scene.folder.name, scene.nodes
     if entry is worker.main:
-        return Needs("worker", name, 1.0, round(1e6 * found.worker_mb), labels)
-    memory = round(1e6 * found.readers_mb / 2)
+        return Needs("worker", name, 1.0, round(1e6 * sizes.worker_mb), labels)
+    memory = round(1e6 * sizes.readers_mb / 2)
     if entry in (renderer.views, renderer.bulk):
         return Needs(entry.__name__, name, READER_CPUS, memory, labels)
     return Needs(entry.__module__.rpartition(".")[2], name, ASIDE_CPUS, memory, labels)

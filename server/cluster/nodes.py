@@ -30,8 +30,8 @@ class Place:
 
 def all_nodes() -> list[dict[str, Any]]:
     """All nodes that there have been, as Ray describes them. Blocking."""
-    found: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
-    return found
+    nodes: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
+    return nodes
 
 
 def living_nodes() -> list[dict[str, Any]]:
@@ -47,8 +47,8 @@ def is_lost(id: str) -> bool:
     """
     try:
         living = living_nodes()
-        found = [node for node in living if node["NodeID"] == id] if _own_is_in(living) else []
-        return not any(_listens(node["NodeManagerAddress"], node["NodeManagerPort"]) for node in found)
+        own = [node for node in living if node["NodeID"] == id] if _own_is_in(living) else []
+        return not any(_listens(node["NodeManagerAddress"], node["NodeManagerPort"]) for node in own)
     except Exception:  # whatever Ray raises without its head
         return True
 
@@ -93,13 +93,13 @@ def cluster_of(
     Args:
         nodes: as Ray describes them. places: of processes. lost: ids. answers: the head of the cluster does.
     """
-    found = []
+    statuses = []
     for node in nodes:
         own = [place.needs for place in places if place.node == node["NodeID"]]
         if not (node["Alive"] or own or node["NodeID"] in lost):
             continue
         has = node["Resources"]
-        found.append(
+        statuses.append(
             Node(
                 id=node["NodeID"],
                 host=node["NodeManagerHostname"],
@@ -120,4 +120,4 @@ def cluster_of(
         if place.node is None
         for needs in (place.needs,)
     ]
-    return Cluster(placement="ray", nodes=found, waiting=waiting, answers=answers)
+    return Cluster(placement="ray", nodes=statuses, waiting=waiting, answers=answers)

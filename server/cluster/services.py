@@ -53,8 +53,8 @@ def announced(word: str, host: str, port: int) -> Any:
 
 def _authority(host: str, port: int) -> str:
     """The numbers of an address: a service refuses names that it is not told of."""
-    found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
-    number = str(found[0][4][0])
+    addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
+    number = str(addresses[0][4][0])
     return f"[{number}]:{port}" if ":" in number else f"{number}:{port}"
 
 
@@ -84,7 +84,7 @@ def others(word: str, known: Mapping[str, str] | None) -> dict[str, str]:
 
 def _asked(names: Sequence[str]) -> dict[str, tuple[str, str | None]]:
     """Asks services for their addresses; one that does not tell has its name as address."""
-    found: dict[str, tuple[str, str | None]] = {name: (name, None) for name in names}
+    addresses: dict[str, tuple[str, str | None]] = {name: (name, None) for name in names}
     asked: dict[Any, str] = {}
     for name in names:
         with contextlib.suppress(ValueError, RayError):  # it has ended meanwhile
@@ -92,7 +92,7 @@ def _asked(names: Sequence[str]) -> dict[str, tuple[str, str | None]]:
             asked[actor.get.remote()] = name
     for answer in ray.wait(list(asked), num_returns=len(asked), timeout=ASK_S)[0] if asked else ():
         try:
-            found[asked[answer]] = ray.get(answer)
+            addresses[asked[answer]] = ray.get(answer)
         except RayError as error:  # it ends, or begins
             log.info("service %s does not tell its address: %s", asked[answer], error)
-    return found
+    return addresses

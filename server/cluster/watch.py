@@ -72,7 +72,7 @@ class NodeWatch:
         stopped = {node["NodeID"] for node in nodes if node.get("DeathReason") in ON_PURPOSE}
         back = {hosts[id] for id in alive - self._alive}
         now = self._now()
-        found = self._lost | dict.fromkeys(sorted(self._alive - alive - stopped), now)
-        found = {id: when for id, when in found.items() if hosts.get(id) not in back}
-        self._lost = dict(list(found.items())[-MOST_LOST:])
+        lost = self._lost | dict.fromkeys(sorted(self._alive - alive - stopped), now)
+        lost = {id: when for id, when in lost.items() if hosts.get(id) not in back}
+        self._lost = dict(list(lost.items())[-MOST_LOST:])
         self._alive = alive

@@ -90,8 +90,8 @@ class Connection(HttpToolsProtocol):
                 if record.phase is not Phase.HEAD:
                     self._begin_head()
                 limit = at + self.guard.limits.header_bytes - self._head_bytes
-                found = data.find(END_OF_HEAD, at, limit)
-                end = limit if found < 0 else found + len(END_OF_HEAD)
+                end_of_head = data.find(END_OF_HEAD, at, limit)
+                end = limit if end_of_head < 0 else end_of_head + len(END_OF_HEAD)
             whole = at == 0 and end >= len(data)
             at += self._parse(data if whole else memoryview(data)[at:end])
 

@@ -87,23 +87,23 @@ class ConnectionLimits:
     def is_proxy(self, address: str) -> bool:
         """Returns True if the address is one of the trusted proxies."""
         try:
-            found = ipaddress.ip_address(address)
+            parsed = ipaddress.ip_address(address)
         except ValueError:
             return False
-        return any(found in network for network in self.proxies)
+        return any(parsed in network for network in self.proxies)
 
 
 def peer_key(address: str) -> str:
     """Returns the key of a peer's connections: of an IPv6 address its /64, which belongs to one customer."""
     try:
-        found = ipaddress.ip_address(address)
+        parsed = ipaddress.ip_address(address)
     except ValueError:
         return address
-    if isinstance(found, ipaddress.IPv4Address):
+    if isinstance(parsed, ipaddress.IPv4Address):
         return address
-    if found.ipv4_mapped is not None:
-        return str(found.ipv4_mapped)
-    return f"{ipaddress.IPv6Address(int(found) >> 64 << 64)}/64"
+    if parsed.ipv4_mapped is not None:
+        return str(parsed.ipv4_mapped)
+    return f"{ipaddress.IPv6Address(int(parsed) >> 64 << 64)}/64"
 
 
 class ConnectionGuard:
@@ -201,10 +201,10 @@ class ConnectionGuard:
 
     def counts(self) -> dict[str, int]:
         """Counts the open connections by kind."""
-        found = dict.fromkeys(KINDS.values(), 0)
+        totals = dict.fromkeys(KINDS.values(), 0)
         for record in self._records.values():
-            found[KINDS[record.phase]] += 1
-        return found
+            totals[KINDS[record.phase]] += 1
+        return totals
 
     def _unqueue(self, record: OpenConnection) -> None:
         if record.queue is not None:
@@ -251,10 +251,10 @@ class ConnectionGuard:
     def _displace(self, peers: Collection[Peer], now: float) -> bool:
         """Ends the connection of these peers that can be spared best; False where none can."""
         for queues in ([peer.strangers for peer in peers], [peer.idle for peer in peers]):
-            found = [(len(queue), next(iter(queue))) for queue in queues if queue]
-            if found:
+            oldest = [(len(queue), next(iter(queue))) for queue in queues if queue]
+            if oldest:
                 # Of many peers with as many it is the one that has waited longest: who has just come has a request.
-                _, record = max(found, key=lambda one: (one[0], -one[1].since))
+                _, record = max(oldest, key=lambda one: (one[0], -one[1].since))
                 self._end(record, now)
                 return True
         quiet = [

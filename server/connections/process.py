@@ -58,9 +58,9 @@ def unread_bytes(transport: asyncio.Transport) -> int:
     """Returns bytes that were written and not acknowledged: the transport's and, on systems that count them, the
     kernel's. The kernel takes more in lumps of up to a megabyte, between which a slow reader would look like none.
     """
-    found = transport.get_write_buffer_size()
+    unread = transport.get_write_buffer_size()
     socket = transport.get_extra_info("socket")
-    if found and UNIX and socket is not None:
+    if unread and UNIX and socket is not None:
         with contextlib.suppress(OSError, ValueError):
-            found += struct.unpack("i", fcntl.ioctl(socket.fileno(), termios.TIOCOUTQ, bytes(4)))[0]
-    return found
+            unread += struct.unpack("i", fcntl.ioctl(socket.fileno(), termios.TIOCOUTQ, bytes(4)))[0]
+    return unread

@@ -86,19 +86,19 @@ def check(rig: RigModel, settings: Settings, server: ServerSettings) -> None:
     Raises:
         Problem: 422, with the scale of the pictures that would.
     """
-    found = estimate(rig, settings, server)
-    if found.memory_mb <= found.limit_mb:
+    needed = estimate(rig, settings, server)
+    if needed.memory_mb <= needed.limit_mb:
         return
     smaller = [scale for scale in SCALES if scale < settings.scene.image_scale]
-    fits = next((s for s in smaller if estimate(rig, settings, server, s).memory_mb <= found.limit_mb), None)
+    fits = next((s for s in smaller if estimate(rig, settings, server, s).memory_mb <= needed.limit_mb), None)
     remedy = "send fewer or smaller pictures, lower settings.static.max_gaussians, or raise SCAS4D_MAX_SCENE_MEMORY_MB"
     if fits is not None:
         remedy = f"set settings.scene.image_scale to {fits:g}; or {remedy}"
     raise Problem(
         422,
-        f"the scene is estimated to take {found.memory_mb:.0f} MB, more than {found.limit_mb:.0f} MB",
+        f"the scene is estimated to take {needed.memory_mb:.0f} MB, more than {needed.limit_mb:.0f} MB",
         field="rig.cameras",
-        value=f"{counted(len(rig.cameras), 'camera')}, {found.scaled_pixels} pixels, {found.gaussians} Gaussians",
+        value=f"{counted(len(rig.cameras), 'camera')}, {needed.scaled_pixels} pixels, {needed.gaussians} Gaussians",
         remedy=remedy,
-        estimate=found.model_dump(),
+        estimate=needed.model_dump(),
     )

@@ -90,9 +90,9 @@ def split(authority: str) -> tuple[str, int | None] | None:
 
 
 def _is_ours(scope: Scope, authority: str, allowed: Sequence[str]) -> bool:
-    found = split(authority)
-    assert found is not None
-    host, port = found
+    origin = split(authority)
+    assert origin is not None
+    host, port = origin
     if is_loopback(host) or (scope.get("server") and _is_address(host) and host == scope["server"][0]):
         return True
     return any(other is not None and other[0] == host and other[1] in (None, port) for other in map(split, allowed))

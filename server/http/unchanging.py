@@ -141,10 +141,10 @@ def _range(request: Request, tag: str, size: int) -> tuple[int, int] | None:
     given = request.headers.get("range")
     if given is None or request.headers.get("if-range", tag) != tag:
         return None
-    found = RANGE.fullmatch(given.strip())
-    if found is None or found.groups() == ("", ""):
+    match = RANGE.fullmatch(given.strip())
+    if match is None or match.groups() == ("", ""):
         return None
-    first, last = found.groups()
+    first, last = match.groups()
     if not first:
         start, end = max(0, size - int(last)), size
     else:

@@ -76,8 +76,8 @@ def invalid(
 
 def first_of(error: ValidationError, *, model: object = None, prefix: str = "", text: str | None = None) -> Problem:
     """Makes the problem for the first error of a failed validation."""
-    found = error.errors()
-    return invalid(found[0], model=model, prefix=prefix, others=len(found) - 1, text=text)
+    faults = error.errors()
+    return invalid(faults[0], model=model, prefix=prefix, others=len(faults) - 1, text=text)
 
 
 def fields_of(model: object, loc: tuple[int | str, ...] = ()) -> list[str]:
@@ -86,7 +86,7 @@ def fields_of(model: object, loc: tuple[int | str, ...] = ()) -> list[str]:
     for part in loc:
         if isinstance(part, str):
             inner = [one.model_fields[part].annotation for one in here if part in one.model_fields]
-            here = [found for annotation in inner for found in _models(annotation)]
+            here = [inner_model for annotation in inner for inner_model in _models(annotation)]
     return list(dict.fromkeys(name for one in here for name in one.model_fields))
 
 

@@ -249,10 +249,10 @@ def _jpeg(data: memoryview) -> ImageHeader:
 
 def _end_of_scan(data: memoryview, at: int) -> int:
     """Finds the end of the entropy-coded data from `at` on: the next marker that is no stuffed zero and no restart."""
-    found = _SCAN_END.search(data, at)
-    if found is None:
+    end = _SCAN_END.search(data, at)
+    if end is None:
         raise _truncated("JPEG", len(data))
-    return found.start()
+    return end.start()
 
 
 def _png(data: memoryview) -> ImageHeader:

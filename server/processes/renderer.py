@@ -89,8 +89,8 @@ def _serve(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
             break
         if isinstance(message, AskedQuery):
             answer = renderer.answer(message)
-            if found := renderer.take_faults():  # before a refused query is asked again
-                connection.send(Damaged(found))
+            if faults := renderer.take_faults():  # before a refused query is asked again
+                connection.send(Damaged(faults))
             connection.send(answer)
     logging.shutdown()
     os._exit(0)
@@ -186,8 +186,8 @@ class Renderer:
                 body, media_type, headers = encode_view(view, query.kinds, query.format, query.quality)
                 return Answer(number, body, media_type, {**headers, "X-Frame": str(query.frame)})
             case TracksQuery():
-                found = track_answers.find(self.reader, self.history, query)
-                return Answer(number, *track_answers.encoded(found, query, track_answers.metres_per_unit(self.spec)))
+                tracks = track_answers.find(self.reader, self.history, query)
+                return Answer(number, *track_answers.encoded(tracks, query, track_answers.metres_per_unit(self.spec)))
             case PartsQuery():
                 labels, last = self.labels(query.count), self.history.indices[-1]
                 model = parts_model(labels, self.history.gaussians(last).ids, last)

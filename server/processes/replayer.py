@@ -51,7 +51,7 @@ def _replay(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
 
     use_one_thread()
     for iterations in spec.iterations:
-        found = replay(
+        result = replay(
             scene.rig, scene.settings, history, spec.base, frames, iterations, lambda: connection.send(ReplayUpdated())
         )
-        connection.send(ReplayPoint(iterations, found.milliseconds, found.error, found.psnr, found.frames))
+        connection.send(ReplayPoint(iterations, result.milliseconds, result.error, result.psnr, result.frames))

@@ -301,29 +301,29 @@ def read(folder: Path, message: FrameReady) -> Encoded:
     Raises:
         FrameDamage: the record that holds the whole frame cannot be used.
     """
-    found = Encoded({}, {}, [])
+    contents = Encoded({}, {}, [])
     for name in message.files:
         try:
             pictures = read_pictures(folder, name)
         except FrameDamage as error:
             if len(message.files) == 1:
                 raise
-            found.faults.append(f"a record in the frame log is damaged: {error}")
+            contents.faults.append(f"a record in the frame log is damaged: {error}")
             continue
         if len(message.files) == 1 and frame_identity(pictures.hashes, message.time) != message.identity:
             raise FrameDamage(f"{name}: it holds other pictures than were acknowledged")
-        found.images.update(pictures.images)
-        found.masks.update(pictures.masks)
-    return found
+        contents.images.update(pictures.images)
+        contents.masks.update(pictures.masks)
+    return contents
 
 
 def decode(rig: Rig, message: FrameReady, encoded: Encoded) -> tuple[Frame, dict[str, str]]:
     """Returns the frame, and the cameras left out of it with the reason; cameras are decoded side by side."""
     with ThreadPoolExecutor(max_workers=min(DECODERS, os.cpu_count() or 1)) as pool:
-        found = list(pool.map(lambda camera: _pictures_of(camera, encoded), rig.cameras))
+        decoded = list(pool.map(lambda camera: _pictures_of(camera, encoded), rig.cameras))
     images, masks, dropped = {}, {}, {}
     # In the order of the rig, whatever the order in which they came: the same pictures give the same bits.
-    for camera, pictures in zip(rig.cameras, found, strict=True):
+    for camera, pictures in zip(rig.cameras, decoded, strict=True):
         if isinstance(pictures, str):
             dropped[camera.name] = pictures
             continue

@@ -27,13 +27,13 @@ async def get(request: Request, response: Response, scenes: AllScenes, server: T
     """
     placement: Placement = request.app.state.placement
     siblings: Siblings | None = request.app.state.siblings
-    found = await placement.cluster() or _alone(scenes, server)
+    cluster_status = await placement.cluster() or _alone(scenes, server)
     if siblings is not None and PASSED not in request.headers:
         others, silent = await siblings.clusters()
-        found = together(found, others)
+        cluster_status = together(cluster_status, others)
         if silent:
             response.headers["X-Unreachable"] = ", ".join(silent)
-    return found
+    return cluster_status
 
 
 def _alone(scenes: Scenes, server: ServerSettings) -> Cluster:

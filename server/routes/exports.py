@@ -61,20 +61,20 @@ async def get(id: SceneId, export: ExportId, exports: AllExports) -> ExportModel
 @router.get("/{id}/exports/{export}/file", response_class=Response, responses=FILE)
 async def file(id: SceneId, export: ExportId, exports: AllExports, request: Request) -> Response:
     """Returns the file of an export that is done; numbered files in one .zip. `Range` and `If-None-Match` hold."""
-    found = exports.get(id, export)
-    if found.state != ExportState.DONE:
+    file_export = exports.get(id, export)
+    if file_export.state != ExportState.DONE:
         raise Problem(
             409,
-            f"the export is {found.state.value}" + (f": {found.error}" if found.error else ""),
+            f"the export is {file_export.state.value}" + (f": {file_export.error}" if file_export.error else ""),
             field="export",
             value=export,
             remedy=f"wait until GET /v1/scenes/{id}/exports/{export} tells that it is done"
-            if found.error is None
+            if file_export.error is None
             else "ask for another export",
         )
     try:
         return await unchanging_file(
-            request, found.spec.file, tag=found.id, media_type=found.media_type, name=found.name
+            request, file_export.spec.file, tag=file_export.id, media_type=file_export.media_type, name=file_export.name
         )
     except FileNotFoundError:  # removed between the two
         remedy = "ask for another export"

@@ -155,8 +155,8 @@ async def missing(scene: TheScene, n: FrameIndex, request: MissingRequest | None
 @router.get("/{id}/frames/{n}")
 async def report(scene: TheRecord, n: FrameIndex) -> FrameReportModel:
     """Returns the state of a frame, and its numbers once it is committed."""
-    found = await scene.report(n)
-    if found is None:
+    frame_report = await scene.report(n)
+    if frame_report is None:
         raise Problem(
             404,
             f"frame {n} has not come",
@@ -164,7 +164,7 @@ async def report(scene: TheRecord, n: FrameIndex) -> FrameReportModel:
             value=n,
             remedy=f"send it, or wait for it: the next is {scene.next_frame}",
         )
-    return found
+    return frame_report
 
 
 @router.get(
@@ -245,8 +245,8 @@ async def _stored(scene: Scene, n: int, c: str, kind: FileKind) -> memoryview:
         except FrameDamage as error:
             fault = f"the pictures of frame {n} cannot be read: {error}"
             continue
-        if (found := (stored.images if kind == FileKind.IMAGE else stored.masks).get(c)) is not None:
-            return found
+        if (picture := (stored.images if kind == FileKind.IMAGE else stored.masks).get(c)) is not None:
+            return picture
         field, fault = "c", f"no {kind.value} of camera {c} was sent with frame {n}"
     remedy = "ask for a newer frame; PATCH of the scene's `keep_frames` keeps more of them"
     raise Problem(404, fault, field=field, value=n if field == "n" else c, remedy=remedy)

@@ -22,7 +22,7 @@ async def metrics(request: Request, scenes: AllScenes, settings: TheSettings) ->
     gauges = CollectorRegistry()
     state, guard = request.app.state, request.app.state.guard
     cluster = await scenes.placement.cluster()
-    found = State(settings, scenes.statuses(), state.hub.count(), readiness.after, guard.counts(), cluster)
-    gauges.register(found)
+    service_state = State(settings, scenes.statuses(), state.hub.count(), readiness.after, guard.counts(), cluster)
+    gauges.register(service_state)
     text = generate_latest(registry) + generate_latest(gauges)
     return Response(text, media_type=CONTENT_TYPE_PLAIN_0_0_4)

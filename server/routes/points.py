@@ -166,5 +166,5 @@ def columns_of(data: NDArray[Any]) -> dict[str, NDArray[Any]]:
             value=f"{data.dtype} {data.shape}",
             remedy="give numbers of shape [P, 7]: x y z, r g b, foreground; or positions and colours instead",
         )
-    found = {"positions": data[:, :3], "colours": data[:, 3:6]}
-    return found | ({"foreground": data[:, 6]} if data.shape[1] == 7 else {})
+    columns = {"positions": data[:, :3], "colours": data[:, 3:6]}
+    return columns | ({"foreground": data[:, 6]} if data.shape[1] == 7 else {})

@@ -30,8 +30,10 @@ ENDINGS = {one: f".{'jpg' if one == RenderFormat.JPEG else one.value}" for one i
 @router.post("/{id}/render", response_class=Response, responses=PICTURES)
 async def render(scene: TheScene, request: Request, view: RenderRequest) -> Response:
     """Renders a committed frame from any camera; this does not wait for an update at work."""
-    found = await ask(request, scene, render_query(scene, view))
-    return Response(found.body, media_type=found.media_type, headers={**found.headers, "Cache-Control": "no-store"})
+    response = await ask(request, scene, render_query(scene, view))
+    return Response(
+        response.body, media_type=response.media_type, headers={**response.headers, "Cache-Control": "no-store"}
+    )
 
 
 @router.get("/{id}/render", response_class=Response, responses=PICTURES)
@@ -70,11 +72,11 @@ async def render_by_name(
         }
         if is_known(request, keep["ETag"]):
             return Response(status_code=304, headers=keep)
-    found = await ask(request, scene, query)
+    response = await ask(request, scene, query)
     seen_by = view.camera if isinstance(view.camera, str) else "view"
     name = f"{scene.id[:8]}-{query.frame:06d}-{seen_by}-{query.kinds[0]}{ENDINGS[view.format]}"
     keep["Content-Disposition"] = disposition(name, inline=True)
-    return Response(found.body, media_type=found.media_type, headers={**found.headers, **keep})
+    return Response(response.body, media_type=response.media_type, headers={**response.headers, **keep})
 
 
 def _colour(text: str) -> tuple[float, float, float]:

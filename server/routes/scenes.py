@@ -104,14 +104,14 @@ async def listed(scenes: AllScenes, request: Request, response: Response) -> Sce
     """
     scenes.recovering.check()
     permission: Permission = request.scope.get(PERMISSION, ALL)
-    found = scenes.statuses()
+    summaries = scenes.statuses()
     siblings: Siblings | None = request.app.state.siblings
     if siblings is not None and PASSED not in request.headers:
         others, silent = await siblings.scenes(permission)
-        found = sorted([*found, *others], key=lambda status: status.created)
+        summaries = sorted([*summaries, *others], key=lambda status: status.created)
         if silent:
             response.headers["X-Unreachable"] = ", ".join(silent)
-    return SceneList(scenes=[status for status in found if permission.scene in (None, status.id)])
+    return SceneList(scenes=[status for status in summaries if permission.scene in (None, status.id)])
 
 
 @router.get("/{id}")

@@ -60,8 +60,8 @@ async def tracks(
 
 async def answer(http: Request, scene: Scene, request: TracksRequest) -> Response:
     """Checks the request and asks the reader."""
-    found = await ask(http, scene, tracks_query(scene, request))
-    return Response(found.body, media_type=found.media_type)
+    response = await ask(http, scene, tracks_query(scene, request))
+    return Response(response.body, media_type=response.media_type)
 
 
 def ids_in(text: str) -> list[int]:

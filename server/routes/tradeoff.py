@@ -39,9 +39,9 @@ async def end(scene: TheScene) -> TradeoffModel:
 async def answer(scene: Scene) -> TradeoffModel:
     """Returns all points that are known now."""
     newest = scene.committed[-tradeoff.NEWEST :]
-    found = [await scene.report(index) for index in newest]
+    frame_reports = [await scene.report(index) for index in newest]
     first = scene.committed[0] if newest else 0
-    reports = tradeoff.telling([report for report in found if report is not None], first)
+    reports = tradeoff.telling([report for report in frame_reports if report is not None], first)
     write = tradeoff.writing(reports)
     replayed = [
         point.model_copy(update={"milliseconds": point.milliseconds + write})

@@ -103,10 +103,10 @@ class Beginning:
         if self.number == now and ledger.begun is not None and ledger.begun.asked == self.asked:
             return True
         if self.number != now + 1:
-            found = "has begun already" if self.number <= now else "comes after another one"
+            reason = "has begun already" if self.number <= now else "comes after another one"
             raise Problem(
                 409,
-                f"reconstruction {self.number} {found}: the scene's is {now}",
+                f"reconstruction {self.number} {reason}: the scene's is {now}",
                 field="n",
                 value=self.number,
                 remedy=f"begin reconstruction {now + 1}",
@@ -151,12 +151,12 @@ async def journal_beginning(folder: SceneFolder, beginning: Beginning) -> list[s
         Problem: see `Beginning.event`; 507, the disk is full.
     """
     definition, _ = await asyncio.to_thread(read_definition, folder)
-    found = await asyncio.to_thread(recover, folder, definition.id, definition.as_json())
-    event = beginning.event(found.ledger, found.folder)
+    recovered = await asyncio.to_thread(recover, folder, definition.id, definition.as_json())
+    event = beginning.event(recovered.ledger, recovered.folder)
     assert event is not None
-    journal = Journal(folder.journal, found.good)
+    journal = Journal(folder.journal, recovered.good)
     try:
-        await journal.append(*found.events, event)
+        await journal.append(*recovered.events, event)
     except OSError as error:
         if no_room(error):
             raise full_disk(error) from None
@@ -164,7 +164,7 @@ async def journal_beginning(folder: SceneFolder, beginning: Beginning) -> list[s
     finally:
         await journal.close()
     log.warning("scene %s begins reconstruction %d with frame %d", folder.name, event.number, event.index)
-    return found.damage
+    return recovered.damage
 
 
 def _is_sent(entry: FrameEntry) -> bool:

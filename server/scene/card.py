@@ -63,5 +63,5 @@ def _fingerprint(folder: SceneFolder) -> list[Any]:
     own = {folder.card.name, folder.card.with_suffix(".part").name, folder.worker_lock.name}
     with os.scandir(folder.path) as entries:
         others = [entry for entry in entries if entry.name not in own and not entry.name.startswith(f"{EXPORT}.")]
-        found = [(entry.name, entry.stat()) for entry in others]
-    return [[name, seen.st_size, seen.st_mtime_ns] for name, seen in sorted(found)]
+        stats = [(entry.name, entry.stat()) for entry in others]
+    return [[name, seen.st_size, seen.st_mtime_ns] for name, seen in sorted(stats)]

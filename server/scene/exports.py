@@ -131,11 +131,11 @@ class Exports:
             Problem: 404, there is none.
         """
         self._scenes.status(scene)
-        found = self._known.get(scene, {}).get(export)
-        if found is None:
+        known_export = self._known.get(scene, {}).get(export)
+        if known_export is None:
             remedy = f"GET /v1/scenes/{scene}/exports lists them; ask for a new one where it was removed"
             raise Problem(404, f"the scene has no export {export!r}", field="export", value=export, remedy=remedy)
-        return found
+        return known_export
 
     def begin(self, scene: Scene, request: ExportRequest, frames: tuple[int, ...]) -> Export:
         """Queues an export of committed frames.
@@ -273,12 +273,12 @@ class Exports:
         Raises:
             Problem: 404, there is none.
         """
-        found = self.get(scene, export)
-        if found.state in OVER:
-            self._drop(found)
-            await self._clear(found.spec.file.parent)
+        removed = self.get(scene, export)
+        if removed.state in OVER:
+            self._drop(removed)
+            await self._clear(removed.spec.file.parent)
         else:
-            await self._cancel(found)
+            await self._cancel(removed)
 
     async def forget(self, scene: str) -> None:
         """Ends and removes all exports of a scene that was deleted, or whose reconstruction was begun anew."""

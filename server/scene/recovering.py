@@ -68,12 +68,12 @@ class Recovering:
 
     def _folders(self) -> list[str]:
         """Lists the folders of scenes, newest journal first; moves those never acknowledged to the deleted ones."""
-        found = []
+        folders = []
         for path in sorted(path for path in self._data.scenes.iterdir() if path.is_dir()):
             folder = SceneFolder(path)
             if never_acknowledged(folder):
                 path.rename(self._data.deleted / f"{path.name}-{secrets.token_hex(4)}")
             else:
-                found.append((folder.journal.stat().st_mtime if folder.journal.exists() else 0.0, path.name))
+                folders.append((folder.journal.stat().st_mtime if folder.journal.exists() else 0.0, path.name))
         sync_folder(self._data.scenes)
-        return [name for _, name in sorted(found, reverse=True)]
+        return [name for _, name in sorted(folders, reverse=True)]

@@ -239,12 +239,12 @@ class Scene:
         if entry is not None and entry.deleted and entry.error is not None:
             raise Problem(404, entry.error, field=field, value=index, remedy=other)
         if entry is None or entry.state != FrameState.COMMITTED or entry.deleted:
-            found = "not here" if entry is None else entry.state.value
+            reason = "not here" if entry is None else entry.state.value
             if entry is not None and entry.deleted:
-                found = "deleted by the scene's retention"
+                reason = "deleted by the scene's retention"
             raise Problem(
                 404,
-                f"frame {index} is {found}; only committed frames that are kept can be read",
+                f"frame {index} is {reason}; only committed frames that are kept can be read",
                 field=field,
                 value=index,
                 remedy=other,

@@ -82,9 +82,9 @@ class Scenes:
 
     def statuses(self) -> list[SceneStatus]:
         """The status of every scene that is recovered, oldest first; none is woken."""
-        found = [(scene.created, scene.status) for id, scene in self.asleep.items() if id not in self.by_id]
-        found += [(scene.created, scene.status()) for scene in self.by_id.values()]
-        return [status for _, status in sorted(found, key=lambda one: one[0])]
+        entries = [(scene.created, scene.status) for id, scene in self.asleep.items() if id not in self.by_id]
+        entries += [(scene.created, scene.status()) for scene in self.by_id.values()]
+        return [status for _, status in sorted(entries, key=lambda one: one[0])]
 
     def status(self, id: str) -> SceneStatus:
         """The status of a scene, which is not woken.
@@ -191,17 +191,17 @@ class Scenes:
             if not wake and (status := await asyncio.to_thread(sleep.sleeps_on, folder, self.server)) is not None:
                 self._sleeps(status)
                 return True
-            found = await asyncio.to_thread(find, folder, self._data.bury, said)
-            goes_on = not wake and sleep.was_awake(found.used, self.server) and self._places_left > 0
-            if found.has_work or goes_on or wake:
-                scene = Scene(found, self.server, self.placement, self.hub)
-                scene.has_place = found.has_work or goes_on
+            restored = await asyncio.to_thread(find, folder, self._data.bury, said)
+            goes_on = not wake and sleep.was_awake(restored.used, self.server) and self._places_left > 0
+            if restored.has_work or goes_on or wake:
+                scene = Scene(restored, self.server, self.placement, self.hub)
+                scene.has_place = restored.has_work or goes_on
                 self.by_id[scene.id] = scene
                 if goes_on:
                     scene.start()
                 scene.updates.begin()
             else:
-                self._sleeps(status := found.facts(self.server.queue_frames).status())
+                self._sleeps(status := restored.facts(self.server.queue_frames).status())
                 await asyncio.to_thread(write_card, folder, status)
         except Exception as error:  # a fault of one scene is no fault of the others
             known = isinstance(error, DefinitionError | OSError)
@@ -209,7 +209,7 @@ class Scenes:
             self.unreadable[folder.name] = reason
             log.error("folder %s is left as it is: %s", folder.path, reason, exc_info=None if known else error)
             return False
-        for sentence in found.content.damage:
+        for sentence in restored.content.damage:
             if sentence not in said:
                 log.warning("scene %s: %s", folder.name, sentence)
         return True
@@ -274,7 +274,7 @@ class Scenes:
         definition = Definition(secrets.token_hex(6), datetime.now(UTC), request, settings)
         folder = self._data.scene(definition.id)
         try:
-            found = await make(folder, definition)
+            created = await make(folder, definition)
         except OSError as error:
             await asyncio.to_thread(shutil.rmtree, folder.path, ignore_errors=True)
             if no_room(error):
@@ -282,7 +282,7 @@ class Scenes:
             raise
         finally:
             self._promised -= 1
-        scene = Scene(found, self.server, self.placement, self.hub)
+        scene = Scene(created, self.server, self.placement, self.hub)
         scene.has_place = True
         self.by_id[definition.id] = scene
         scene.start()

@@ -121,7 +121,9 @@ def _groups(items: Sequence[Any], key: Any) -> list[tuple[Any, list[Any]]]:
     def order(item: Any) -> Any:
         return tuple(-1 if part is None else part for part in key(item))
 
-    return [(key(group[0]), group) for _, found in groupby(sorted(items, key=order), order) if (group := list(found))]
+    return [
+        (key(group[0]), group) for _, members in groupby(sorted(items, key=order), order) if (group := list(members))
+    ]
 
 
 def _rounded(iterations: int | None) -> int:

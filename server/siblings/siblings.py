@@ -102,10 +102,10 @@ class Siblings:
 
     def headers(self, permission: Permission) -> dict[str, str]:
         """Headers with which a sibling is asked, for somebody who may do so much."""
-        found = {PASSED: "1"}
+        forwarded = {PASSED: "1"}
         if self._secret is not None:
-            found["authorization"] = f"Bearer {_bearer(permission, self._secret)}"
-        return found
+            forwarded["authorization"] = f"Bearer {_bearer(permission, self._secret)}"
+        return forwarded
 
     async def owner(self, scene: str) -> str | None:
         """Returns the address of the sibling that has a scene; None: none of them has it.
@@ -147,7 +147,7 @@ class Siblings:
     async def scenes(self, permission: Permission) -> tuple[list[SceneStatus], list[str]]:
         """Returns the scenes of all siblings, and the addresses of those that do not answer."""
         lists, silent = await self._every("/v1/scenes", permission, SceneList)
-        return list({status.id: status for found in lists for status in found.scenes}.values()), silent
+        return list({status.id: status for listing in lists for status in listing.scenes}.values()), silent
 
     async def clusters(self) -> tuple[list[Cluster], list[str]]:
         """Returns what the siblings' scenes take of nodes, and the addresses of those that do not answer."""
@@ -156,15 +156,15 @@ class Siblings:
     async def _every(self, path: str, permission: Permission, model: type[M]) -> tuple[list[M], list[str]]:
         siblings = await self.addresses()
         answers = await asyncio.gather(*(self._get(address, path, permission) for address in siblings))
-        found, silent = [], []
+        replies, silent = [], []
         for address, answer in zip(siblings, answers, strict=True):
             try:
                 if answer is None or answer.status_code != 200:
                     raise ValueError(answer)
-                found.append(model.model_validate_json(answer.content))
+                replies.append(model.model_validate_json(answer.content))
             except (ValueError, ValidationError):  # a service of another version may have other words
                 silent.append(address)
-        return found, silent
+        return replies, silent
 
     async def _has(self, address: str, scene: str) -> bool | None:
         """Returns whether a sibling has a scene; None: it does not say."""

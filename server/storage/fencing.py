@@ -40,8 +40,8 @@ class FencingError(RuntimeError):
 
 def epochs(states: Path) -> dict[int, Path]:
     """Folders of epochs that are whole, in rising order."""
-    found = {epoch: path for path, epoch in _folders(states) if path.suffix != PART}
-    return dict(sorted(found.items()))
+    by_epoch = {epoch: path for path, epoch in _folders(states) if path.suffix != PART}
+    return dict(sorted(by_epoch.items()))
 
 
 def epoch_read(states: Path) -> int | None:
@@ -148,8 +148,8 @@ def _point(states: Path, epoch: int) -> None:
 
 def _folders(states: Path) -> list[tuple[Path, int]]:
     """Folders of epochs, whole or not, with their epochs."""
-    found = [(path, _epoch_of(states, path)) for path in states.parent.glob(f"{states.name}.*") if path.is_dir()]
-    return [(path, epoch) for path, epoch in found if epoch is not None]
+    folders = [(path, _epoch_of(states, path)) for path in states.parent.glob(f"{states.name}.*") if path.is_dir()]
+    return [(path, epoch) for path, epoch in folders if epoch is not None]
 
 
 def _epoch_of(states: Path, path: Path) -> int | None:

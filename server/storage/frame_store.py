@@ -150,18 +150,18 @@ def read_pictures(folder: Path, name: str) -> StoredPictures:
         data = (folder / name).read_bytes()
     except OSError as error:
         raise FrameDamage(f"{name}: {error.strerror}") from None
-    found, end = read_at(memoryview(data), 0)
-    if not isinstance(found, Record) or found.kind != Kind.PICTURES or end != len(data):
-        raise FrameDamage(f"{name}: {'not one record of pictures' if isinstance(found, Record) else found.reason}")
+    record, end = read_at(memoryview(data), 0)
+    if not isinstance(record, Record) or record.kind != Kind.PICTURES or end != len(data):
+        raise FrameDamage(f"{name}: {'not one record of pictures' if isinstance(record, Record) else record.reason}")
     images: dict[str, memoryview] = {}
     masks: dict[str, memoryview] = {}
     hashes: Hashes = {}
     try:
-        for file, piece, digest in zip(found.head["files"], found.files, found.digests, strict=True):
+        for file, piece, digest in zip(record.head["files"], record.files, record.digests, strict=True):
             kind, camera = FileKind(file["kind"]), file["camera"]
             (images if kind == FileKind.IMAGE else masks)[camera] = piece
             hashes.setdefault(camera, {})[kind] = digest.hex()
-        return StoredPictures(found.index, found.head["time"], bool(found.head["part"]), images, masks, hashes)
+        return StoredPictures(record.index, record.head["time"], bool(record.head["part"]), images, masks, hashes)
     except (KeyError, TypeError, ValueError) as error:
         raise FrameDamage(f"{name}: its head is not one of pictures ({error!r})") from None
 

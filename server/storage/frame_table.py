@@ -92,8 +92,8 @@ class FrameTable:
 
     def flagged(self, flag: int) -> NDArray[np.bool_]:
         """[N] true for frames with the flag; a copy."""
-        found: NDArray[np.bool_] = (np.frombuffer(bytes(self._flags), np.uint8) & flag) != 0
-        return found
+        flags: NDArray[np.bool_] = (np.frombuffer(bytes(self._flags), np.uint8) & flag) != 0
+        return flags
 
     def copy(self) -> FrameTable:
         """Copies the table without records of commits, for a thread to read."""
@@ -193,10 +193,10 @@ class FrameTable:
         """Commits all queued and updating frames up to `last`: many at once, after a start."""
         states = np.frombuffer(self._states, np.uint8)
         for state in (FrameState.QUEUED, FrameState.UPDATING):
-            found = np.flatnonzero(states[: last + 1] == CODES[state])
-            states[found] = CODES[FrameState.COMMITTED]
-            self.counts[state] -= len(found)
-            self.counts[FrameState.COMMITTED] += len(found)
+            rows = np.flatnonzero(states[: last + 1] == CODES[state])
+            states[rows] = CODES[FrameState.COMMITTED]
+            self.counts[state] -= len(rows)
+            self.counts[FrameState.COMMITTED] += len(rows)
         del states  # the column cannot grow while it is looked at
         self._list_all()
 

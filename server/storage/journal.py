@@ -74,19 +74,21 @@ def replay(path: Path, take: Callable[[JournalEvent], object]) -> JournalReading
         return JournalReading(0, damage)
     with opened as file:
         good = os.fstat(file.fileno()).st_size
-        for found in streamed(file):
-            if isinstance(found, Damage):
-                if found.torn:
-                    good = found.start
-                broken |= not found.torn
-                damage.append(f"{path.name}: bytes {found.start} to {found.end} dropped: {found.reason}")
+        for record in streamed(file):
+            if isinstance(record, Damage):
+                if record.torn:
+                    good = record.start
+                broken |= not record.torn
+                damage.append(f"{path.name}: bytes {record.start} to {record.end} dropped: {record.reason}")
                 continue
             try:
-                event = parse_event(found.text)
+                event = parse_event(record.text)
             except ValidationError as error:
                 fault = why_no_event(error)
                 broken = True
-                damage.append(f"{path.name}: a record of kind {found.kind}, frame {found.frame}, is no event: {fault}")
+                damage.append(
+                    f"{path.name}: a record of kind {record.kind}, frame {record.frame}, is no event: {fault}"
+                )
                 continue
             begun = isinstance(event, SceneCreated) if begun is None else begun
             take(event)
@@ -140,11 +142,11 @@ def checked_journal(path: Path, good: int) -> Iterator[int]:
     """
     read = since = 0
     with path.open("rb") as file:
-        for found in streamed(_Beginning(file, good)):
-            if isinstance(found, Damage):
-                raise ValueError(f"bytes {found.start} to {found.end}: {found.reason}")
-            read += found.size
-            since += found.size
+        for record in streamed(_Beginning(file, good)):
+            if isinstance(record, Damage):
+                raise ValueError(f"bytes {record.start} to {record.end}: {record.reason}")
+            read += record.size
+            since += record.size
             if since >= PIECE:
                 yield since
                 since = 0

@@ -227,13 +227,13 @@ class Ledger:
 
     def waiting(self) -> list[int]:
         """Lists queued frames that the worker does not have, rising."""
-        found: list[int] = []  # scans backwards: queued frames are always the newest
+        indices: list[int] = []  # scans backwards: queued frames are always the newest
         for index in range(self.next_frame - 1, -1, -1):
-            if len(found) == self.counts[FrameState.QUEUED]:
+            if len(indices) == self.counts[FrameState.QUEUED]:
                 break
             if self.frames[index].state == FrameState.QUEUED:
-                found.append(index)
-        return found[::-1]
+                indices.append(index)
+        return indices[::-1]
 
     def hopeless(self) -> list[FrameSetAside]:
         """Returns events, not applied, that set aside the frames waiting behind a failed first one."""

@@ -166,8 +166,8 @@ def records(data: bytes | memoryview) -> Iterator[Record | Damage]:
     view = memoryview(data)
     at = 0
     while at < len(view):
-        found, at = read_at(view, at)
-        yield found
+        record, at = read_at(view, at)
+        yield record
 
 
 PIECE = 1 << 22
@@ -226,8 +226,8 @@ def _damage(data: bytes, at: int) -> tuple[Damage | None, int]:
     """Returns why no such record begins at a byte, and where to go on; None at the end of the data."""
     if at == len(data):
         return None, at
-    found, after = read_at(memoryview(data), at)
-    return found if isinstance(found, Damage) else Damage(at, after, "of a version that has no place here"), after
+    record, after = read_at(memoryview(data), at)
+    return record if isinstance(record, Damage) else Damage(at, after, "of a version that has no place here"), after
 
 
 def _skip(data: memoryview, at: int, reason: str) -> tuple[Damage, int]:

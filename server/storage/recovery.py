@@ -112,8 +112,8 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
         events.extend(_found_states(states, ledger))
     if damage:
         events.extend(_found(frames, sorted(_unnamed(ledger, sizes)), ledger, states, broken))
-    if found := sorted({event.index for event in events if isinstance(event, FrameAccepted | PartAccepted)}):
-        listed = ", ".join(map(str, found))
+    if recovered_frames := sorted({event.index for event in events if isinstance(event, FrameAccepted | PartAccepted)}):
+        listed = ", ".join(map(str, recovered_frames))
         damage.append(f"the journal does not name the records of frames {listed} any more; used as they were found")
     damage += in_states
     debris = _unnamed(ledger, sizes)
@@ -223,15 +223,15 @@ def _events_of(folder: Path, index: int, names: list[str], ledger: Ledger, state
     for name in names:
         with contextlib.suppress(FrameDamage):
             pictures[name] = read_pictures(folder, name)
-    whole = [name for name, found in pictures.items() if not found.part]
-    parts = {name: found for name, found in pictures.items() if found.part}
+    whole = [name for name, events in pictures.items() if not events.part]
+    parts = {name: events for name, events in pictures.items() if events.part}
     if len(names) == len(whole) == 1:
         accepted = _whole(index, whole[0], pictures[whole[0]], ledger)
     elif index < ledger.next_frame:
         accepted = _closed(index, parts, states.times.get(index))
     else:
-        found = [_part(index, name, pictures) for name, pictures in parts.items()]
-        return [event for event in found if event is not None]
+        events = [_part(index, name, pictures) for name, pictures in parts.items()]
+        return [event for event in events if event is not None]
     if accepted is None:
         return []
     known = index in states.times or index in states.damaged

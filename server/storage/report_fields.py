@@ -16,9 +16,9 @@ NOT_SENT = frozenset({"index", "time", "publish_seconds", "resumed"})
 def committed_fields(record: Mapping[str, Any]) -> dict[str, Any]:
     """Fields of the report on the wire from the record of a commit (`scas4d_core.frame_report.FrameReport.record`)."""
     sent = {WIRE_NAMES.get(name, name): value for name, value in record.items() if name not in NOT_SENT}
-    found = {name: sent[name] for name in FrameReportModel.model_fields if sent.get(name) is not None}
-    seconds = {name: float(value) for name, value in found.get("seconds", {}).items()}
+    fields = {name: sent[name] for name in FrameReportModel.model_fields if sent.get(name) is not None}
+    seconds = {name: float(value) for name, value in fields.get("seconds", {}).items()}
     if "report" in seconds:  # the report before this one was published after its commit
         seconds["report"] += record.get("publish_seconds") or 0.0
     seconds.setdefault("total", sum(seconds.values()))
-    return {**found, "seconds": seconds, "loss": [value for value in found.get("loss", []) if value is not None]}
+    return {**fields, "seconds": seconds, "loss": [value for value in fields.get("loss", []) if value is not None]}

@@ -37,8 +37,8 @@ def cluster(
     opened = open_source(capture)
     study = Study(work.resolve(), opened, encoded_frames(opened, frames), parse_changes(changes), {})
     with Nodes(count=3, cpus=3) as nodes:
-        found = measure(study, nodes.address, scenes=scenes, turns=turns, views=views, echo=typer.echo)
-    text = told(found, scenes)
+        figures = measure(study, nodes.address, scenes=scenes, turns=turns, views=views, echo=typer.echo)
+    text = told(figures, scenes)
     typer.echo(text)
     write_page(out, text)
 

@@ -45,7 +45,7 @@ def measure(
     Args:
         study: its frames are sent to each scene. address: of the cluster.
     """
-    found = {name: CostFigures() for name in PLACEMENTS}
+    figures = {name: CostFigures() for name in PLACEMENTS}
     services = {
         "local": study.service("local", {"SCAS4D_MAX_SCENES": str(scenes + 1)}),
         "ray": study.service("ray", {"SCAS4D_MAX_SCENES": str(scenes + 1), "SCAS4D_PLACEMENT": f"ray={address}"}),
@@ -56,20 +56,20 @@ def measure(
         for turn in range(turns):
             lone = {name: _begun(study, service) for name, service in services.items()}
             for name in (PLACEMENTS, PLACEMENTS[::-1])[turn % 2]:
-                found[name].views += _views(services[name], lone[name], study.capture.full_rig.names[0], views)
+                figures[name].views += _views(services[name], lone[name], study.capture.full_rig.names[0], views)
             for name, seconds in _updates(study, services, lone).items():
-                found[name].updates += seconds
+                figures[name].updates += seconds
             for name, scene in lone.items():
                 services[name].http.delete(f"/v1/scenes/{scene}")
             echo(f"turn {turn + 1} of {turns}: one scene")
         for turn in range(turns):
             for name in (PLACEMENTS, PLACEMENTS[::-1])[turn % 2]:
-                found[name].throughput.append(_together(study, services[name], scenes))
+                figures[name].throughput.append(_together(study, services[name], scenes))
             echo(f"turn {turn + 1} of {turns}: {scenes} scenes")
     finally:
         for service in services.values():
             service.stop()
-    return found
+    return figures
 
 
 def told(found: dict[str, CostFigures], scenes: int) -> str:
@@ -116,16 +116,16 @@ def _views(service: Service, scene: str, camera: str, count: int) -> list[float]
 
 def _updates(study: Study, services: Mapping[str, Service], scenes: Mapping[str, str]) -> dict[str, list[float]]:
     """Seconds of each update of one scene a service, which take turns with every frame: they wait for each other."""
-    found: dict[str, list[float]] = {name: [] for name in scenes}
+    seconds: dict[str, list[float]] = {name: [] for name in scenes}
     for index in range(1, len(study.frames)):
         for name in (PLACEMENTS, PLACEMENTS[::-1])[index % 2]:
             service, scene = services[name], scenes[name]
             FrameSender(study, service, scene).send(index)
             began = time.monotonic()
             service.finish(scene, index + 1, EVERY_S)
-            found[name].append(time.monotonic() - began)
+            seconds[name].append(time.monotonic() - began)
             _check(service, [scene], index + 1)
-    return found
+    return seconds
 
 
 def _together(study: Study, service: Service, scenes: int) -> float:

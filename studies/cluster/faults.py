@@ -59,9 +59,9 @@ def killed_nodes(
         faults = _faults_of_kills(service, scene, sender, expected, pauses)
         lost = len(study.frames) - len(sender.receipts)
         longest = max(pauses, default=0.0)
-        found = f"{lost} acknowledged frames lost, {len(expected)} states compared, on after at most {longest:.1f} s"
+        summary = f"{lost} acknowledged frames lost, {len(expected)} states compared, on after at most {longest:.1f} s"
         target = f"0 acknowledged frames lost, final state bit-identical, no frame to blame, on within {GOES_ON_S:g} s"
-        return ScenarioResult(f"a node killed at {count} random moments", target, found, faults)
+        return ScenarioResult(f"a node killed at {count} random moments", target, summary, faults)
 
 
 def stopped_node(
@@ -97,9 +97,9 @@ def stopped_node(
             time.sleep(AGAIN_S)
         if still := sorted(epochs(states))[:-1]:
             faults.append(f"the folders of epochs {still} are still there")
-        found = f"on after {pause:.1f} s; then the old worker wrote {len(written)} files, which nothing read; removed"
+        summary = f"on after {pause:.1f} s; then the old worker wrote {len(written)} files, which nothing read; removed"
         target = "nothing it wrote is read; found and removed; final state bit-identical"
-        return ScenarioResult("a node stopped, and continued after its scene has moved", target, found, faults)
+        return ScenarioResult("a node stopped, and continued after its scene has moved", target, summary, faults)
 
 
 def full_nodes(study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo) -> ScenarioResult:
@@ -128,9 +128,11 @@ def full_nodes(study: Study, nodes: Nodes, expected: Mapping[int, str], update_s
         faults += _faults_of_kills(service, scene, sender, expected, [pause])
         if status.degraded:
             faults.append(f"the scene is degraded still: {status.error}")
-        found = f"{len(left)} frames acknowledged while it waited and said why; the next committed {pause:.1f} s after"
+        summary = (
+            f"{len(left)} frames acknowledged while it waited and said why; the next committed {pause:.1f} s after"
+        )
         target = "frames are acknowledged, the scene says why it waits, goes on once there is room; bit-identical"
-        return ScenarioResult("a node killed while other scenes fill the rest", target, found, faults)
+        return ScenarioResult("a node killed while other scenes fill the rest", target, summary, faults)
 
 
 def restarted_head(
@@ -157,12 +159,12 @@ def restarted_head(
         wait_until(lambda: service.status(scene).worker_deaths > deaths, "a lost node was not noticed")
         wait_until(lambda: service.worker_pid(scene) is not None, "the scene was not placed again")
         faults = sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
-        found = (
+        summary = (
             f"{without} frames committed meanwhile, {deaths} workers lost; then a node was killed, and its scene "
             f"placed on another; {len(expected)} states compared"
         )
         target = "0 acknowledged frames lost, final state bit-identical, scenes are placed again afterwards"
-        return ScenarioResult(f"the head killed, back after {HEAD_GONE_S:g} s (Redis)", target, found, faults)
+        return ScenarioResult(f"the head killed, back after {HEAD_GONE_S:g} s (Redis)", target, summary, faults)
 
 
 def _second_half(study: Study, service: Service, scene: str, sender: FrameSender) -> range:
@@ -186,11 +188,11 @@ def _node_of(service: Service, nodes: Nodes, scene: str) -> tuple[int, int]:
 
 def _changed(folder: Path) -> dict[str, int]:
     """Returns when each file of a folder was changed last, by name; nothing of one that goes meanwhile."""
-    found = {}
+    changes = {}
     for name in os.listdir(folder) if folder.is_dir() else ():
         with suppress(FileNotFoundError):
-            found[name] = (folder / name).stat().st_mtime_ns
-    return found
+            changes[name] = (folder / name).stat().st_mtime_ns
+    return changes
 
 
 def _fill(study: Study, service: Service) -> list[str]:

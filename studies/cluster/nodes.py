@@ -145,10 +145,10 @@ def _parent(pid: int) -> int:
 def _below(pid: int) -> list[int]:
     """Processes below one, parents first."""
     parents = {each: _parent(each) for each in _pids()}
-    found, level = [], [pid]
+    pids, level = [], [pid]
     while level := [each for each, parent in parents.items() if parent in level]:
-        found += level
-    return found
+        pids += level
+    return pids
 
 
 def _pids() -> Iterator[int]:

@@ -104,7 +104,7 @@ def silences(count: int, echo: Callable[[str], None]) -> list[float]:
     """Kills the head `count` times; seconds from each kill until an actor that was asked for then answers."""
     import ray
 
-    found = []
+    gaps = []
     with SupervisedCluster():
         wait_until(lambda: _joined(ray), NOT_STARTED, PATIENCE_S)
         made: Any = ray.remote(Answers)
@@ -116,12 +116,12 @@ def silences(count: int, echo: Callable[[str], None]) -> list[float]:
                 began = time.monotonic()
                 actor = made.options(num_cpus=0.1).remote()
                 ray.get(actor.is_there.remote(), timeout=PATIENCE_S)
-                found.append(time.monotonic() - began)
+                gaps.append(time.monotonic() - began)
                 ray.kill(actor)
-                echo(f"{number + 1} of {count}: {found[-1]:.2f} s")
+                echo(f"{number + 1} of {count}: {gaps[-1]:.2f} s")
         finally:
             ray.shutdown()
-    return found
+    return gaps
 
 
 def told(found: Sequence[float]) -> str:

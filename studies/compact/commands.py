@@ -30,8 +30,8 @@ def compact(
     from studies.compact.compact import measure, told
 
     changed = dict(one.split("=", 1) for one in bounds or ())
-    found = measure(capture, states, frames, {name: float(value) for name, value in changed.items()}, key_every)
-    text = told(found)
+    figures = measure(capture, states, frames, {name: float(value) for name, value in changed.items()}, key_every)
+    text = told(figures)
     print(text)
     write_page(page, text)
 

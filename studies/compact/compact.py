@@ -95,9 +95,9 @@ def measure(
         with file.open("rb") as opened:
             records = list(scan(opened, 0, file.name))
         kinds = {
-            kind.name.lower(): float(np.mean(found))
+            kind.name.lower(): float(np.mean(sizes))
             for kind in Kind
-            if (found := [record.size for record in records if record.kind is kind])
+            if (sizes := [record.size for record in records if record.kind is kind])
         }
         opening = _seconds(lambda: CompactReader(file).close())
         cut = file.with_suffix(".cut")
@@ -193,11 +193,11 @@ def _pictures(
         scores = []
         for state in (decoded[index], history.gaussians(index)):
             scene = _scene(world, {index: state}, limits)
-            found = [
+            psnrs = [
                 metrics.psnr(scene.render(camera, background=history.background).colour, truth.images[camera.name])
                 for camera in rig.cameras
             ]
-            scores.append(float(np.mean(found)))
+            scores.append(float(np.mean(psnrs)))
         losses.append(scores[0] - scores[1])
     return float(np.mean(losses)), float(min(losses))
 
@@ -208,8 +208,8 @@ def _tracks(world: WorldFrame, history: History, decoded: Mapping[int, Gaussians
     rows = np.random.default_rng(0).choice(rows, min(POINTS, len(rows)), replace=False)
     points = world.to_user(state.means[rows])
     exact = _scene(world, {index: history.gaussians(index) for index in indices})
-    found = _scene(world, decoded)
-    tracks = [one.tracks_of_points(points, indices[0], indices).positions for one in (exact, found)]
+    decoded_tracks = _scene(world, decoded)
+    tracks = [one.tracks_of_points(points, indices[0], indices).positions for one in (exact, decoded_tracks)]
     extent = moving_extent(state) / world.metres_per_unit
     return float(100 * np.nanmedian(np.linalg.norm(tracks[0] - tracks[1], axis=-1)) / extent)
 

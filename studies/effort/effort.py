@@ -187,8 +187,8 @@ class Turns:
 def _score(reconstruction: Any, capture: Capture, truth: Mapping[str, NDArray[np.float32]]) -> float:
     """dB, mean over the test cameras, of each ``SEEN_DB`` at most."""
     cameras = capture.test_rig.cameras if capture.test_rig is not None else ()
-    found = [image_psnr(reconstruction.render(c).colour, truth[c.name]) for c in cameras]
-    return float(np.mean(np.minimum(found, SEEN_DB)))
+    scores = [image_psnr(reconstruction.render(c).colour, truth[c.name]) for c in cameras]
+    return float(np.mean(np.minimum(scores, SEEN_DB)))
 
 
 def _each(report: Any) -> float:

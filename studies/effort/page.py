@@ -74,8 +74,8 @@ def _adaptive(rows: Sequence[Row]) -> list[str]:
     ]
     losses, times, repeats = [], [], []
     for row in rows:
-        found = {one["sequence"]: one for one in row["sequences"]}
-        plain, again, slow = found["as it is"], found["repeated"], found["slowed"]
+        by_sequence = {one["sequence"]: one for one in row["sequences"]}
+        plain, again, slow = by_sequence["as it is"], by_sequence["repeated"], by_sequence["slowed"]
         losses.append(_gain(plain))
         times.append(plain["time"])
         repeats.append(again["time_repeats"])

@@ -61,9 +61,9 @@ def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report
                     continue
                 cpu[tells].append(taken)
                 if tells:
-                    found = {**done.seconds, REPORT: done.seconds[REPORT] + _published(scenes[tells], index)}
-                    stages.append(found)
-                    shares.append(found[REPORT] / sum(found.values()))
+                    seconds = {**done.seconds, REPORT: done.seconds[REPORT] + _published(scenes[tells], index)}
+                    stages.append(seconds)
+                    shares.append(seconds[REPORT] / sum(seconds.values()))
     ratios = np.array(cpu[True]) / np.array(cpu[False])
     answer = {
         "updates": len(shares),

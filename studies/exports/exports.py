@@ -97,8 +97,8 @@ def measure(folder: Path, states: Path) -> list[ExportFigures]:
             coming = ((each, history.time(each), history.gaussians(each)) for each in chosen)
             (file,) = export_sequence(coming, name, out, world=world, parts=labels)
             metres = FORMATS[name].unit.startswith("metre")
-            found = read(file).gaussians(Y_UP if y_up else np.ones(3), world, metres)
-            views = _rendered(found, world, history, cameras)
+            cloud = read(file).gaussians(Y_UP if y_up else np.ones(3), world, metres)
+            views = _rendered(cloud, world, history, cameras)
             psnr = float(np.mean([metrics.psnr(b, a) for a, b in zip(exact, views, strict=True)]))
             left, right = (pictures.eight_bit(each[0]) for each in (exact, views))
             compared = pictures.comparison(left, right)
@@ -190,19 +190,19 @@ def _by_pygltflib(file: Path) -> Found:
         view = document.bufferViews[accessor.bufferView]
         width = WIDTHS[accessor.type]
         begin = (view.byteOffset or 0) + (accessor.byteOffset or 0)
-        found = np.frombuffer(blob, "<f4", accessor.count * width, begin).astype(np.float64)
-        return found.reshape(-1, width) if width > 1 else found
+        numbers = np.frombuffer(blob, "<f4", accessor.count * width, begin).astype(np.float64)
+        return numbers.reshape(-1, width) if width > 1 else numbers
 
     ends: dict[tuple[int, str], Float] = {}
     for animation in document.animations:
         for channel in animation.channels:
             ends[channel.target.node, channel.target.path] = values(animation.samplers[channel.sampler].output)[-1]
-    found = []
+    gaussians = []
     for number, node in enumerate(document.nodes):
         has = vars(document.meshes[node.mesh].primitives[0].attributes)
         turn = Rotation.from_quat(ends.get((number, "rotation"), np.array([0.0, 0, 0, 1])))
         shift = ends.get((number, "translation"), np.zeros(3))
-        found.append(
+        gaussians.append(
             (
                 turn.apply(values(has["POSITION"])) + shift,
                 (turn * Rotation.from_quat(values(has[f"{SPLAT}:ROTATION"]))).as_quat(),
@@ -211,7 +211,7 @@ def _by_pygltflib(file: Path) -> Found:
                 values(has[f"{SPLAT}:OPACITY"]),
             )
         )
-    return Found(*(np.ascontiguousarray(np.concatenate(arrays)) for arrays in zip(*found, strict=True)))
+    return Found(*(np.ascontiguousarray(np.concatenate(arrays)) for arrays in zip(*gaussians, strict=True)))
 
 
 def _by_pxr(file: Path) -> Found:

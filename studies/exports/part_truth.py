@@ -79,10 +79,10 @@ class AssetFigures:
         Args:
             moving: only the parts that move in the truth.
         """
-        found = [one for one in self.parts if one.covered and not (moving and one.static)]
-        if not found:
+        chosen = [one for one in self.parts if one.covered and not (moving and one.static)]
+        if not chosen:
             return float("nan"), float("nan")
-        degrees, percent = (np.concatenate([getattr(one, name) for one in found]) for name in ("degrees", "percent"))
+        degrees, percent = (np.concatenate([getattr(one, name) for one in chosen]) for name in ("degrees", "percent"))
         return float(np.nanmedian(degrees)), float(np.nanmedian(percent))
 
 
@@ -133,8 +133,8 @@ def read_asset(file: Path, seconds: Float) -> list[Node]:
         view = document.bufferViews[about.bufferView]
         width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[about.type]
         begin = (view.byteOffset or 0) + (about.byteOffset or 0)
-        found = np.frombuffer(blob, "<f4", about.count * width, begin).astype(np.float64)
-        return found.reshape(-1, width) if width > 1 else found
+        numbers = np.frombuffer(blob, "<f4", about.count * width, begin).astype(np.float64)
+        return numbers.reshape(-1, width) if width > 1 else numbers
 
     (animation,) = document.animations
     keyed: dict[int, dict[str, tuple[Float, Float]]] = {}

@@ -168,10 +168,10 @@ def _draw(
 
 def _deviations(points: Sequence[Point], captures: Sequence[str]) -> dict[str, float]:
     """dB, by method: standard deviation over seeds of a mean over captures, whose seeds are independent."""
-    found = {method: [spread(points, method, name) for name in captures] for method in METHODS}
+    deviations = {method: [spread(points, method, name) for name in captures] for method in METHODS}
     return {
         method: sum(one[0] ** 2 for one in each if one is not None) ** 0.5 / len(each)
-        for method, each in found.items()
+        for method, each in deviations.items()
         if None not in each
     }
 
@@ -190,10 +190,10 @@ def _text(
     images = {name.removesuffix(".png"): f"![{name.removesuffix('.png')}]({stem}/{name})" for name in pictures}
     compared = equal_seconds(points, captures)
     others = "\n\n".join(
-        f"**{words}**{_over(points, axis, captures)}\n\n" + score_table(found, base, counts=axis == "gaussians")
+        f"**{words}**{_over(points, axis, captures)}\n\n" + score_table(axis_means, base, counts=axis == "gaussians")
         for axis, words in AXIS_WORDS.items()
-        for found, base in [_axis_means(points, axis, captures)]
-        if found
+        for axis_means, base in [_axis_means(points, axis, captures)]
+        if axis_means
     )
     return f"""# Accuracy against time
 
@@ -315,10 +315,10 @@ def _spreads(points: Sequence[Point], captures: Sequence[str]) -> str:
     spreads = []
     for method in METHODS:
         by_capture = {name: spread(points, method, name) for name in captures}
-        found = {name: value for name, value in by_capture.items() if value is not None}
-        if found:
-            count = max(seeds for _, seeds in found.values())
-            words = ", ".join(f"{name} {deviation:.2f}" for name, (deviation, _) in found.items())
+        present = {name: value for name, value in by_capture.items() if value is not None}
+        if present:
+            count = max(seeds for _, seeds in present.values())
+            words = ", ".join(f"{name} {deviation:.2f}" for name, (deviation, _) in present.items())
             spreads.append(f"`{method}` {words} ({count} seeds)")
     return f"Standard deviation of PSNR over seeds of the updates, dB: {'; '.join(spreads)}." if spreads else ""
 

@@ -153,10 +153,10 @@ def _draw_about_default(
     _steps(axes, best)
     _curve(axes, points, method, best, deviation)
     default = next((point for point in points if point.variant == DEFAULT), None)
-    named = [(point, OTHER_AXES[axis][2]) for axis, found in others.items() for point in found]
-    for axis, found in others.items():
+    named = [(point, OTHER_AXES[axis][2]) for axis, rows in others.items() for point in rows]
+    for axis, rows in others.items():
         _, marker, colour = OTHER_AXES[axis]
-        _markers(axes, found, best, marker, colour, 20)
+        _markers(axes, rows, best, marker, colour, 20)
     if default is not None:
         named.insert(0, (default, COLOURS[method]))
     seconds, psnr = [point.seconds for point, _ in named], [point.psnr for point, _ in named]
@@ -190,9 +190,9 @@ def draw_captures(points: Sequence[Point], captures: Sequence[str], file: Path) 
     for capture, axes in zip(captures, grid.flat, strict=False):
         here = [point for point in points if point.capture == capture]
         for method in METHODS:
-            found = spread(here, method, capture)
-            known |= found is not None
-            _curve(axes, here, method, here, None if found is None else found[0], size=12)
+            deviation = spread(here, method, capture)
+            known |= deviation is not None
+            _curve(axes, here, method, here, None if deviation is None else deviation[0], size=12)
         axes.set_title(capture, loc="left")
         _whole_decibels(axes)
         _log_seconds(axes, label=False)

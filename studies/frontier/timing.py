@@ -146,8 +146,8 @@ def time_of(times: Row | None, variant: Variant) -> Row | None:
     today = variant.record
     for entry in times["settings"] if times else ():
         if _unseeded(entry["settings"]) == _unseeded(today):
-            found: Row = entry
-            return found
+            timing: Row = entry
+            return timing
     return None
 
 

@@ -88,9 +88,9 @@ def mean_points(points: Iterable[Point], captures: Sequence[str]) -> list[Point]
     for point in points:
         by_variant.setdefault(point.variant, {})[point.capture] = point
     means = []
-    for variant, found in by_variant.items():
-        if all(capture in found for capture in captures):
-            means.append(_mean(variant, [found[capture] for capture in captures]))
+    for variant, rows in by_variant.items():
+        if all(capture in rows for capture in captures):
+            means.append(_mean(variant, [rows[capture] for capture in captures]))
     return means
 
 
@@ -101,8 +101,8 @@ def of_axis(points: Iterable[Point], axis: str, capture: str | None = None) -> l
 
 def curve(points: Iterable[Point], method: str, capture: str | None = None) -> list[Point]:
     """A method by its number of iterations, ascending."""
-    found = [p for p in of_axis(points, "iterations", capture) if p.variant.preset == method]
-    return sorted(found, key=lambda point: point.variant.iterations)
+    points_of_method = [p for p in of_axis(points, "iterations", capture) if p.variant.preset == method]
+    return sorted(points_of_method, key=lambda point: point.variant.iterations)
 
 
 def undominated(points: Sequence[Point]) -> list[Point]:
@@ -150,7 +150,7 @@ class EqualSeconds:
 def equal_seconds(points: Sequence[Point], captures: Sequence[str]) -> list[EqualSeconds]:
     """Compares the methods at equal seconds, at every budget of ``BUDGETS`` that was measured."""
     own, other = METHODS
-    found = []
+    pairs = []
     for capture in captures:
         own_curve = curve(points, own, capture)
         others = curve(points, other, capture)
@@ -158,8 +158,8 @@ def equal_seconds(points: Sequence[Point], captures: Sequence[str]) -> list[Equa
             if base.variant.iterations in BUDGETS:
                 psnr = psnr_at(own_curve, base.seconds)
                 best = max(each.psnr for each in others if each.seconds <= base.seconds)
-                found.append(EqualSeconds(capture, base.variant.iterations, base.seconds, psnr, best))
-    return found
+                pairs.append(EqualSeconds(capture, base.variant.iterations, base.seconds, psnr, best))
+    return pairs
 
 
 def spread(points: Iterable[Point], method: str, capture: str, score: str = "psnr") -> tuple[float, int] | None:

@@ -98,6 +98,6 @@ def unexpected_counts(
     """A line where the CPU's guards acted otherwise than expected; None: anything goes."""
     if expected is None:
         return []
-    found = {name: count for name, count in outcome.guards.items() if count and name not in silent}
+    counts = {name: count for name, count in outcome.guards.items() if count and name not in silent}
     wanted = {name: count for name, count in expected.items() if count}
-    return [] if found == wanted else [f"guards acted {found}, expected {wanted}"]
+    return [] if counts == wanted else [f"guards acted {counts}, expected {wanted}"]

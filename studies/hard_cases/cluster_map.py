@@ -58,13 +58,13 @@ def _alive(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[st
     """The factor and its gradient are not 0 before the clamp: a cluster that shrank can grow again."""
     exponent = float(problem.clusters[-1][0, S])
     rows = problem.labels[-1] == 0
-    found = []
+    faults = []
     for backend, outcome in outcomes.items():
         if -40 <= exponent < 0 and not np.abs(outcome.values["factors"][rows]).max() > 0:
-            found.append(f"{backend}: the factors are 0")
+            faults.append(f"{backend}: the factors are 0")
         if -40 <= exponent < 0 and not abs(outcome.gradients["layer 1"][0, S]) > 0:
-            found.append(f"{backend}: the gradient of s is 0")
-    return found
+            faults.append(f"{backend}: the gradient of s is 0")
+    return faults
 
 
 def _fold(strength: float) -> Deforming:

@@ -109,10 +109,10 @@ def _frame_studies(
             from studies.hard_frames import study as frames_study
             from studies.hard_frames.cost import cost, in_words
 
-            found = frames_study.study(footage, store / "frames", cases, typer.echo)
-            typer.echo(frames_study.table(found))
+            results = frames_study.study(footage, store / "frames", cases, typer.echo)
+            typer.echo(frames_study.table(results))
             typer.echo(in_words(footage, cost(footage)))
-            failed += [line.case.name for line in found if line.violations]
+            failed += [line.case.name for line in results if line.violations]
     _end(failed)
 
 

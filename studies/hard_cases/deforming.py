@@ -142,9 +142,9 @@ class Deforming:
             )
             terms = terms * (len(sound) / len(self.means))  # means over all pairs, those held back included
             loss = loss + (terms * tensor(np.array(STRENGTHS))).sum()
-        found = torch.autograd.grad(loss, [*leaves, own], allow_unused=True)
-        gradients = {f"layer {k}": g for k, g in enumerate(found[:-1])}
-        gradients["own"] = found[-1]
+        gradient_list = torch.autograd.grad(loss, [*leaves, own], allow_unused=True)
+        gradients = {f"layer {k}": g for k, g in enumerate(gradient_list[:-1])}
+        gradients["own"] = gradient_list[-1]
         values = {"means": self.means.copy(), "factors": self.factors.copy(), "turns": no_turn(len(self.means))}
         for name in values:
             values[name] = values[name].astype(np.float64 if backend == REFERENCE else np.float32)
@@ -154,43 +154,43 @@ class Deforming:
 
     def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
         """See ``Problem``: finite, bounded, unit turns, bad rows held and apart, in agreement."""
-        found = []
+        faults = []
         for backend, outcome in outcomes.items():
             sound = ~self.bad if self.bad.size else np.ones(len(self.means), bool)
             rows = {name: v[sound] for name, v in outcome.values.items() if name != "terms"}
-            found += not_finite(BackendResult(rows, outcome.gradients), backend) + beyond(outcome, backend, self.bound)
+            faults += not_finite(BackendResult(rows, outcome.gradients), backend) + beyond(outcome, backend, self.bound)
             norms = np.linalg.norm(rows["turns"], axis=1)
             if norms.size and np.abs(norms - 1).max() > 1e-4:
-                found.append(f"{backend}: a turn has length {norms[np.abs(norms - 1).argmax()]:.4g}")
+                faults.append(f"{backend}: a turn has length {norms[np.abs(norms - 1).argmax()]:.4g}")
             if self.bad.any():
                 held = all(np.array_equal(outcome.values[n][self.bad], getattr(self, n)[self.bad], equal_nan=True)
                            for n in ("means", "factors"))  # fmt: skip
-                found += [] if held else [f"{backend}: a row that is not finite was not left as it is"]
+                faults += [] if held else [f"{backend}: a row that is not finite was not left as it is"]
         if CPU in outcomes:
-            found += unexpected_counts(outcomes[CPU], self.guards)
+            faults += unexpected_counts(outcomes[CPU], self.guards)
         for backend in set(outcomes) - {REFERENCE}:
-            found += self._disagreement(outcomes[backend], outcomes[REFERENCE], backend, sound)
-        return found
+            faults += self._disagreement(outcomes[backend], outcomes[REFERENCE], backend, sound)
+        return faults
 
     def _disagreement(
         self, outcome: BackendResult, truth: BackendResult, backend: str, sound: NDArray[np.bool_]
     ) -> list[str]:
-        found = []
+        faults = []
         if self.value is not None and sound.any():
             off = np.abs(outcome.values["means"][sound] - truth.values["means"][sound]).max()
-            found += [] if off <= self.value else [f"{backend}: means are {off:.2g} m off"]
+            faults += [] if off <= self.value else [f"{backend}: means are {off:.2g} m off"]
             distance = apart(outcome.values["factors"][sound], truth.values["factors"][sound])
-            found += [] if distance <= 100 * self.value else [f"{backend}: factors are {distance:.2g} off"]
+            faults += [] if distance <= 100 * self.value else [f"{backend}: factors are {distance:.2g} off"]
         if self.turn is not None and sound.any():
             # q and −q are one rotation.
             dots = (outcome.values["turns"] * truth.values["turns"]).sum(axis=1)[sound]
             angle = 2 * np.arccos(np.clip(np.abs(dots.astype(np.float64)), 0, 1)).max()
-            found += [] if angle <= max(self.turn, 2e-3) else [f"{backend}: a turn is {angle:.2g} rad off"]
+            faults += [] if angle <= max(self.turn, 2e-3) else [f"{backend}: a turn is {angle:.2g} rad off"]
         if self.gradient is not None:
             for name, expected in truth.gradients.items():
                 distance = apart(outcome.gradients[name], expected, least=1e-9)
-                found += [] if distance <= self.gradient else [f"{backend}: gradient of {name} is {distance:.2g} off"]
-        return found
+                faults += [] if distance <= self.gradient else [f"{backend}: gradient of {name} is {distance:.2g} off"]
+        return faults
 
 
 def no_turn(count: int) -> Array:

@@ -129,12 +129,12 @@ def _opaque(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> list[s
     places, _ = problem.camera.project(problem.means[rows])
     columns, lines = np.floor(places).astype(int).T
     inside = (columns >= 0) & (columns < problem.camera.width) & (lines >= 0) & (lines < problem.camera.height)
-    found = []
+    faults = []
     for backend, outcome in outcomes.items():
         least = outcome.values["alpha"][lines[inside], columns[inside]].min()
         if least < 0.75:
-            found.append(f"{backend}: alpha is {least:.2g} in the middle of an opaque Gaussian")
-    return found
+            faults.append(f"{backend}: alpha is {least:.2g} in the middle of an opaque Gaussian")
+    return faults
 
 
 def _on_a_pixel(seed: int) -> Culled:

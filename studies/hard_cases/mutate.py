@@ -99,11 +99,11 @@ def take_away(guard: Guard, core: Path) -> None:
         edits = PATCHES[guard.name]
     else:
         text = (core / "guards.py").read_text()
-        found = re.findall(rf'^    "{guard.name}", [^,]+, ([^,]+),$', text, re.MULTILINE)
+        values = re.findall(rf'^    "{guard.name}", [^,]+, ([^,]+),$', text, re.MULTILINE)
         old = re.findall(rf'^    "{guard.name}", [^,]+, [^,]+,$', text, re.MULTILINE)
         if len(old) != 1:
             raise MutationError(f"guard {guard.name!r} has {len(old)} rows in guards.py; one is needed")
-        edits = (("guards.py", old[0], f'    "{guard.name}", {found[0]}, {found[0]},'),)
+        edits = (("guards.py", old[0], f'    "{guard.name}", {values[0]}, {values[0]},'),)
     for name, old_text, new_text in edits:
         path = core / name
         text = path.read_text()
@@ -140,8 +140,8 @@ def failing_without(guard: Guard | None, sections: list[str]) -> list[str]:
             if done.returncode < 0 and guard is not None:
                 return ["(the run dies)"]
             raise MutationError(f"the run without {guard.name if guard else CONTROL} failed: {done.stderr[-2000:]}")
-        found: list[str] = json.loads(done.stdout.strip().splitlines()[-1])
-        return found
+        failing: list[str] = json.loads(done.stdout.strip().splitlines()[-1])
+        return failing
 
 
 LOOKED_AT = (
@@ -157,18 +157,18 @@ LOOKED_AT = (
 
 def sources() -> str:
     """Digest of the files that decide what the mutations find."""
-    found = hashlib.sha256()
+    hasher = hashlib.sha256()
     for path in sorted({path for pattern in LOOKED_AT for path in CORE.parent.glob(pattern)}):
-        found.update(str(path.relative_to(CORE.parent)).encode() + path.read_bytes())
-    return found.hexdigest()[:16]
+        hasher.update(str(path.relative_to(CORE.parent)).encode() + path.read_bytes())
+    return hasher.hexdigest()[:16]
 
 
 def known(store: Path) -> dict[str, list[str]] | None:
     """Results of ``study`` for these sources; None where it has not been run to its end."""
     file = store / f"mutations-{sources()}.json"
     results: dict[str, list[str]] = json.loads(file.read_text()) if file.exists() else {}
-    found = {guard.name: results[guard.name] for guard in mutants() if guard.name in results}
-    return found if len(found) == len(list(mutants())) else None
+    stored = {guard.name: results[guard.name] for guard in mutants() if guard.name in results}
+    return stored if len(stored) == len(list(mutants())) else None
 
 
 def study(store: Path, echo: Callable[[str], None] = print) -> dict[str, list[str]]:

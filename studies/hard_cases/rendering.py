@@ -79,9 +79,9 @@ class Rendering:
         g_image, g_alpha = rasterizer.gradient_buffers()
         height, width = self.camera.height, self.camera.width
         g_image[:, :height, :width], g_alpha[:height, :width] = self.weights()
-        found = rasterizer.backward(g_image, g_alpha)
+        buffers = rasterizer.backward(g_image, g_alpha)
         names = ("means", "factors", "opacities", "features")
-        gradients = {name: getattr(found, name).copy() for name in names}
+        gradients = {name: getattr(buffers, name).copy() for name in names}
         return BackendResult(values, gradients, dict(rasterizer.guards))
 
     def _twin(self) -> BackendResult:
@@ -118,19 +118,19 @@ class Rendering:
 
     def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
         """See ``Problem``: finite, bounded, within the hull of the colours, bad rows apart, in agreement."""
-        found = []
+        faults = []
         for backend, outcome in outcomes.items():
-            found += not_finite(outcome, backend) + beyond(outcome, backend, self.bound * self.weight)
-            found += self._outside(outcome, backend) + self._touched(outcome, backend)
+            faults += not_finite(outcome, backend) + beyond(outcome, backend, self.bound * self.weight)
+            faults += self._outside(outcome, backend) + self._touched(outcome, backend)
         if CPU in outcomes:
-            found += unexpected_counts(outcomes[CPU], self.guards)
+            faults += unexpected_counts(outcomes[CPU], self.guards)
             if self.bad.any():
-                found += self._spoilt(outcomes[CPU])
+                faults += self._spoilt(outcomes[CPU])
         if REFERENCE in outcomes:
             truth = outcomes[REFERENCE]
             for backend in set(outcomes) - {REFERENCE}:
-                found += self._disagreement(outcomes[backend], truth, backend)
-        return found
+                faults += self._disagreement(outcomes[backend], truth, backend)
+        return faults
 
     def _range(self) -> tuple[float, float]:
         drawn = self.features[~self.bad] if self.bad.size else self.features
@@ -141,14 +141,16 @@ class Rendering:
         low, high = self._range()
         slack = 1e-4 * max(high - low, 1e-3)
         picture, alpha = outcome.values["features"], outcome.values["alpha"]
-        found = []
+        faults = []
         if picture.min() < low - slack or picture.max() > high + slack:
-            found.append(f"{backend}: picture in {picture.min():.4g}…{picture.max():.4g}, colours {low:.4g}…{high:.4g}")
+            faults.append(
+                f"{backend}: picture in {picture.min():.4g}…{picture.max():.4g}, colours {low:.4g}…{high:.4g}"
+            )
         if alpha.min() < -1e-5 or alpha.max() > 1 + 1e-5:
-            found.append(f"{backend}: alpha in {alpha.min():.4g}…{alpha.max():.4g}")
+            faults.append(f"{backend}: alpha in {alpha.min():.4g}…{alpha.max():.4g}")
         if alpha.size and 1 - alpha.max() < LEAST_LIGHT:
-            found.append(f"{backend}: {1 - alpha.max():.2g} of the light is left, less than {LEAST_LIGHT:g}")
-        return found
+            faults.append(f"{backend}: {1 - alpha.max():.2g} of the light is left, less than {LEAST_LIGHT:g}")
+        return faults
 
     def _touched(self, outcome: BackendResult, backend: str) -> list[str]:
         if not self.bad.any() or (backend == REFERENCE and self.value is None):
@@ -167,19 +169,19 @@ class Rendering:
         return [] if same else ["cpu: the others' picture or gradients are not what they are without the bad rows"]
 
     def _disagreement(self, outcome: BackendResult, truth: BackendResult, backend: str) -> list[str]:
-        found = []
+        faults = []
         if self.value is not None:
             low, high = self._range()
             off = np.abs(outcome.values["features"] - truth.values["features"]).max(axis=0) / max(high - low, 1e-3)
             share = float(np.mean(~(off <= self.value)))
             if share > KINK_SHARE and np.count_nonzero(off > self.value) > 1:
-                found.append(f"{backend}: {100 * share:.2g} % of the pixels are up to {off.max():.2g} off")
+                faults.append(f"{backend}: {100 * share:.2g} % of the pixels are up to {off.max():.2g} off")
         if self.gradient is not None:
             for name, expected in truth.gradients.items():
                 distance = apart(outcome.gradients[name], expected, least=1e-9 * self.weight)
                 if not distance <= self.gradient:
-                    found.append(f"{backend}: gradient of {name} is {distance:.2g} off")
-        return found
+                    faults.append(f"{backend}: gradient of {name} is {distance:.2g} off")
+        return faults
 
 
 BACKGROUND = np.array([0.1, 0.2, 0.3, 0.0], np.float32)

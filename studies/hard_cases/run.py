@@ -68,7 +68,7 @@ def run_case(case: HardCase, size: Any, on: Iterable[str]) -> CaseResult:
     try:
         with np.errstate(all="ignore"):
             problem = case.make(size)
-            outcomes = {name: found for name in on if (found := problem.run(name)) is not None}
+            outcomes = {name: outcome for name in on if (outcome := problem.run(name)) is not None}
             line.backends = list(outcomes)
             line.violations = problem.violations(outcomes) + case.holds(problem, outcomes)
         if CPU in outcomes:
@@ -114,11 +114,11 @@ def catalogue_table(lines: Sequence[CaseResult]) -> str:
             "|" + "---|" * 4,
         ]
         for case in cases:
-            found = by_case.get(case.name, [])
-            if not found:
+            results = by_case.get(case.name, [])
+            if not results:
                 continue
-            failed = [line.size for line in found if line.violations]
-            sizes = ", ".join(line.size for line in found) + (f"; **fails**: {', '.join(failed)}" if failed else "")
+            failed = [line.size for line in results if line.violations]
+            sizes = ", ".join(line.size for line in results) + (f"; **fails**: {', '.join(failed)}" if failed else "")
             text.append(f"| {case.name} | {case.what} | {case.source} | {sizes} |")
         text.append("")
     return "\n".join(text)

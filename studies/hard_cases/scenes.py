@@ -73,15 +73,15 @@ class HardScene:
     def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
         """See ``Problem``: finite, unit turns, what stands stands, nothing flies off, the pictures are met."""
         values = outcomes[CPU].values
-        found = [f"{name} is not finite" for name, array in values.items() if not np.isfinite(array).all()]
+        faults = [f"{name} is not finite" for name, array in values.items() if not np.isfinite(array).all()]
         lengths = np.linalg.norm(values["rotations"], axis=1)
-        found += [] if np.abs(lengths - 1).max() < 1e-4 else [f"a rotation has length {lengths.max():.4g}"]
-        found += [] if values["standing"].max() == 0 else ["what stands has moved"]
+        faults += [] if np.abs(lengths - 1).max() < 1e-4 else [f"a rotation has length {lengths.max():.4g}"]
+        faults += [] if values["standing"].max() == 0 else ["what stands has moved"]
         far = float(values["error"].max())
-        found += [] if far < 1 else [f"a Gaussian is {far:.2g} extents off"]
+        faults += [] if far < 1 else [f"a Gaussian is {far:.2g} extents off"]
         psnr = float(values["psnr"][0])
-        found += [] if psnr >= self.least else [f"{psnr:.1f} dB, less than {self.least:.1f}"]
-        return found
+        faults += [] if psnr >= self.least else [f"{psnr:.1f} dB, less than {self.least:.1f}"]
+        return faults
 
 
 def _in_users_world(camera: Camera, user: WorldFrame) -> Camera:

@@ -54,17 +54,17 @@ class HardStep:
 
     def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
         """See ``Problem``."""
-        found = []
+        faults = []
         for backend, outcome in outcomes.items():
-            found += not_finite(outcome, backend) + beyond(outcome, backend, self.bound)
-        found += unexpected_counts(outcomes[CPU], self.guards) + self.more(outcomes)
+            faults += not_finite(outcome, backend) + beyond(outcome, backend, self.bound)
+        faults += unexpected_counts(outcomes[CPU], self.guards) + self.more(outcomes)
         if REFERENCE in outcomes and self.agreement is not None:
             truth = {**outcomes[REFERENCE].values, **outcomes[REFERENCE].gradients}
             mine = {**outcomes[CPU].values, **outcomes[CPU].gradients}
             for name in set(truth) & set(mine):
                 distance = apart(mine[name], truth[name], least=1e-9)
-                found += [] if distance <= self.agreement else [f"{name} is {distance:.2g} off"]
-        return found
+                faults += [] if distance <= self.agreement else [f"{name} is {distance:.2g} off"]
+        return faults
 
 
 STEPS = 20
@@ -259,16 +259,16 @@ def _clustering(points: Callable[[np.random.Generator], NDArray[Any]], wished: t
 
     def on_cpu() -> BackendResult:
         means = points(np.random.default_rng(14)).astype(np.float32)
-        found = build_hierarchy(means, np.ones(len(means), bool), wished, 8)
+        hierarchy = build_hierarchy(means, np.ones(len(means), bool), wished, 8)
         again = build_hierarchy(means, np.ones(len(means), bool), wished, 8)
         finite = np.isfinite(means).all(axis=1)
-        whole = np.array_equal(np.sort(found.rows), np.flatnonzero(finite))
-        same = np.array_equal(found.rows, again.rows)
-        nested = all(set(a) <= set(b) for a, b in zip(found.starts, found.starts[1:], strict=False))
-        full = all((np.diff(starts) > 0).all() and starts[-1] == len(found.rows) for starts in found.starts)
-        capped = all(size <= wish for size, wish in zip(found.sizes, wished, strict=False))
-        laws = np.array([whole, same, nested, full, capped, found.left_out == np.count_nonzero(~finite)], float)
-        return BackendResult({"laws": laws}, {}, {"left_out_of_hierarchy": found.left_out})
+        whole = np.array_equal(np.sort(hierarchy.rows), np.flatnonzero(finite))
+        same = np.array_equal(hierarchy.rows, again.rows)
+        nested = all(set(a) <= set(b) for a, b in zip(hierarchy.starts, hierarchy.starts[1:], strict=False))
+        full = all((np.diff(starts) > 0).all() and starts[-1] == len(hierarchy.rows) for starts in hierarchy.starts)
+        capped = all(size <= wish for size, wish in zip(hierarchy.sizes, wished, strict=False))
+        laws = np.array([whole, same, nested, full, capped, hierarchy.left_out == np.count_nonzero(~finite)], float)
+        return BackendResult({"laws": laws}, {}, {"left_out_of_hierarchy": hierarchy.left_out})
 
     def lawful(outcomes: Mapping[str, BackendResult]) -> list[str]:
         names = ("every finite row once", "the same twice", "nested", "none empty", "no more than wished", "counted")
@@ -289,8 +289,8 @@ def _megabytes_of_clustering(count: int) -> float:
     means /= np.linalg.norm(means, axis=1, keepdims=True)
     build_hierarchy(means[:2000], np.ones(2000, bool), (16, 64), 8)  # what the libraries hold
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    found = build_hierarchy(means, np.ones(count, bool), (64, 320, 1280), 8)
-    assert len(found.rows) == count
+    hierarchy = build_hierarchy(means, np.ones(count, bool), (64, 320, 1280), 8)
+    assert len(hierarchy.rows) == count
     return (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
 
 
@@ -328,10 +328,10 @@ def _split(lengths: tuple[float, float, float]) -> HardStep:
         turns = np.linalg.qr(rng.normal(size=(2, 200, 3, 3)))[0]
         factors = (turns[0] * np.array(lengths) @ turns[1]).astype(np.float32)
         axes, scales = split_factors(factors)
-        found = axes * np.square(scales)[:, None, :] @ np.swapaxes(axes, 1, 2)
+        matrices = axes * np.square(scales)[:, None, :] @ np.swapaxes(axes, 1, 2)
         wide = factors.astype(np.float64)
         truth = wide @ np.swapaxes(wide, 1, 2)
-        off = np.abs(found - truth).max() / np.abs(truth).max()
+        off = np.abs(matrices - truth).max() / np.abs(truth).max()
         return BackendResult({"off": np.array([off]), "hands": np.linalg.det(axes)})
 
     def same(outcomes: Mapping[str, BackendResult]) -> list[str]:

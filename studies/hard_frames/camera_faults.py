@@ -56,13 +56,13 @@ def told(name: str, soon: int) -> Holds:
     """An alarm names the camera by frame ``soon`` of the fault, none names another, and no damage is done."""
 
     def holds(steps: Sequence[FrameStep], size: Any) -> list[str]:
-        found = [] if any(_names(step, name) for step in steps[:soon]) else [f"no alarm of it within {soon} frames"]
+        faults = [] if any(_names(step, name) for step in steps[:soon]) else [f"no alarm of it within {soon} frames"]
         for step in steps:
             others = {alarm.camera for alarm in step.report.alarms} - {name}
-            found += [
+            faults += [
                 f"frame {step.report.index}: an alarm of {other or 'the frame'}" for other in sorted(others, key=str)
             ]
-        return found + near(steps, size)
+        return faults + near(steps, size)
 
     return holds
 
@@ -73,14 +73,14 @@ def _names(step: FrameStep, name: str) -> bool:
 
 def blurred(picture: Picture, pixels: float) -> Picture:
     """Out of focus: blurred by so many pixels, standard deviation."""
-    found: Picture = gaussian_filter(picture.astype(np.float32), (pixels, pixels, 0)).round().astype(np.uint8)
-    return found
+    picture_blurred: Picture = gaussian_filter(picture.astype(np.float32), (pixels, pixels, 0)).round().astype(np.uint8)
+    return picture_blurred
 
 
 def scaled(picture: Picture, factor: Any) -> Picture:
     """Times a factor, or one of each colour; saturated at 255."""
-    found: Picture = (picture * np.asarray(factor)).round().clip(0, 255).astype(np.uint8)
-    return found
+    picture_scaled: Picture = (picture * np.asarray(factor)).round().clip(0, 255).astype(np.uint8)
+    return picture_scaled
 
 
 def noisy(picture: Picture, levels: float) -> Picture:
@@ -94,9 +94,9 @@ def dirty(picture: Picture, white: float) -> Picture:
     height, width = picture.shape[:2]
     middle = slice(height // 3, 2 * height // 3), slice(width // 3, 2 * width // 3)
     smeared = gaussian_filter(picture[middle].astype(np.float32), (SMEARED * width, SMEARED * width, 0))
-    found = picture.copy()
-    found[middle] = (smeared + white * (255 - smeared)).round().astype(np.uint8)
-    return found
+    smudged = picture.copy()
+    smudged[middle] = (smeared + white * (255 - smeared)).round().astype(np.uint8)
+    return smudged
 
 
 def _faulty(footage: Footage, at: int, name: str, size: Any, fault: Fault) -> list[Sent]:

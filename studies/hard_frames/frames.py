@@ -103,19 +103,19 @@ class FrameCase:
 
 def violations(case: FrameCase, steps: Sequence[FrameStep], size: Any) -> list[str]:
     """Laws that do not hold, a sentence each."""
-    found = [f"frame {step.report.index}: not finite, or a rotation is no unit" for step in steps if not step.sound]
+    faults = [f"frame {step.report.index}: not finite, or a rotation is no unit" for step in steps if not step.sound]
     faulty = [step for step in steps if not step.sent.good]
-    found += case.holds(faulty, size)
+    faults += case.holds(faulty, size)
     if case.alarms(size) and not any(step.report.alarms for step in faulty):
-        found.append("no alarm")
+        faults.append("no alarm")
     last = steps[-1]
     if last.sent.good:
-        found += [f"{AFTER} good frames later an alarm: {alarm.evidence}" for alarm in last.report.alarms]
+        faults += [f"{AFTER} good frames later an alarm: {alarm.evidence}" for alarm in last.report.alarms]
         if not last.psnr >= last.usual - WITHIN_DB:
-            found.append(f"{AFTER} good frames later {last.psnr - last.usual:+.2f} dB against the undisturbed run")
+            faults.append(f"{AFTER} good frames later {last.psnr - last.usual:+.2f} dB against the undisturbed run")
         if last.report.degraded is not None:
-            found.append(f"{AFTER} good frames later it is still degraded: {last.report.degraded}")
-    return found
+            faults.append(f"{AFTER} good frames later it is still degraded: {last.report.degraded}")
+    return faults
 
 
 # What must hold of the faulty frames
@@ -123,8 +123,8 @@ def violations(case: FrameCase, steps: Sequence[FrameStep], size: Any) -> list[s
 
 def held(steps: Sequence[FrameStep], size: Any) -> list[str]:
     """The state stays as it was, and the report says why."""
-    found = [f"frame {step.report.index}: the state has changed" for step in steps if not step.kept]
-    return found + [f"frame {s.report.index}: not said to be held" for s in steps if not s.report.outcome.held]
+    faults = [f"frame {step.report.index}: the state has changed" for step in steps if not step.kept]
+    return faults + [f"frame {s.report.index}: not said to be held" for s in steps if not s.report.outcome.held]
 
 
 def left_out(names: Callable[[Any], Sequence[str]], first: int = 0, may: Sequence[str] = ()) -> Holds:
@@ -135,15 +135,15 @@ def left_out(names: Callable[[Any], Sequence[str]], first: int = 0, may: Sequenc
     """
 
     def holds(steps: Sequence[FrameStep], size: Any) -> list[str]:
-        found = []
+        faults = []
         for number, step in enumerate(steps):
             wanted, dropped = set(names(size)), set(step.report.dropped)
             missing, others = wanted - dropped, dropped - wanted - set(may)
             if missing and number >= first:
-                found.append(f"frame {step.report.index}: {', '.join(sorted(missing))} is not left out")
+                faults.append(f"frame {step.report.index}: {', '.join(sorted(missing))} is not left out")
             if others:
-                found.append(f"frame {step.report.index}: {', '.join(sorted(others))} is left out as well")
-        return found + near(steps, size)
+                faults.append(f"frame {step.report.index}: {', '.join(sorted(others))} is left out as well")
+        return faults + near(steps, size)
 
     return holds
 
@@ -159,17 +159,17 @@ def near(steps: Sequence[FrameStep], size: Any) -> list[str]:
 
 def stood(steps: Sequence[FrameStep], size: Any) -> list[str]:
     """Nothing is moved, and the report says so."""
-    found = [f"frame {step.report.index}: the state has changed" for step in steps if not step.kept]
-    return found + [f"frame {s.report.index}: not said to stand" for s in steps if s.report.iterations]
+    faults = [f"frame {step.report.index}: the state has changed" for step in steps if not step.kept]
+    return faults + [f"frame {s.report.index}: not said to stand" for s in steps if s.report.iterations]
 
 
 def jumped(steps: Sequence[FrameStep], size: Any) -> list[str]:
     """Degraded at first, and explained; then found again."""
-    found = [] if steps[0].report.degraded else [f"frame {steps[0].report.index}: not degraded"]
+    faults = [] if steps[0].report.degraded else [f"frame {steps[0].report.index}: not degraded"]
     last = steps[-1]
     if not last.psnr >= last.usual - JUMPED_DB:
-        found.append(f"not found again: {last.psnr - last.usual:+.2f} dB after {len(steps)} frames")
-    return found
+        faults.append(f"not found again: {last.psnr - last.usual:+.2f} dB after {len(steps)} frames")
+    return faults
 
 
 def explained(steps: Sequence[FrameStep], size: Any) -> list[str]:
@@ -325,10 +325,10 @@ def teleported(footage: Footage, at: int, size: Any) -> list[Sent] | None:
     """The object is moved by so many times its own size, and goes on from there: four frames are sent."""
     sent = []
     for number in range(4):
-        found = footage.jumped(at + number, size)
-        if found is None:
+        jump = footage.jumped(at + number, size)
+        if jump is None:
             return None
-        sent.append(Sent(found[0], at + number, found[1], False))
+        sent.append(Sent(jump[0], at + number, jump[1], False))
     return sent
 
 

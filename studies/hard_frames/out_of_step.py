@@ -103,11 +103,11 @@ def _row(key: str, folder: Path, out: Path, settings: Settings, updates: int, ca
     scene = started(capture, settings, out)
     with clocked() as spent:
         reports = [scene.step(played(capture, index, case.step, shifts)) for index in range(1, updates + 1)]
-    found = summary(reports, {name: shift / case.step for name, shift in shifts.items()})
+    row = summary(reports, {name: shift / case.step for name, shift in shifts.items()})
     whole = float(np.median([sum(report.seconds.values()) for report in reports]))
-    found |= {"milliseconds": 1000 * float(np.median(spent)), "share": float(np.median(spent)) / whole}
+    row |= {"milliseconds": 1000 * float(np.median(spent)), "share": float(np.median(spent)) / whole}
     told = {"capture": capture.name, "step": case.step, "settings": recorded(settings, ()), "masks": masks}
-    return {"key": key, **told, **found, "core": core_version(), "machine": machine()}
+    return {"key": key, **told, **row, "core": core_version(), "machine": machine()}
 
 
 def played(capture: Capture, index: int, step: int, shifts: Mapping[str, int]) -> Frame:
@@ -133,9 +133,9 @@ def clocked() -> Iterator[list[float]]:
 
     def noted(*given: Any) -> Any:
         began = perf_counter()
-        found = looked(*given)
+        observation = looked(*given)
         spent.append(perf_counter() - began)
-        return found
+        return observation
 
     with mock.patch.object(timing, "noted", noted):
         yield spent

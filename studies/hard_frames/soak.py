@@ -176,39 +176,39 @@ class Soak:
 
 def violations(rows: Sequence[Row]) -> list[str]:
     """Targets that are missed, a sentence each."""
-    found = []
+    faults = []
     for row in rows:
         at = f"frame {row.frame}: "
         if not row.finite:
-            found.append(at + "something is not finite")
+            faults.append(at + "something is not finite")
         if not row.still:
-            found.append(at + "what stands has moved")
+            faults.append(at + "what stands has moved")
         if not row.resting <= RESTING_M:
-            found.append(
+            faults.append(
                 at + f"what rests is {1000 * row.resting:.1f} mm from where it was, the target is {RESTING_M} m"
             )
         if row.frame % (2 * OUT) == 0 and not row.moving <= RETURN_M:
-            found.append(
+            faults.append(
                 at + f"it came back {1000 * row.moving:.1f} mm from where it began, the target is {RETURN_M} m"
             )
         if not row.unit <= UNIT:
-            found.append(at + f"a rotation's norm is {row.unit:.1e} from 1")
+            faults.append(at + f"a rotation's norm is {row.unit:.1e} from 1")
         if not (row.longest <= GROWTH and row.shortest >= 1 / GROWTH):
-            found.append(at + f"axes are {row.shortest:.2f} to {row.longest:.2f} times as long as in frame 0")
+            faults.append(at + f"axes are {row.shortest:.2f} to {row.longest:.2f} times as long as in frame 0")
     half = len(rows) // 2
     if half >= HALF:
         early, late = (float(np.mean([row.resting for row in part])) for part in (rows[:half], rows[half:]))
         if not early + late <= 2 * RESTING_MEAN_M:
-            found.append(f"what rests is {500 * (early + late):.1f} mm from where it was on average")
+            faults.append(f"what rests is {500 * (early + late):.1f} mm from where it was on average")
         if late > TREND * early:
-            found.append(
+            faults.append(
                 f"what rests wanders: {1000 * early:.1f} mm in the first half, {1000 * late:.1f} mm in the second"
             )
     tenth = max(1, len(rows) // 10)
     began, ended = max(row.memory for row in rows[:tenth]), max(row.memory for row in rows[-tenth:])
     if ended > MEMORY * began:
-        found.append(f"memory grew from {began:.0f} to {ended:.0f} MB")
-    return found
+        faults.append(f"memory grew from {began:.0f} to {ended:.0f} MB")
+    return faults
 
 
 def _rms(distances: NDArray[np.float64]) -> float:

@@ -118,8 +118,8 @@ def measure_rasterizer(gaussians: Gaussians, cameras: Sequence[Camera], repeats:
 
     for view in views:
         forward(view)
-        found = blended_pairs(rasterizer.splats, rasterizer.counts, view.width, view.height, limits)
-        pairs, lanes = pairs + found[0], lanes + found[1]
+        blended = blended_pairs(rasterizer.splats, rasterizer.counts, view.width, view.height, limits)
+        pairs, lanes = pairs + blended[0], lanes + blended[1]
     micro = MicroKernel(threads())
     # One thread's own time is not disturbed by others who want its core; several threads also wait for each other.
     clock = time.process_time if threads() == 1 else time.perf_counter

@@ -57,7 +57,7 @@ a frame 0 that all its rows share{_elsewhere(captures, there)}.
 
 ## Agreement
 
-{summary([outcome for found in outcomes.values() for outcome in found], outcomes)}
+{summary([outcome for outcomes_of_variant in outcomes.values() for outcome in outcomes_of_variant], outcomes)}
 
 The gain is the first setting's mean less the second's, over the captures of both. It agrees in size if the two gains
 are within a factor of {FACTOR:g}; gains that are small on both sides

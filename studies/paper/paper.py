@@ -213,24 +213,24 @@ class ClaimResult:
 
 def measured(out: Path, captures: Sequence[str], updates: int, quality: Path | None = None) -> Measured:
     """Our figures: rows of the frontier; for captures without any, rows of the study of quality over shared updates."""
-    found: dict[tuple[Variant, str], dict[str, float]] = {}
+    by_variant: dict[tuple[Variant, str], dict[str, float]] = {}
     for point in read_points(out, captures, updates):
         for score in SMALL:
             value = point.scores[score]
             if value is not None and not point.variant.whole:
-                found.setdefault((point.variant, score), {})[point.capture] = value
+                by_variant.setdefault((point.variant, score), {})[point.capture] = value
     if quality is not None and quality.is_dir():
         rows = measured_runs(Store(quality))
         for capture in captures:
             pair = [rows.get((run, capture)) for run in ("scas4d", "dynamic3dgs")]
             own, base = pair
-            if own is None or base is None or capture in found.get((DEFAULT, "psnr"), {}):
+            if own is None or base is None or capture in by_variant.get((DEFAULT, "psnr"), {}):
                 continue
             shared = min(own["updates"], base["updates"])
             for setting, row in ((DEFAULT, own), (BASE_100, base)):
                 psnr = row["psnr_by_frame"][1 : 1 + shared]
-                found.setdefault((setting, "psnr"), {})[capture] = sum(psnr) / shared
-    return found
+                by_variant.setdefault((setting, "psnr"), {})[capture] = sum(psnr) / shared
+    return by_variant
 
 
 def compare(experiment: Experiment, ours: Measured) -> list[ClaimResult]:

@@ -103,7 +103,7 @@ def variants(names: Sequence[str], settings: Settings) -> list[Pins]:
     >>> variants(["rigidity", "entering"], Settings())
     [{'rigidity': 'off'}, {'entering': 'off'}, {'entering': 'removed'}, {'entering': 'on'}]
     """
-    found: list[Pins] = []
+    pins: list[Pins] = []
     for name in names:
         if name not in EFFECTS:
             raise ValueError(f"effect {name!r} is unknown; docs/effects.md lists all")
@@ -113,8 +113,8 @@ def variants(names: Sequence[str], settings: Settings) -> list[Pins]:
         for mode in modes:
             contradicts = mode != "removed" and any(contradictions(pinned(settings, {name: mode})))
             if not contradicts and not (refused and mode != "removed"):
-                found.append({name: mode})
-    return found
+                pins.append({name: mode})
+    return pins
 
 
 def pinned(settings: Settings, pins: Pins) -> Settings:

@@ -74,15 +74,15 @@ def load_first_frame(path: Path) -> tuple[StaticResult, float] | None:
 def save_first_frame(path: Path, result: StaticResult, seconds: float) -> None:
     """Keeps a frame 0; the file is whole or not there."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    names, found = sorted(result.exposures), result.evidence or {}
+    names, evidence = sorted(result.exposures), result.evidence or {}
     beside = path.with_suffix(f".{os.getpid()}.part")
     arrays: dict[str, Any] = {
         "exposure_names": np.array(names, dtype=np.str_),
         "exposures": np.array([result.exposures[name] for name in names], np.float32).reshape(-1, 3, 2),
         "losses": np.array(result.losses),
-        "evidence_names": np.array(list(found), dtype=np.str_),
-        "evidence_shares": np.array([one.share for one in found.values()]),
-        "evidence_texts": np.array([one.text for one in found.values()], dtype=np.str_),
+        "evidence_names": np.array(list(evidence), dtype=np.str_),
+        "evidence_shares": np.array([one.share for one in evidence.values()]),
+        "evidence_texts": np.array([one.text for one in evidence.values()], dtype=np.str_),
         "seconds": np.float64(seconds),
         **result.gaussians.arrays(),
     }
@@ -96,15 +96,15 @@ def first_of(capture: Capture, out: Path, settings: Settings) -> StaticResult:
     key = first_frame_key(capture, settings)
     gloss = settings.effects.get("direction", "auto")
     path = out / "first" / f"{key}{'' if gloss == 'auto' else f'-direction-{gloss}'}.npz"
-    found = load_first_frame(path)
-    if found is None:
+    result = load_first_frame(path)
+    if result is None:
         began = perf_counter()
         scene = Reconstruction.start(capture.rig, capture.frame(0), settings, points=capture.points)
         assert scene.static is not None
         save_first_frame(path, scene.static, perf_counter() - began)
-        found = load_first_frame(path)
-        assert found is not None
-    return found[0]
+        result = load_first_frame(path)
+        assert result is not None
+    return result[0]
 
 
 def started(capture: Capture, settings: Settings, out: Path, states: Path | None = None) -> Reconstruction:

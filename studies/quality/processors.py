@@ -123,10 +123,10 @@ def measure(capture: Path, frames: int, seed: int, changes: Sequence[str]) -> Ro
             views = [scene.render(camera, index).colour for camera in opened.test_rig.cameras]
             truths = [truth.images[camera.name] / np.float32(255) for camera in opened.test_rig.cameras]
             row["psnr"].append(float(np.mean([psnr(a, b) for a, b in zip(views, truths, strict=True)])))
-        found = hashlib.sha256()
+        hasher = hashlib.sha256()
         for array in scene.history.gaussians(index).arrays().values():
-            found.update(np.ascontiguousarray(array).tobytes())
-        row["states"].append(found.hexdigest()[:16])
+            hasher.update(np.ascontiguousarray(array).tobytes())
+        row["states"].append(hasher.hexdigest()[:16])
     return row
 
 

@@ -131,7 +131,7 @@ def measured_runs(store: Store) -> dict[tuple[str, str], Row]:
     asked for, those of updates do not count.
     """
     rows = [row for row in store.rows() if "error" not in row]
-    found: dict[tuple[str, str], Row] = {}
+    by_run: dict[tuple[str, str], Row] = {}
     for name, run in RUNS.items():
         for capture in run.captures:
             settings = run.settings(capture).model_dump(mode="json")
@@ -144,7 +144,7 @@ def measured_runs(store: Store) -> dict[tuple[str, str], Row]:
                 same &= not any(run.frames != 1 or place.startswith(FIRST_FRAME) for place in varied)
                 if row["capture"] != capture or not same or withheld != (run.masks, run.points):
                     continue
-                best = found.get((name, capture))
+                best = by_run.get((name, capture))
                 if best is None or given["frames"] > best["given"]["frames"]:
-                    found[name, capture] = row
-    return found
+                    by_run[name, capture] = row
+    return by_run

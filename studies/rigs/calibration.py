@@ -125,7 +125,7 @@ def _row(known: Row, folder: Path, rig: Rig, changes: Sequence[str]) -> Row:
 def _told(name: str, matches: Matches) -> list[Row]:
     """Residuals of the rig as it is given, and of each camera in turn with each fault."""
     given, off = residuals(matches)
-    known = np.array([found.pixels for found in given.values()])
+    known = np.array([fit.pixels for fit in given.values()])
     rows: list[Row] = [_told_row(name, "none", known, f"{len(off)} of {len(known)}", 0)]
     if np.isnan(known).all():
         return rows
@@ -133,8 +133,8 @@ def _told(name: str, matches: Matches) -> list[Row]:
         own, named, others = [], 0, 0
         for camera in matches.cameras:
             cameras = [faulty(c, kind, size) if c is camera else c for c in matches.cameras]
-            found, off = residuals(matches.seen_by(cameras))
-            own.append(found[camera.name].pixels)
+            fit, off = residuals(matches.seen_by(cameras))
+            own.append(fit[camera.name].pixels)
             named += camera.name in off
             others += len(set(off) - {camera.name})
         rows.append(_told_row(name, f"{kind} {size:g}", np.array(own), f"{named} of {len(own)}", others))
@@ -150,14 +150,14 @@ def _told_row(capture: str, fault: str, residual: NDArray[np.float64], named: st
 
 def _fitted(folder: Path, rig: Rig, changes: Sequence[str]) -> Mapping[str, Any]:
     """PSNR of the test cameras in frame 0, with the rig as it is and refined."""
-    capture, found = open_source(folder), dict[str, Any]()
+    capture, row = open_source(folder), dict[str, Any]()
     for refine in (False, True):
         settings = settings_of("scas4d", None, 0, [*changes, f"static.refine_calibration={str(refine).lower()}"])
         scene = Reconstruction.start(rig, capture.frame(0), settings, points=capture.points)
         tests = open_source(folder, image_scale=settings.scene.image_scale)
-        found["refined" if refine else "given"] = measure_pictures(scene, tests, 0)[0]["psnr"]
+        row["refined" if refine else "given"] = measure_pictures(scene, tests, 0)[0]["psnr"]
         assert scene.report is not None
         if scene.report.calibration is not None and (refined := scene.report.calibration.refined) is not None:
-            found |= {"accepted": "yes" if refined.accepted else "no", "said": refined.text}
-            found["seconds"] = scene.report.seconds["calibration"]
-    return found
+            row |= {"accepted": "yes" if refined.accepted else "no", "said": refined.text}
+            row["seconds"] = scene.report.seconds["calibration"]
+    return row

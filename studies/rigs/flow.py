@@ -78,34 +78,34 @@ def followed(film: Grey, start: Float) -> Float:
     Args:
         film: grey pictures [H, W]. start: [Q, 2] pixels in the first, in which the middle of the first pixel is 0.5.
     """
-    found = np.full((len(film), len(start), 2), np.nan)
-    found[0] = start
+    paths = np.full((len(film), len(start), 2), np.nan)
+    paths[0] = start
     for index in range(1, len(film)):
-        here = (found[index - 1] - 0.5).astype(np.float32)
+        here = (paths[index - 1] - 0.5).astype(np.float32)
         there = np.isfinite(here).all(axis=1)
         if not there.any():
             break
         ahead, seen = _flow(film[index - 1], film[index], here[there])
         back, seen_back = _flow(film[index], film[index - 1], ahead)
         good = seen & seen_back & (np.linalg.norm(back - here[there], axis=1) < BACK)
-        found[index, np.flatnonzero(there)[good]] = ahead[good] + 0.5
-    return found
+        paths[index, np.flatnonzero(there)[good]] = ahead[good] + 0.5
+    return paths
 
 
 def _flow(
     picture: NDArray[np.uint8], after: NDArray[np.uint8], points: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """[Q, 2] the places in the next picture of points of this one, and [Q] those that were found."""
-    where, found, _ = cv2.calcOpticalFlowPyrLK(picture, after, points, points.copy())
-    return np.asarray(where, np.float32), np.asarray(found).ravel() > 0
+    where, status, _ = cv2.calcOpticalFlowPyrLK(picture, after, points, points.copy())
+    return np.asarray(where, np.float32), np.asarray(status).ravel() > 0
 
 
 def _corners(film: Grey) -> Float:
     """[T, Q, 2] corners of the first picture that move and are followed to the last."""
     start = np.asarray(cv2.goodFeaturesToTrack(film[0], CORNERS, 0.01, APART), np.float64)  # of None, NaN
-    found = followed(film, start.reshape(-1, 2) + 0.5 if start.ndim else np.zeros((0, 2)))
-    moves = np.linalg.norm(found[-1] - found[0], axis=1) >= MOVING  # False for NaN
-    return found[:, moves]
+    paths = followed(film, start.reshape(-1, 2) + 0.5 if start.ndim else np.zeros((0, 2)))
+    moves = np.linalg.norm(paths[-1] - paths[0], axis=1) >= MOVING  # False for NaN
+    return paths[:, moves]
 
 
 def _from_lines(scene: Reconstruction, pair: tuple[Camera, Camera], points: Float, flow: Float, film: Grey) -> Float:
@@ -128,11 +128,11 @@ def _from_lines(scene: Reconstruction, pair: tuple[Camera, Camera], points: Floa
     distance = np.abs((np.concatenate([other, ones], axis=-1) * lines).sum(-1)) / np.linalg.norm(
         lines[..., :2], axis=-1
     )
-    found: Float = distance[np.isfinite(distance)]
-    return found
+    distances: Float = distance[np.isfinite(distance)]
+    return distances
 
 
 def _median(parts: Sequence[Float]) -> float | None:
     values = np.concatenate(parts) if parts else np.zeros(0)
-    found = float(np.median(values)) if len(values) >= FEWEST else np.inf
-    return found if np.isfinite(found) else None
+    median = float(np.median(values)) if len(values) >= FEWEST else np.inf
+    return median if np.isfinite(median) else None

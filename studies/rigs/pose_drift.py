@@ -84,8 +84,8 @@ def run(
 
 
 def _row(known: Row, folder: Path, out: Path, settings: Settings, updates: int, drift: tuple[float, float]) -> Row:
-    found = _played(folder, out, settings, updates, drift)
-    return {**known, **found, "settings": recorded(settings, ()), "core": core_version(), "machine": machine()}
+    row = _played(folder, out, settings, updates, drift)
+    return {**known, **row, "settings": recorded(settings, ()), "core": core_version(), "machine": machine()}
 
 
 def _played(folder: Path, out: Path, settings: Settings, updates: int, drift: tuple[float, float]) -> Row:
@@ -97,8 +97,8 @@ def _played(folder: Path, out: Path, settings: Settings, updates: int, drift: tu
         size = min(drift[1], index * drift[0])
         offsets = {names[len(names) // 8]: np.array([size, 0, 0]), names[-len(names) // 3]: np.array([0, size, 0])}
         scene.step(turned(capture, index, offsets if size else {}))
-        found = measure_pictures(scene, tests, index)[0]["psnr"]
-        scores.append(float("nan") if found is None else found)
+        score = measure_pictures(scene, tests, index)[0]["psnr"]
+        scores.append(float("nan") if score is None else score)
     arrays = scene.history.effects(scene.history.indices[-1]).get(NAME, {})
     twists = arrays.get("twists", np.zeros((len(names), 6)))
     told = {name: _pixels(scene, name, twists[names.index(name)]) for name in offsets}
@@ -145,6 +145,8 @@ def _seen(
     x, y, z = np.einsum("ij,jhw->ihw", back, np.stack([u, v, np.ones_like(u)]))
     places = np.stack([y / z - 0.5, x / z - 0.5])
     planes = np.atleast_3d(picture).astype(np.float64)
-    found = [map_coordinates(planes[..., k], places, order=order, mode="nearest") for k in range(planes.shape[2])]
-    seen: NDArray[np.uint8] = np.rint(np.clip(np.stack(found, axis=-1), 0, 255)).astype(np.uint8).reshape(picture.shape)
+    planes_seen = [map_coordinates(planes[..., k], places, order=order, mode="nearest") for k in range(planes.shape[2])]
+    seen: NDArray[np.uint8] = (
+        np.rint(np.clip(np.stack(planes_seen, axis=-1), 0, 255)).astype(np.uint8).reshape(picture.shape)
+    )
     return seen

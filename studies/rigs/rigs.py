@@ -138,11 +138,11 @@ def measured(
         "machine": machine(),
     }
     if (unseen := truth.test_rig) is not None:
-        found = [_psnr(scene, unseen, truth.test_frame(index)) for index in range(count)]
+        scores = [_psnr(scene, unseen, truth.test_frame(index)) for index in range(count)]
         row |= {
             "held_out": ", ".join(unseen.names),
-            "psnr_held_out": float(np.mean(found)),
-            "psnr_held_out_last": found[-1],
+            "psnr_held_out": float(np.mean(scores)),
+            "psnr_held_out_last": scores[-1],
             "psnr_nearest": float(np.mean([_nearest_psnr(truth, unseen, index) for index in range(count)])),
         }
     if count > 1:
@@ -164,20 +164,20 @@ def _psnr(scene: Reconstruction, rig: Rig, frame: Frame) -> float:
 
 def _nearest_psnr(truth: Capture, unseen: Rig, index: int) -> float:
     """Mean dB of the pictures of the training cameras nearest to those held out, each shown in their place."""
-    pictures, seen, found = truth.test_frame(index).images, truth.frame(index).images, []
+    pictures, seen, scores = truth.test_frame(index).images, truth.frame(index).images, []
     centres = np.array([camera.centre for camera in truth.rig.cameras])
     for camera in unseen.cameras:
         nearest = truth.rig.cameras[int(np.linalg.norm(centres - camera.centre, axis=1).argmin())]
         true = pictures[camera.name]
-        found.append(metrics.psnr(_resized(seen[nearest.name], true.shape) / np.float32(255), true))
-    return float(np.mean(found))
+        scores.append(metrics.psnr(_resized(seen[nearest.name], true.shape) / np.float32(255), true))
+    return float(np.mean(scores))
 
 
 def _resized(image: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.uint8]:
     """The nearest pixels of a picture, as [H, W, 3] of another shape."""
     lines, columns = (np.arange(want) * have // want for want, have in zip(shape[:2], image.shape[:2], strict=True))
-    found: NDArray[np.uint8] = image[lines[:, None], columns[None]]
-    return found
+    resized: NDArray[np.uint8] = image[lines[:, None], columns[None]]
+    return resized
 
 
 def _joints(path: Path, scene: Reconstruction, rig: Rig, count: int) -> Row:

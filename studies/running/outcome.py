@@ -25,8 +25,8 @@ def table(outcomes: Sequence[ScenarioResult]) -> str:
     """As Markdown."""
     rows = ["| fault | target | found | |", "|---|---|---|---|"]
     for outcome in outcomes:
-        found = "; ".join([*outcome.faults, *([outcome.found] if outcome.found else [])])
+        summary = "; ".join([*outcome.faults, *([outcome.found] if outcome.found else [])])
         rows.append(
-            f"| {outcome.name} | {outcome.target} | {found} | {'reached' if outcome.reached else '**missed**'} |"
+            f"| {outcome.name} | {outcome.target} | {summary} | {'reached' if outcome.reached else '**missed**'} |"
         )
     return "\n".join(rows)

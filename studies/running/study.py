@@ -63,15 +63,15 @@ def encoded_frames(capture: Capture, count: int) -> list[Files]:
 
 def _files(capture: Capture, index: int) -> Files:
     images = {name: capture.encoded(index, name) for name in capture.full_rig.names}
-    found = {name: capture.encoded_mask(index, name) for name in capture.full_rig.names}
-    masks = {name: mask for name, mask in found.items() if mask is not None}
+    files = {name: capture.encoded_mask(index, name) for name in capture.full_rig.names}
+    masks = {name: mask for name, mask in files.items() if mask is not None}
     return images, masks if len(masks) == len(images) else {}
 
 
 def digests(states: Path) -> dict[int, str]:
     """SHA-256 over every array of each committed state, and what its report says of decisions."""
     history = History.load(states)
-    found = {}
+    by_frame = {}
     for index in history.indices:
         digest = hashlib.sha256()
         for name, array in sorted(Gaussians.arrays(history.gaussians(index)).items()):
@@ -79,8 +79,8 @@ def digests(states: Path) -> dict[int, str]:
             digest.update(array.tobytes())
         report = history.report(index)
         decided = {name: report.get(name) for name in ("index", "time", "iterations", "loss", "used", "dropped")}
-        found[index] = f"{digest.hexdigest()} {decided}"
-    return found
+        by_frame[index] = f"{digest.hexdigest()} {decided}"
+    return by_frame
 
 
 def compare(found: Mapping[int, str], expected: Mapping[int, str], but: Sequence[int] = ()) -> list[str]:

@@ -33,9 +33,9 @@ def scale(
     if unknown := set(sweep or []) - set(SWEEPS):
         raise typer.BadParameter(f"there is no sweep {sorted(unknown)[0]!r}; they are {', '.join(SWEEPS)}")
     counts = [count for count in frames or FRAMES if count]
-    found = run(work.resolve(), sweep or list(SWEEPS), counts, typer.echo)
-    text = told(found)
+    sizes_run = run(work.resolve(), sweep or list(SWEEPS), counts, typer.echo)
+    text = told(sizes_run)
     typer.echo(text)
     write_page(out, text)
     if picture is not None:
-        plot(found, picture)
+        plot(sizes_run, picture)

@@ -120,7 +120,7 @@ def growth(frames: Sequence[int], *, folder: bool) -> dict[int, float]:
     settings = Settings.model_validate({"scene": SCENE, "update": {"iterations": 2}})
     state, cameras = wall(size), rig(size)
     there = [shown(state, way, cameras) for way in range(TURN + 1)]
-    found: dict[int, float] = {}
+    peak: dict[int, float] = {}
     with TemporaryDirectory() as work:
         history = History(Path(work) / "states") if folder else History()
         scene = Reconstruction.start(cameras, there[0], settings, static=known(state, cameras), history=history)
@@ -128,8 +128,8 @@ def growth(frames: Sequence[int], *, folder: bool) -> dict[int, float]:
             way = index % TURN if index % (2 * TURN) < TURN else TURN - index % TURN  # to and fro
             scene.step(replace(there[way], index=index, time=index / 30))
             if index in frames:
-                found[index] = _peak_mb()
-    return found
+                peak[index] = _peak_mb()
+    return peak
 
 
 def run(work: Path, sweeps: Sequence[str], frames: Sequence[int], echo: Echo) -> dict[str, Any]:

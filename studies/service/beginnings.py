@@ -64,9 +64,9 @@ def beginnings(study: Study, expected: Mapping[int, str], count: int, seed: int,
         faults = sender.check() + compare(digests(folder.states), expected)
         faults += [f"{path.name} is left" for path in folder.path.glob("states*") if path != folder.states]
         faults += [f"damage was said: {said}" for said in service.status(scene).damage]
-        found = f"{ended['before']} ended before, {ended['after']} after; {len(expected)} states compared"
+        summary = f"{ended['before']} ended before, {ended['after']} after; {len(expected)} states compared"
         target = "each ends wholly before or after; final state bit-identical to a run without any"
-        return ScenarioResult(f"kill -9 in {count} beginnings of a reconstruction", target, found, faults)
+        return ScenarioResult(f"kill -9 in {count} beginnings of a reconstruction", target, summary, faults)
 
 
 def _begin(service: Service, scene: str, number: int) -> None:

@@ -129,8 +129,8 @@ def _phase(folder: Path, name: str) -> Iterator[None]:
 
 
 def _files(folder: Path, phase: str, root: Path) -> Iterator[str]:
-    for found in folder.glob(f"{phase}.*"):
-        for name in found.read_text().splitlines():
+    for match in folder.glob(f"{phase}.*"):
+        for name in match.read_text().splitlines():
             path = Path(name)
             if path.is_relative_to(root):
                 inside = path.relative_to(root)

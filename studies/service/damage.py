@@ -77,7 +77,7 @@ def flips(study: Study, count: int, seed: int, echo: Callable[[str], None]) -> F
     """Flips `count` bits, as many of each kind, half of them while the service is down."""
     random_ = random.Random(seed)
     expected, views = undisturbed(study)
-    found = Flips()
+    counts = Flips()
     with running(study, "flips", SCRUB, keep_frames={"last": KEPT}) as (service, scene, sender):
         for index in range(BEFORE):
             sender.send(index)
@@ -87,20 +87,20 @@ def flips(study: Study, count: int, seed: int, echo: Callable[[str], None]) -> F
             one = _Flip(study, service, scene, kind, BEFORE + number, random_)
             said = f"{number + 1} of {count}: {one.said}{', while the service is down' if down else ''}"
             try:
-                outcome = one.run(down, found, views)
+                outcome = one.run(down, counts, views)
                 sender.send(BEFORE + number)
                 service.finish(scene, BEFORE + number + 1)
                 echo(f"{said}: {outcome}")
             except StudyError as error:
                 one.faults.append(str(error))
-            found.faults += [f"{said}: {fault}" for fault in one.faults]
-        found.faults += sender.check()
+            counts.faults += [f"{said}: {fault}" for fault in one.faults]
+        counts.faults += sender.check()
         states = digests(DataFolder(service.data).scene(scene).states)
-        others = found.remade | found.lost | found.unreported
+        others = counts.remade | counts.lost | counts.unreported
         wrong = [index for index in expected if index not in others and states.get(index) != expected[index]]
         if wrong:
-            found.faults.append(f"states {wrong} are not bit-identical")
-        return found
+            counts.faults.append(f"states {wrong} are not bit-identical")
+        return counts
 
 
 class _Flip:

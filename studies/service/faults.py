@@ -71,13 +71,13 @@ def kills(
         service.finish(scene, len(study.frames))
         faults = sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
         lost = len(study.frames) - len(sender.receipts)
-        found = (
+        summary = (
             f"{done['worker']} of the worker, {done['service']} of the service; {lost} acknowledged frames lost, "
             f"{len(expected)} states compared"
         )
         target = "0 acknowledged frames lost, final state bit-identical"
         return ScenarioResult(
-            f"kill -9 at {count} random moments over {len(study.frames)} frames", target, found, faults
+            f"kill -9 at {count} random moments over {len(study.frames)} frames", target, summary, faults
         )
 
 
@@ -146,9 +146,9 @@ def damaged_log(
             faults.append(f"{said}: {error}")
         finally:
             victim.stop()
-    found = f"started {cuts + flips} times; {dropped} frames set aside with their reason, all others committed"
+    summary = f"started {cuts + flips} times; {dropped} frames set aside with their reason, all others committed"
     target = "starts, loses nothing acknowledged before the damage, says what it dropped"
-    return ScenarioResult(f"{cuts} cuts and {flips} flipped bytes of journal and frame log", target, found, faults)
+    return ScenarioResult(f"{cuts} cuts and {flips} flipped bytes of journal and frame log", target, summary, faults)
 
 
 def _damage(folder: SceneFolder, kind: str, random_: random.Random, half: int) -> tuple[str, int | None]:
@@ -233,15 +233,15 @@ def _no_room(pid: int) -> Any:
 def flipped_bits(study: Study, count: int, seed: int, echo: Echo) -> ScenarioResult:
     """Single bits over everything on disk, with and without a restart (`studies.service.damage`)."""
     longer = replace(study, frames=encoded_frames(study.capture, damage.frames_for(count)))
-    found = damage.flips(longer, count, seed, echo)
-    counts = Counter(kind.rpartition(" ")[2] for kind in found.counts.elements())
+    flipped = damage.flips(longer, count, seed, echo)
+    counts = Counter(kind.rpartition(" ")[2] for kind in flipped.counts.elements())
     said = (
-        f"{counts['noticed']} noticed, {counts['harmless']} harmless; {len(found.remade)} states made again from "
-        f"pictures, {len(found.lost)} named as lost, {len(found.unreported)} without their report"
+        f"{counts['noticed']} noticed, {counts['harmless']} harmless; {len(flipped.remade)} states made again from "
+        f"pictures, {len(flipped.lost)} named as lost, {len(flipped.unreported)} without their report"
     )
     target = "each noticed or harmless; no wrong picture, no 500, the scene goes on"
     return ScenarioResult(
-        f"{count} flipped bits of {', '.join(damage.KINDS)}, half while down", target, said, found.faults
+        f"{count} flipped bits of {', '.join(damage.KINDS)}, half while down", target, said, flipped.faults
     )
 
 

@@ -94,12 +94,14 @@ def script(footage: BackAndForth, cases: Sequence[FrameCase]) -> tuple[list[Sent
     for case in cases:
         for size in case.sizes:
             like = sent[-1].like + 1
-            found = case.make(footage, like, size)
-            if found is None or (case.make is teleported and size > FARTHEST):
+            case_frames = case.make(footage, like, size)
+            if case_frames is None or (case.make is teleported and size > FARTHEST):
                 continue
-            parts.append(SentCase(case, size, len(sent), found))
-            sent += found
-            sent += [good(footage, sent[-1].like + 1 + number) for number in range(BETWEEN if found[-1].good else 6)]
+            parts.append(SentCase(case, size, len(sent), case_frames))
+            sent += case_frames
+            sent += [
+                good(footage, sent[-1].like + 1 + number) for number in range(BETWEEN if case_frames[-1].good else 6)
+            ]
     return sent, parts
 
 

@@ -65,12 +65,12 @@ def jpeg(size_bytes: int, seed: int, side: int = 1024) -> bytes:
 def noise_rig(cameras: int, side: int = 1024) -> Rig:
     """Cameras that look at nothing, side by side."""
     k = np.array([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1.0]])
-    found = []
+    placed_cameras = []
     for number in range(cameras):
         pose = np.eye(4)
         pose[:3, 3] = (number / cameras, 0, 3)
-        found.append(Camera(f"c{number}", k, pose, side, side))
-    return Rig(tuple(found))
+        placed_cameras.append(Camera(f"c{number}", k, pose, side, side))
+    return Rig(tuple(placed_cameras))
 
 
 def measure(folder: Path, *, frames: int, cameras: int, size_bytes: int, rounds: int, senders: int) -> IngestTimes:
@@ -93,7 +93,7 @@ def measure(folder: Path, *, frames: int, cameras: int, size_bytes: int, rounds:
             lambda first: _ingest(service, scene, records, first, frames, senders),
             lambda first: _socket(service, scene, records, first, frames),
         ]
-        found: list[list[float]] = [[], [], []]
+        seconds: list[list[float]] = [[], [], []]
         first = 0
         for number in range(rounds + 1):
             for turn in range(3):
@@ -101,8 +101,8 @@ def measure(folder: Path, *, frames: int, cameras: int, size_bytes: int, rounds:
                 took = ways[way](first)
                 first += frames if way else 0
                 if number:  # the first round warms caches, connections and the pool of threads
-                    found[way].append(megabytes / took)
-        return IngestTimes(*found)
+                    seconds[way].append(megabytes / took)
+        return IngestTimes(*seconds)
     finally:
         service.stop()
         shutil.rmtree(plain_folder, ignore_errors=True)

@@ -96,7 +96,7 @@ def sleeping(scene: Path, count: int, views: int, work: Path) -> dict[str, float
         shutil.copytree(scene, folder.path)
         write_definition(folder, replace(definition, id=name))
         os.utime(folder.journal, (0, 0))  # used long ago
-    found = {}
+    megabytes = {}
     for name, data in (("empty", empty), ("new", full.path), ("again", full.path)):
         data.mkdir(exist_ok=True)
         service = Service(data)
@@ -104,11 +104,15 @@ def sleeping(scene: Path, count: int, views: int, work: Path) -> dict[str, float
             began = time.perf_counter()
             service.start()
             listed = service.http.get("/v1/scenes").json()["scenes"]
-            found[name] = time.perf_counter() - began, resident_mb(service.pid), len(listed)
+            megabytes[name] = time.perf_counter() - began, resident_mb(service.pid), len(listed)
             waited = [_first_view(service, one) for one in names[:views]] if name == "again" else []
         finally:
             service.stop()
-    (_, alone, _), (new, together, counted), (seconds, _, again) = found["empty"], found["new"], found["again"]
+    (_, alone, _), (new, together, counted), (seconds, _, again) = (
+        megabytes["empty"],
+        megabytes["new"],
+        megabytes["again"],
+    )
     assert (counted, again) == (count, count), f"{counted} and {again} of {count} scenes are listed"
     return {
         "mb_a_scene": (together - alone) / count,

@@ -161,7 +161,7 @@ def compare(
         )
         if missed
     ]
-    found = (
+    summary = (
         f"/health/live p50 {without.p(50):.1f} → {attacked.p(50):.1f} ms, p99 {without.p(99):.1f} → "
         f"{attacked.p(99):.1f} ms, {attacked.lost} of {len(attacked.health)} without an answer; memory "
         f"{without.memory:.0f} → {attacked.memory:.0f} MB; all closed after {closed:.0f} s; an update "
@@ -172,6 +172,6 @@ def compare(
         f"{attack.halves} half-sent headers, {attack.uploads} hanging uploads at once",
         f"/health/live answers, p99 + {P99_MS:.0f} ms; memory + {MEMORY_MB:.0f} MB; closed within {CLOSED_S:.0f} s; "
         f"update ≤ {SLOWER:g} times",
-        found,
+        summary,
         faults,
     )

@@ -143,9 +143,9 @@ def measure(
         names = capture.rig.names
         with Load(url, names, 2.0, width):  # connections, the reader's kernels
             time.sleep(3.0)
-        found = [ViewTimes(rate) for rate in rates]
+        times = [ViewTimes(rate) for rate in rates]
         for _ in range(turns):
-            for row in found:
+            for row in times:
                 with Load(url, names, row.rate, width) as load:
                     time.sleep(IDLE_S)
                 row.idle += load.latencies
@@ -156,7 +156,7 @@ def measure(
                 row.loaded += load.latencies
                 row.refused += load.refused
                 echo(line(row))
-        return found
+        return times
     finally:
         with contextlib.suppress(Exception):
             service.stop()

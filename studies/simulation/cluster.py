@@ -88,13 +88,13 @@ class SimulatedCluster:
             self._changed(node)
 
     def _choose(self, needs: Needs) -> Node:
-        found = []
+        candidates = []
         for node in self.nodes:
             if node.listed and node.fits(needs):
                 load = node.load()
-                found.append((load if load >= SPREAD_ABOVE else 0.0, node.number, node))
-        found.sort(key=lambda entry: entry[:2])
-        return self.random.choice(found[: max(1, int(TOP_SHARE * len(self.nodes)))])[2]
+                candidates.append((load if load >= SPREAD_ABOVE else 0.0, node.number, node))
+        candidates.sort(key=lambda entry: entry[:2])
+        return self.random.choice(candidates[: max(1, int(TOP_SHARE * len(self.nodes)))])[2]
 
     # Failures.
 

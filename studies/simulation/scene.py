@@ -88,10 +88,10 @@ class SimulatedScene:
         """So many frames are committed; who committed those that are new is read through the link, as clients do."""
         for index in self._frames.untold(self.plan.name, count):
             try:
-                found = read_frame(frame_file(self.plan.spec.folder.states, index)).worker
+                worker = read_frame(frame_file(self.plan.spec.folder.states, index)).worker
             except FileNotFoundError:  # told of, and not to be read: no worker has this number
-                found = 0
-            self._frames.tell(self.plan.name, index, found)
+                worker = 0
+            self._frames.tell(self.plan.name, index, worker)
         self._committed = count
 
     # Frames.

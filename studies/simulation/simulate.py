@@ -173,7 +173,7 @@ def _needs(spec: SceneSpec) -> Needs:
 
 def _plans(sizes: Sizes, data: DataFolder, specs: Sequence[SceneSpec], random: Random) -> list[tuple[ScenePlan, float]]:
     """All scenes, and when they are created. The first end in time for those that are asked for beyond the room."""
-    end, found = sizes.seconds, []
+    end, plans = sizes.seconds, []
     shares = [share for share, _ in RIGS]
     for number in range(sizes.scenes + sizes.more):
         begin, last, count, ends = random.uniform(0, CREATED_S), end, sizes.frames, None
@@ -185,17 +185,17 @@ def _plans(sizes: Sizes, data: DataFolder, specs: Sequence[SceneSpec], random: R
         moments = [begin + step * (index + random.random()) for index in range(count)]
         (kind,) = random.choices(range(len(specs)), shares)
         spec = replace(specs[kind], folder=data.scene(f"scene-{number:05}"))
-        found.append((ScenePlan(spec, kind, moments, ends), begin))
-    return found
+        plans.append((ScenePlan(spec, kind, moments, ends), begin))
+    return plans
 
 
 def _checked(frames: FrameRecord, plan: ScenePlan) -> FrameCounts:
     """Reads the states of a scene through the link, as clients do."""
     states, name = plan.spec.folder.states, plan.name
-    found = {index: read_frame(frame_file(states, index)) for index in listed(states)}
+    counts_by_frame = {index: read_frame(frame_file(states, index)) for index in listed(states)}
     chain, state = [], name
     for index in range(len(plan.frames)):
         state = content(state, index)
         chain.append(state)
     frames.acknowledged.setdefault(name, 0)
-    return frames.check(name, found, chain)
+    return frames.check(name, counts_by_frame, chain)

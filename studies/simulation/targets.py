@@ -28,9 +28,9 @@ class Row:
 def rows(outcome: Outcome) -> list[Row]:
     """Compares an outcome with the targets."""
     frames = outcome.frames
-    seconds = [times for found in outcome.placed.values() for times in found]
+    seconds = [times for table_rows in outcome.placed.values() for times in table_rows]
     share = _share([room for room, _ in seconds])
-    found = [
+    table_rows = [
         _none("acknowledged frames lost", frames.lost, f" of {frames.read + frames.lost:,}"),
         _none("frames run twice", frames.twice),
         _none("workers started while another of their scene ran", frames.beside, f" of {outcome.workers:,}"),
@@ -51,9 +51,9 @@ def rows(outcome: Outcome) -> list[Row]:
         if times := outcome.placed.get(reason):
             room, answered = (_share(each) for each in zip(*times, strict=True))
             share_of = f"{room:.2%} of {len(times):,}; while the head answers {answered:.2%}"
-            found.append(Row(f"… {words}", share_of))
+            table_rows.append(Row(f"… {words}", share_of))
     longest = max(outcome.waited, default=0.0)
-    found += [
+    table_rows += [
         _none(
             f"workers without a place for {WAIT_S:g} s whose scene was not told why",
             outcome.unexplained,
@@ -69,8 +69,8 @@ def rows(outcome: Outcome) -> list[Row]:
     ]
     for failure, words in AFTER.items():
         if times := outcome.resumed.get(failure):
-            found.append(Row(f"from {words} until the scene goes on, while a node has room", _seconds(times)))
-    return found
+            table_rows.append(Row(f"from {words} until the scene goes on, while a node has room", _seconds(times)))
+    return table_rows
 
 
 def told(outcome: Outcome) -> str:

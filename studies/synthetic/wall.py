@@ -43,9 +43,9 @@ def wall(size: Size) -> Gaussians:
     patches = rng.uniform(0.1, 0.9, (50, 50, 3))  # the same picture whatever it is made of
     row, column = (np.minimum(((axis / WIDTH_M + 0.5) * 50).astype(int), 49) for axis in (y, x))
     points = np.stack([x, y, 0.01 * rng.standard_normal(len(x))], axis=1)
-    found = Gaussians.of_points(points, radius=0.6 * WIDTH_M / side, colours=patches[row, column])
+    gaussians = Gaussians.of_points(points, radius=0.6 * WIDTH_M / side, colours=patches[row, column])
     moves = np.maximum(np.abs(x), np.abs(y)) <= np.sqrt(size.moving) * WIDTH_M / 2 + 1e-9
-    return found.replace(foreground=moves.astype(np.float32))
+    return gaussians.replace(foreground=moves.astype(np.float32))
 
 
 def rig(size: Size) -> Rig:

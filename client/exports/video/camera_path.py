@@ -43,10 +43,10 @@ def fitted(camera: Camera, size: tuple[int, int]) -> Camera:
 
 def centred(camera: Camera, size: tuple[int, int]) -> Camera:
     """As ``fitted``, with the optical axis in the middle of the picture."""
-    found = fitted(camera, size)
-    scale = min(found.fx, found.fy)
+    fitted_camera = fitted(camera, size)
+    scale = min(fitted_camera.fx, fitted_camera.fy)
     lens = np.array([[scale, 0, size[0] / 2], [0, scale, size[1] / 2], [0, 0, 1]])
-    return Camera(found.name, lens, found.world_to_camera, *size)
+    return Camera(fitted_camera.name, lens, fitted_camera.world_to_camera, *size)
 
 
 def still(camera: Camera, size: tuple[int, int]) -> CameraPath:

@@ -96,6 +96,6 @@ class Trails:
             u, v = uv[-1, track]
             draw.ellipse((u - thick, v - thick, u + thick, v + thick), fill=(*self._colours[track], 255))
         small = sheet.reduce(SHARPER)
-        found = Image.fromarray(picture)
-        found.paste(small, (0, 0), small)
-        return np.asarray(found)
+        image = Image.fromarray(picture)
+        image.paste(small, (0, 0), small)
+        return np.asarray(image)

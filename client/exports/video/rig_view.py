@@ -66,8 +66,8 @@ def _nearest_to_axes(centres: Float, ahead: Float) -> Float | None:
     matrix = across.sum(axis=0)
     if len(centres) < 2 or abs(np.linalg.det(matrix)) < PARALLEL * np.abs(matrix).max() ** 3:
         return None
-    found: Float = np.linalg.solve(matrix, np.einsum("nij,nj->i", across, centres))
-    return found
+    point: Float = np.linalg.solve(matrix, np.einsum("nij,nj->i", across, centres))
+    return point
 
 
 def _unit(vector: Float) -> Float:

@@ -69,8 +69,8 @@ def picture_size(text: str) -> tuple[int, int]:
     >>> picture_size("1280x720")
     (1280, 720)
     """
-    found = re.fullmatch(r"(\d{1,5})[xX×](\d{1,5})", text.strip())
-    size = (int(found[1]), int(found[2])) if found else (0, 0)
+    match = re.fullmatch(r"(\d{1,5})[xX×](\d{1,5})", text.strip())
+    size = (int(match[1]), int(match[2])) if match else (0, 0)
     if not all(SMALLEST <= side <= LARGEST for side in size):
         raise InputError(
             f"size {text!r} is no size of a picture", f"give WIDTHxHEIGHT, as 1280x720, {SMALLEST} to {LARGEST} each"

@@ -57,7 +57,7 @@ def _depth(data: bytes) -> int:
     lines = [line for line in data.splitlines() if line.strip()]
     if len(tags):  # XML may be indented at will
         return int(max(brackets.max(), tags.max()))
-    dashes = max((len(found[0]) // 2 for found in map(DASHES.match, lines) if found), default=0)
+    dashes = max((len(match[0]) // 2 for match in map(DASHES.match, lines) if match), default=0)
     return int(max(brackets.max(initial=0), len({len(line) - len(line.lstrip()) for line in lines}), dashes))
 
 

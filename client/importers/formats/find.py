@@ -33,13 +33,13 @@ def _found_here(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     names = sorted(path for path in folder.iterdir() if path.is_file())
-    found = [path for path in names if path.name == CALISCOPE or path.name.lower().endswith(QUALISYS)]
-    found += [path for path in names if _is_toml(path)]
+    files = [path for path in names if path.name == CALISCOPE or path.name.lower().endswith(QUALISYS)]
+    files += [path for path in names if _is_toml(path)]
     if is_easymocap(folder):
-        found.append(folder / INTRINSICS)
+        files.append(folder / INTRINSICS)
     elif camera_files(folder):
-        found.append(folder)
-    return found
+        files.append(folder)
+    return files
 
 
 def _is_toml(path: Path) -> bool:

@@ -32,8 +32,8 @@ def camera_files(folder: Path) -> list[Path]:
     """The files of the folder that hold a camera's matrix; those of EasyMocap have several, and are not among them."""
     if not folder.is_dir():
         return []
-    found = sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDS and path.is_file())
-    return [path for path in found if path.name not in (INTRINSICS, EXTRINSICS) and _is_camera(path)]
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDS and path.is_file())
+    return [path for path in files if path.name not in (INTRINSICS, EXTRINSICS) and _is_camera(path)]
 
 
 def _is_camera(path: Path) -> bool:

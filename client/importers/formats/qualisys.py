@@ -57,9 +57,9 @@ def read_qualisys(path: Path) -> Calibration:
     Raises:
         CaptureError: no XML, or a field is missing or cannot be; the message names file, camera, field and remedy.
     """
-    found = [camera for camera in _cameras(path) if camera.own.get("active", "1") not in ("0", "false")]
-    video = [camera for camera in found if _films(camera)] or found
-    markers = [camera.own.get("serial", "?") for camera in found if camera not in video]
+    cameras = [camera for camera in _cameras(path) if camera.own.get("active", "1") not in ("0", "false")]
+    video = [camera for camera in cameras if _films(camera)] or cameras
+    markers = [camera.own.get("serial", "?") for camera in cameras if camera not in video]
     why = f"{path.name}: left out, they record markers and no video"
     return calibration_of_cameras(path, [_lens(path, camera) for camera in video], markers, why)
 
@@ -71,13 +71,13 @@ def _films(camera: _Camera) -> bool:
 
 def _cameras(path: Path) -> list[_Camera]:
     """The cameras of the file. Documents that define entities are refused: no calibration does."""
-    found: list[_Camera] = []
+    cameras: list[_Camera] = []
 
     def started(name: str, attributes: dict[str, str]) -> None:
         if name == "camera":
-            found.append(_Camera(attributes))
-        elif found and name in PARTS:
-            found[-1].parts[name] = attributes
+            cameras.append(_Camera(attributes))
+        elif cameras and name in PARTS:
+            cameras[-1].parts[name] = attributes
 
     def declared(*_: Any) -> None:
         raise CaptureError(f"{path}: declares a document type, which no calibration of QTM does; export it anew")
@@ -93,9 +93,9 @@ def _cameras(path: Path) -> list[_Camera]:
         raise CaptureError(
             f"{path}: cannot be read as XML ({fault}); export the calibration from QTM as text (*.qca.txt)"
         ) from fault
-    if not found:
+    if not cameras:
         raise CaptureError(f"{path}: lists no camera; export the calibration from QTM as text (*.qca.txt)")
-    return found
+    return cameras
 
 
 def _lens(path: Path, camera: _Camera) -> LensCamera:

@@ -75,16 +75,16 @@ def spread_of(seen: Seen) -> float | None:
     Means of the pictures and of their renderings tell it. What all channels of a camera share has no say: a thing
     before black that is drawn too small, or that shines a little, is as dark in all of them.
     """
-    found = []
+    spreads = []
     for view in seen.views:
         fit = seen.result.trace.cameras.get(view.name)
         if fit is not None and fit["colour_shift"] is not None:
             shown = (view.mean - np.array(fit["colour_shift"]) - view.exposure[:3, 1]) / view.exposure[:3, 0]
             gain = POWER * np.log((view.mean + FOOT) / (np.maximum(shown, 0) + FOOT))
-            found.append(gain - gain.mean())
-    if len(found) < CAMERAS:
+            spreads.append(gain - gain.mean())
+    if len(spreads) < CAMERAS:
         return None
-    variance: NDArray[np.float64] = np.var(found, axis=0)
+    variance: NDArray[np.float64] = np.var(spreads, axis=0)
     return float(np.sqrt(variance.mean()))
 
 

@@ -53,8 +53,8 @@ def neighbourhood_turns(before: Array, after: Array, near: NDArray[np.int64]) ->
 def neighbourhoods(means: Array) -> NDArray[np.int64]:
     """[N, k] the nearest of each, itself the first."""
     count = len(means)
-    found: NDArray[np.int64] = np.asarray(cKDTree(means).query(means, min(TURNED_TOGETHER, count))[1])
-    return found.reshape(count, -1)
+    nearest: NDArray[np.int64] = np.asarray(cKDTree(means).query(means, min(TURNED_TOGETHER, count))[1])
+    return nearest.reshape(count, -1)
 
 
 class DirectionPart(Part):

@@ -63,8 +63,8 @@ def change_of_light(before: Gaussians, after: Gaussians, centre: Double) -> floa
         old = before.colours[rows, channel].astype(np.float64)
         change = after.colours[rows, channel] - old
         weighed = terms * old[:, None]
-        found = np.linalg.lstsq(weighed.T @ weighed, weighed.T @ change, rcond=None)[0]  # seven numbers: well enough
-        explained += float(np.square(weighed @ found).sum())
+        light = np.linalg.lstsq(weighed.T @ weighed, weighed.T @ change, rcond=None)[0]  # seven numbers: well enough
+        explained += float(np.square(weighed @ light).sum())
         total += float(np.square(old).sum())
     return float(np.sqrt(explained / max(total, 1e-12)))
 

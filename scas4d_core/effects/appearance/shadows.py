@@ -74,13 +74,13 @@ class Shadows(Effect):
         stands = float((~state.moving).mean())
         if 0 < stands < STANDS:
             return None
-        found = {}
+        arrays = {}
         for view in seen.views:
             means = _means(view)
             # Where all seems to move, as without masks, it is not known yet what stands.
             hidden = _hidden(view, state, seen.renderer) if stands else np.zeros(means.shape[:2])
-            found[view.name] = np.concatenate([means, hidden[..., None]], axis=-1).astype(np.float16)
-        return found
+            arrays[view.name] = np.concatenate([means, hidden[..., None]], axis=-1).astype(np.float16)
+        return arrays
 
     def on_at_first(self, seen: Seen) -> bool:
         """True where something stands."""

@@ -140,8 +140,8 @@ def equations(seen: Pictures, moved: Double, depth: float = 1.0) -> Equations:
 def _weights(residual: Double) -> Double:
     """Of each residual."""
     usual = max(QUIETEST, 1.4826 * float(np.median(np.abs(residual))))
-    found: Double = (FEW * TOLD**2) ** -1 / (1 + np.square(residual / (CAUCHY * usual)))
-    return found
+    weights: Double = (FEW * TOLD**2) ** -1 / (1 + np.square(residual / (CAUCHY * usual)))
+    return weights
 
 
 def twist_equations(lens: Array, seen: Pictures, depth: Array) -> Equations:
@@ -189,8 +189,8 @@ def solved(one: Equations, lens: Array, twist: Double, vector: Double | None = N
     focal, units = float(lens[0] + lens[1]) / 2, np.array([one.depth] * 3 + [1.0] * 3)
     before = np.array([(focal / SHIFTED) ** 2] * 3 + [(focal / TURNED) ** 2] * 3)
     left = (one.vector if vector is None else vector) - before * (twist / units)
-    found: Double = np.asarray(np.linalg.solve(one.matrix + np.diag(before), left), np.float64) * units
-    return found
+    twist_of: Double = np.asarray(np.linalg.solve(one.matrix + np.diag(before), left), np.float64) * units
+    return twist_of
 
 
 def of_the_world(one: Equations, pose: Double) -> Double:
@@ -210,10 +210,10 @@ def adjoint(pose: Double) -> Double:
     >>> adjoint(beside) @ [0, 0, 0, 0, 1, 0]  # a turn about the origin turns and shifts
     array([0., 0., 2., 0., 1., 0.])
     """
-    turn, found = pose[:3, :3], np.zeros((6, 6))
-    found[:3, :3] = found[3:, 3:] = turn
-    found[:3, 3:] = _crossing(pose[:3, 3]) @ turn
-    return found
+    turn, matrix = pose[:3, :3], np.zeros((6, 6))
+    matrix[:3, :3] = matrix[3:, 3:] = turn
+    matrix[:3, 3:] = _crossing(pose[:3, 3]) @ turn
+    return matrix
 
 
 def motion_of(twist: Double) -> Double:
@@ -222,14 +222,14 @@ def motion_of(twist: Double) -> Double:
     >>> motion_of(np.array([1.0, 2, 3, 0, 0, 0]))[:3, 3]
     array([1., 2., 3.])
     """
-    found, cross, angle = np.eye(4), _crossing(twist[3:]), float(np.linalg.norm(twist[3:]))
+    motion, cross, angle = np.eye(4), _crossing(twist[3:]), float(np.linalg.norm(twist[3:]))
     small = angle < 1e-4  # series: the quotients below would lose their digits
     one = 1 - angle**2 / 6 if small else np.sin(angle) / angle
     two = 0.5 - angle**2 / 24 if small else (1 - np.cos(angle)) / angle**2
     three = 1 / 6 - angle**2 / 120 if small else (1 - one) / angle**2
-    found[:3, :3] += one * cross + two * cross @ cross
-    found[:3, 3] = (np.eye(3) + two * cross + three * cross @ cross) @ twist[:3]
-    return found
+    motion[:3, :3] += one * cross + two * cross @ cross
+    motion[:3, 3] = (np.eye(3) + two * cross + three * cross @ cross) @ twist[:3]
+    return motion
 
 
 def _crossing(vector: Double) -> Double:

@@ -113,14 +113,14 @@ class Poses:
     def of(cls, arrays: Arrays, count: int) -> Poses:
         """From ``arrays``; those that are not there are 0."""
         shapes = {"twists": (count, 6), "moved": (count, 3), "offsets": (count, 3), "shares": (count,)}
-        found: dict[str, NDArray[Any]] = {name: np.zeros(shape) for name, shape in shapes.items()}
-        found["looks"] = np.zeros(count, np.int64)
-        return cls(**{name: arrays[name].copy() if name in arrays else empty for name, empty in found.items()})
+        blank: dict[str, NDArray[Any]] = {name: np.zeros(shape) for name, shape in shapes.items()}
+        blank["looks"] = np.zeros(count, np.int64)
+        return cls(**{name: arrays[name].copy() if name in arrays else empty for name, empty in blank.items()})
 
     def arrays(self) -> Arrays:
         """As they are carried to the next frame; no twists where no camera has moved."""
-        found: Arrays = {name: getattr(self, name) for name in ("moved", "offsets", "shares", "looks")}
-        return {**found, "twists": self.twists} if self.twists.any() else found
+        arrays: Arrays = {name: getattr(self, name) for name in ("moved", "offsets", "shares", "looks")}
+        return {**arrays, "twists": self.twists} if self.twists.any() else arrays
 
     def look(self, row: int, turn: Equations) -> None:
         """Notes what a camera's residual says, in the numbers of ``turn_equations``, relative to its present pose."""
@@ -139,8 +139,8 @@ class Poses:
         """[C] the cameras that may have moved: they are rendered, to be looked at again at once."""
         sizes, looked = np.linalg.norm(self.offsets, axis=1), self.looks > 0
         usual = float(np.median(sizes[looked])) if looked.any() else 0.0
-        found: NDArray[np.bool_] = sizes >= max(LEAST, TIMES * usual)
-        return found
+        off: NDArray[np.bool_] = sizes >= max(LEAST, TIMES * usual)
+        return off
 
     def off(self) -> NDArray[np.bool_]:
         """[C] the cameras that have moved."""
@@ -271,14 +271,14 @@ def _looked_at(seen: Seen, poses: Poses, rows: Mapping[str, int]) -> list[Traini
 
 def _aligned(seen: Seen, views: list[TrainingView]) -> dict[int, tuple[Equations, Camera, Array]]:
     """By row, the equations of each view, its camera and lens; without those that tell too little."""
-    rows, found = {name: row for row, name in enumerate(seen.rig.names)}, {}
+    rows, by_row = {name: row for row, name in enumerate(seen.rig.names)}, {}
     for view in views:
         shown, depth = _rendered(seen, view)
         told = pictures(view.target[:3], _exposed(view, shown))
         if told is not None:
             equations = twist_equations(view.camera.lens, told, depth)
-            found[rows[view.name]] = (equations, seen.rig[view.name], view.camera.lens)
-    return found
+            by_row[rows[view.name]] = (equations, seen.rig[view.name], view.camera.lens)
+    return by_row
 
 
 def _look(poses: Poses, row: int, view: TrainingView, shown: Array, every: int) -> None:

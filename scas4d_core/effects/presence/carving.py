@@ -163,8 +163,8 @@ def footprint(one: Novelty, points: Float, voxel: float) -> Bool:
     if not inside.any():
         return shown
     wide = 1 + int(np.ceil(one.camera.fx * voxel / float(np.median(depth[inside]))))
-    found: Bool = binary_dilation(shown, np.ones((2 * (wide // 2) + 1,) * 2, np.bool_))
-    return found
+    dilated: Bool = binary_dilation(shown, np.ones((2 * (wide // 2) + 1,) * 2, np.bool_))
+    return dilated
 
 
 def colours_of(seen: Sequence[Novelty], points: Float, hull: Hull) -> tuple[NDArray[np.float32], NDArray[np.int64]]:

@@ -67,7 +67,7 @@ def _gone(state: Gaussians, arrays: Arrays, number: int) -> Float:
 
 def _ways(hull: Hull, arrays: Arrays) -> dict[int, Float]:
     """By number of a young thing, [3] metres to the nearest hull of about its size."""
-    found: dict[int, Float] = {}
+    displacements: dict[int, Float] = {}
     numbers = np.unique(hull.things)
     centres = np.array([hull.points[hull.things == number].mean(axis=0) for number in numbers]).reshape(-1, 3)
     volumes = np.array([(hull.things == number).sum() * hull.voxel**3 for number in numbers])
@@ -75,5 +75,5 @@ def _ways(hull: Hull, arrays: Arrays) -> dict[int, Float]:
         alike = (volumes < SAME * volume) & (volumes > volume / SAME)
         if alike.any():
             ways = (centres - centre)[alike]
-            found[thing] = ways[np.argmin(np.square(ways).sum(axis=1))]
-    return found
+            displacements[thing] = ways[np.argmin(np.square(ways).sum(axis=1))]
+    return displacements

@@ -163,14 +163,14 @@ class Entering(Effect):
         left = seen.result.carried.get(NAME)
         if left is not None and seen.result.gaussians.present[left["rows"]].any():
             return _evidence(float(left["share"]), int(left["cameras"]))
-        found = entered(seen)
-        return Evidence(0.0, "") if found is None else _evidence(found.share, found.cameras)
+        things = entered(seen)
+        return Evidence(0.0, "") if things is None else _evidence(things.share, things.cameras)
 
     def populated(self, seen: Seen) -> UpdateResult:
         """The result with the Gaussians that are born, and the young ones settled."""
         from scas4d_core.effects.presence.growing import grown, seeds, settled
 
-        result, found = seen.result, entered(seen)
+        result, things = seen.result, entered(seen)
         left = result.carried.get(NAME, NOBODY)
         state, rng = result.gaussians, np.random.default_rng([seen.index, len(result.gaussians)])
         young = left["age"] < SETTLED
@@ -183,24 +183,24 @@ class Entering(Effect):
         if len(grown_up):
             denied = _denied(said(seen, seen.views), state.means[grown_up].astype(np.float64))
             state = state.retire(grown_up[denied]) if denied.any() else state
-        if found is not None and state.retired.any():
-            back = returned(found.seen, found.hull, state, seen.renderer)
+        if things is not None and state.retired.any():
+            back = returned(things.seen, things.hull, state, seen.renderer)
             if back:
                 state = revived(state, back)
-                arrays |= _remembered(found, state, np.concatenate([one.rows for one in back]), arrays)
-                rest = ~np.isin(found.hull.things, [one.thing for one in back])
-                found = replace(found, hull=found.hull.only(rest)) if rest.any() else None
-        if found is not None:
-            points, colours = seeds(found.seen, found.hull, min(int(BUDGET * len(state)), seen.room), rng)
-            found = found if len(points) else None
+                arrays |= _remembered(things, state, np.concatenate([one.rows for one in back]), arrays)
+                rest = ~np.isin(things.hull.things, [one.thing for one in back])
+                things = replace(things, hull=things.hull.only(rest)) if rest.any() else None
+        if things is not None:
+            points, colours = seeds(things.seen, things.hull, min(int(BUDGET * len(state)), seen.room), rng)
+            things = things if len(points) else None
         born = None
-        if found is not None:
+        if things is not None:
             given = seen.views, seen.rig, seen.renderer, rng
             born = grown(state, points, colours, *given, moves=True, time=seen.time)
-        if found is not None and born is not None:
+        if things is not None and born is not None:
             rows = np.arange(len(state), len(state) + len(born))
             state = state.joined(born)
-            arrays |= _remembered(found, state, rows, arrays)
+            arrays |= _remembered(things, state, rows, arrays)
             alone = np.full(len(born), -1, np.int64)
             joins = alone if joins is None else np.concatenate([joins, alone])
         if state is result.gaussians and left is NOBODY:

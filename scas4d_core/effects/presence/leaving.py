@@ -50,9 +50,9 @@ def outside(state: Gaussians, rig: Rig) -> NDArray[np.bool_]:
             border = camera.fx * width / depth
             inside = (uv > -border[:, None]) & (uv < [camera.width, camera.height] + border[:, None])
         rows = rows[~((depth > 0) & inside.all(axis=1))]
-    found = np.zeros(len(state), np.bool_)
-    found[rows] = True
-    return found
+    mask = np.zeros(len(state), np.bool_)
+    mask[rows] = True
+    return mask
 
 
 @dataclass(frozen=True)

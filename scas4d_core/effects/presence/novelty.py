@@ -127,12 +127,12 @@ def _glimpse(view: TrainingView, thinned: Thinned) -> Glimpse:
     label, rest = shown[3], shown[4]
     if len(target) > 3:
         new, stands = (target[3] > 0.5) & (label < ABSENT), (target[3] <= 0.5) & (label < ABSENT)
-        found = _all(new)
+        new_squares = _all(new)
     else:
         stands = label < ABSENT
-        found = _all(label < THERE) & (difference > max(DIFFERENT, TIMES_USUAL * float(np.median(difference))))
+        new_squares = _all(label < THERE) & (difference > max(DIFFERENT, TIMES_USUAL * float(np.median(difference))))
     bare = _all(stands & (rest > BARE)) & (difference > DIFFERENT)
-    return Glimpse(view, float(found.mean()), float(bare.mean()))
+    return Glimpse(view, float(new_squares.mean()), float(bare.mean()))
 
 
 def _corners(plane: NDArray[Any]) -> tuple[NDArray[Any], ...]:
@@ -142,8 +142,8 @@ def _corners(plane: NDArray[Any]) -> tuple[NDArray[Any], ...]:
 
 def _all(plane: Bool) -> Bool:
     one, two, three, four = _corners(plane)
-    found: Bool = one & two & three & four
-    return found
+    everywhere: Bool = one & two & three & four
+    return everywhere
 
 
 def said(seen: Seen, views: Sequence[TrainingView]) -> list[Novelty]:
@@ -153,8 +153,8 @@ def said(seen: Seen, views: Sequence[TrainingView]) -> list[Novelty]:
     missing = [view for view in views if view.name not in known or known[view.name].view is not view]
     colours = state.colours.copy()
     colours[: len(seen.before)] = seen.before.colours
-    found = novelties(state, colours, missing, seen.rig, seen.renderer)
-    known.update({view.name: one for view, one in zip(missing, found, strict=True)})
+    new_things = novelties(state, colours, missing, seen.rig, seen.renderer)
+    known.update({view.name: one for view, one in zip(missing, new_things, strict=True)})
     return [known[view.name] for view in views]
 
 
@@ -199,5 +199,5 @@ def _novelty(state: Gaussians, view: TrainingView, camera: Camera, renderer: Ren
 def _wide(pixels: Bool) -> Bool:
     """The regions that are somewhere as wide as ``RIM``."""
     cores: Any = binary_opening(pixels, np.ones((RIM, RIM), np.bool_))
-    found: Bool = binary_propagation(cores, mask=pixels)
-    return found
+    grown: Bool = binary_propagation(cores, mask=pixels)
+    return grown

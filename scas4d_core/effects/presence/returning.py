@@ -48,14 +48,14 @@ def returned(seen: Sequence[Novelty], hull: Hull, state: Gaussians, renderer: Re
         seen: what the cameras say. hull: of what is new. state: Θ_t. renderer: draws.
     """
     retired = np.flatnonzero(state.retired & (state.foreground > 0.5))
-    found: list[Returned] = []
+    revivals: list[Returned] = []
     for thing in np.unique(hull.things):
         points = hull.points[hull.things == thing]
         best: tuple[float, Returned] | None = None
         for rows in _groups(state.means[retired].astype(np.float64), APART * _size(points)):
             own = retired[rows]
             means = state.means[own].astype(np.float64)
-            taken = any(np.isin(own, one.rows).any() for one in found)
+            taken = any(np.isin(own, one.rows).any() for one in revivals)
             if taken or not 1 / ALIKE <= _size(means) / _size(points) <= ALIKE:
                 continue
             shift = points.mean(axis=0) - means.mean(axis=0)
@@ -63,8 +63,8 @@ def returned(seen: Sequence[Novelty], hull: Hull, state: Gaussians, renderer: Re
             if left < 1 - EXPLAINS and (best is None or left < best[0]):
                 best = left, Returned(int(thing), own, shift)
         if best is not None:
-            found.append(best[1])
-    return found
+            revivals.append(best[1])
+    return revivals
 
 
 def revived(state: Gaussians, found: Sequence[Returned]) -> Gaussians:

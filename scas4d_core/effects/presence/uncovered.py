@@ -51,13 +51,13 @@ def _looked_for(seen: Seen, glanced: int) -> Found | None:
     if sum(one.bare.sum() >= SMALLEST * one.bare.size for one in glance(seen, glanced, bare=SMALLEST)) < glanced:
         return None
     everyone = said(seen, seen.views)
-    found = uncovered(everyone, seen.result.gaussians, seen.renderer)
-    if not len(found.points):
+    points = uncovered(everyone, seen.result.gaussians, seen.renderer)
+    if not len(points.points):
         return None
     total = sum(float(one.error.sum()) for one in everyone)
-    prints = [one.bare & footprint(one, found.points, found.spacing) for one in everyone]
+    prints = [one.bare & footprint(one, points.points, points.spacing) for one in everyone]
     explains = sum(float(one.error[where].sum()) for one, where in zip(everyone, prints, strict=True))
-    return (found, explains / total) if total > 0 else None
+    return (points, explains / total) if total > 0 else None
 
 
 @dataclass(frozen=True)
@@ -68,17 +68,17 @@ class UncoveredEffect(Effect):
         """What is bare has so much of the error; once something was born, fewer cameras have to see it."""
         if not seen.views:
             return None
-        found = _found(seen, GLANCED_ON if NAME in seen.result.carried else GLANCED)
-        return Evidence(0.0, "") if found is None else _evidence(found[1])
+        points = _found(seen, GLANCED_ON if NAME in seen.result.carried else GLANCED)
+        return Evidence(0.0, "") if points is None else _evidence(points[1])
 
     def populated(self, seen: Seen) -> UpdateResult:
         """The result with the Gaussians that are born."""
-        result, found = seen.result, _found(seen, GLANCED_ON)
-        if found is None or found[1] < WORTH:
+        result, uncovered_points = seen.result, _found(seen, GLANCED_ON)
+        if uncovered_points is None or uncovered_points[1] < WORTH:
             return result
         from scas4d_core.effects.presence.growing import grown
 
-        points, share = found
+        points, share = uncovered_points
         state, rng = result.gaussians, np.random.default_rng([seen.index, len(result.gaussians)])
         some = np.arange(len(points.points))
         most = min(int(BUDGET * len(state)), seen.room)

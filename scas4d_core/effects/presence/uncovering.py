@@ -61,8 +61,8 @@ def uncovered(seen: Sequence[Novelty], state: Gaussians, renderer: Renderer) -> 
         seen: what the cameras say. state: Θ_t. renderer: draws.
     """
     standing = state.retire(state.moving)
-    found = [_points(one, standing, renderer) for one in seen if one.bare.any()]
-    points = np.concatenate(found) if found else np.zeros((0, 3))
+    clouds = [_points(one, standing, renderer) for one in seen if one.bare.any()]
+    points = np.concatenate(clouds) if clouds else np.zeros((0, 3))
     if not len(points):
         return Uncovered(points, np.zeros((0, 3), np.float32), 0.0)
     pixel = np.full(len(points), np.inf)
@@ -103,8 +103,8 @@ def _plane(at: NDArray[np.int64], values: Array, wanted: NDArray[np.int64]) -> F
         root = np.sqrt(weights)[:, None]
         solution = np.linalg.lstsq(root * design, root[:, 0] * values, rcond=None)[0]
         weights = 1 / (1 + np.square((values - design @ solution) / (NEAR * middle)))
-    found: Float = np.maximum(np.column_stack([wanted, np.ones(len(wanted))]) @ solution, 0.1 * middle)
-    return found
+    depth: Float = np.maximum(np.column_stack([wanted, np.ones(len(wanted))]) @ solution, 0.1 * middle)
+    return depth
 
 
 def _lifted(one: Novelty, pixels: NDArray[np.int64], depth: Float) -> Float:

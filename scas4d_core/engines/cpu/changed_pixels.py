@@ -123,11 +123,11 @@ class ChangedPixels(CpuRenderer):
         lap("render")
         self._compare_box(region, view)
         lap("picture loss")
-        found = self.rasterizer.backward(*self.rasterizer.gradient_buffers(), self._detached)
+        gradients = self.rasterizer.backward(*self.rasterizer.gradient_buffers(), self._detached)
         if self._gradients is None or self._gradients.features.shape != features.shape:
             shapes = (means.shape, factors.shape, opacities.shape, features.shape, (len(means), 2))
             self._gradients = Gradients(*(np.zeros(shape, np.float32) for shape in shapes))
-        for whole, part in zip(self._gradients, found, strict=True) if len(self._moving) else ():
+        for whole, part in zip(self._gradients, gradients, strict=True) if len(self._moving) else ():
             tiles.put_rows(region.moving, self._moving, part.reshape(len(part), -1), whole.reshape(len(whole), -1))
         lap("render backward")
         return self._gradients
@@ -146,8 +146,8 @@ class ChangedPixels(CpuRenderer):
         count, shown = len(state), features_seen(state, view.camera)
         region = self._drawn((state.means, state.factors, state.opacities, shown), view)
         sums, weights = np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
-        found = self._lacking(view, most)
-        sums[self._moving], weights[self._moving] = found[0][region.moving], found[1][region.moving]
+        missing = self._lacking(view, most)
+        sums[self._moving], weights[self._moving] = missing[0][region.moving], missing[1][region.moving]
         return sums, weights
 
     def shown(self, view: TrainingView) -> Picture:

@@ -151,12 +151,12 @@ class Shading:
     def taken(self, rows: NDArray[np.int64], parents: NDArray[np.int64]) -> Shading:
         """The same for some rows, with their moments, and for further ones like their parents, without."""
         every = np.concatenate([rows, parents])
-        found = Shading(self.gloss[every], self.environment, self._rates)
+        chosen = Shading(self.gloss[every], self.environment, self._rates)
         moments = self.moments[0][:, every]
         moments[:, len(rows) :] = 0
-        found.moments = [np.ascontiguousarray(moments), self.moments[1]]
-        found.changed_from, found._steps = self.changed_from[every], self._steps
-        return found
+        chosen.moments = [np.ascontiguousarray(moments), self.moments[1]]
+        chosen.changed_from, chosen._steps = self.changed_from[every], self._steps
+        return chosen
 
     def smooth(self, means: Array) -> None:
         """Averages the changes since ``changed_from`` over neighbours on the same side of a surface.

@@ -278,12 +278,12 @@ class CpuRasterizer:
             last.splats, last.starts, last.items, last.slots, last.covers, last.learnt, last.tile_order, threads(),
             (last.camera.width, last.camera.height), self.limits, g_image, records,
         )  # fmt: skip
-        found = self._buffer("g_features", (count, blend_kernels.GROUP))
+        gradients = self._buffer("g_features", (count, blend_kernels.GROUP))
         shape = (-(-count // projection.CHUNK), len(projection.ACTED_BACKWARD))
         acted = self._buffer("acted_backward", shape, np.int64)
-        feature_gradients.sum_features(last.counts * last.learnt, last.firsts, records, found, acted)
+        feature_gradients.sum_features(last.counts * last.learnt, last.firsts, records, gradients, acted)
         self.guards.add(projection.ACTED_BACKWARD, acted)
-        return found
+        return gradients
 
     @property
     def planes(self) -> Array:

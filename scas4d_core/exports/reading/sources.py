@@ -74,8 +74,8 @@ def _opened(given: Path, suffix: str, frames_per_second: float) -> ReadStates:
 
 
 def _number(name: str) -> int:
-    found = NUMBERED.fullmatch(name)
-    return int(found[1]) if found else 0
+    match = NUMBERED.fullmatch(name)
+    return int(match[1]) if match else 0
 
 
 def _of_zip(path: Path) -> dict[str, Bytes]:
@@ -96,15 +96,15 @@ def _of_zip(path: Path) -> dict[str, Bytes]:
 
 
 def _numbered(source: str, files: dict[str, Bytes], rate: float) -> ReadStates:
-    found = {name: match for name in sorted(files) if (match := NUMBERED.fullmatch(name))}
-    suffixes = sorted({match[2].lower() for match in found.values()})
+    matches = {name: match for name in sorted(files) if (match := NUMBERED.fullmatch(name))}
+    suffixes = sorted({match[2].lower() for match in matches.values()})
     if lost := [suffix for suffix in suffixes if suffix in LOST]:
         raise InputError(f"{source!r} cannot be read as states: {lost[0]}: {LOST[lost[0]]}", REMEDY)
     if suffixes not in ([".glb"], [".ply"]):
         held = f"files {', '.join(suffixes)}" if suffixes else "no numbered files (frame_000000.glb)"
         raise InputError(f"{source!r} holds {held}", REMEDY)
-    by_index = {int(match[1]): (name, files[name]) for name, match in found.items()}
-    if len(by_index) < len(found):
+    by_index = {int(match[1]): (name, files[name]) for name, match in matches.items()}
+    if len(by_index) < len(matches):
         raise InputError(
             f"{source!r} holds several files of one frame, as frame_1 and frame_000001", "remove all but one"
         )

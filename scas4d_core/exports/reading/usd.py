@@ -65,12 +65,12 @@ def open_usd(path: Path) -> ReadStates:
 
 def _codes(stage: Any, prim: Any) -> list[float]:
     """Time codes of the frames: those of any sample, for what does not change has one alone."""
-    found = {float(stage.GetStartTimeCode()), float(stage.GetEndTimeCode())}
+    codes = {float(stage.GetStartTimeCode()), float(stage.GetEndTimeCode())}
     scope = stage.GetPrimAtPath(PARTS)
     for each in [prim, *(scope.GetChildren() if scope else ())]:
         for attribute in each.GetAttributes():
-            found.update(attribute.GetTimeSamples())
-    return sorted(found)
+            codes.update(attribute.GetTimeSamples())
+    return sorted(codes)
 
 
 class _Reader:
@@ -97,5 +97,5 @@ class _Reader:
         harmonics = harmonics.reshape(count, -1, 3)
         colours = 0.5 + SH_DEGREE_0 * harmonics[:, 0]
         there = opacities > 0
-        found = Cloud(Splats(means, scales, quaternions, opacities, colours), harmonics, self.ids)
-        return found.turned().rows(there)
+        cloud = Cloud(Splats(means, scales, quaternions, opacities, colours), harmonics, self.ids)
+        return cloud.turned().rows(there)

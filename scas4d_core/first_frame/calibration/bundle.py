@@ -114,9 +114,9 @@ class _Bundle:
         for _ in range(MOST_STEPS):
             moves, shifts = self._step(cameras, points, depth, damping)
             trial, places = [_moved(c, move) for c, move in zip(cameras, moves, strict=True)], points + shifts
-            found = self._loss(trial, places, depth)
-            if found < loss:
-                gain, cameras, points, loss = (loss - found) / loss, trial, places, found
+            trial_loss = self._loss(trial, places, depth)
+            if trial_loss < loss:
+                gain, cameras, points, loss = (loss - trial_loss) / loss, trial, places, trial_loss
                 damping = max(damping / 5, 1e-9)
                 if gain < ENOUGH_GAIN:
                     break

@@ -91,12 +91,13 @@ def matches_by_appearance(views: Sequence[PosedPicture]) -> Matches:
         views: of one moment, of two cameras or more.
     """
     small = [_reduced(view) for view in views]
-    found = features(small, most=FEATURES, contrast=CONTRAST)
+    feature_sets = features(small, most=FEATURES, contrast=CONTRAST)
     pairs = {
-        (a, b): _mutual(found[a][1], found[b][1]) for a, b in neighbouring(Rig(tuple(view.camera for view in small)))
+        (a, b): _mutual(feature_sets[a][1], feature_sets[b][1])
+        for a, b in neighbouring(Rig(tuple(view.camera for view in small)))
     }
     scale = np.array([view.camera.width / less.camera.width for view, less in zip(views, small, strict=True)])
-    return Matches(tuple(view.camera for view in small), scale, [uv for uv, _ in found], pairs)
+    return Matches(tuple(view.camera for view in small), scale, [uv for uv, _ in feature_sets], pairs)
 
 
 def _reduced(view: PosedPicture) -> PosedPicture:

@@ -64,8 +64,8 @@ class Refinement:
 
     def posed(self, camera: Camera) -> Camera:
         """The camera, of any size, as it was refined."""
-        found = self.cameras.get(camera.name)
-        return camera if found is None else _posed(camera, found.pose, found.focal)
+        refined_camera = self.cameras.get(camera.name)
+        return camera if refined_camera is None else _posed(camera, refined_camera.pose, refined_camera.focal)
 
 
 @dataclass(frozen=True)
@@ -103,10 +103,12 @@ def in_use(rig: Rig, record: Mapping[str, Any]) -> Rig:
     refined = (record.get("calibration") or {}).get("refined") or {}
     if not refined.get("accepted"):
         return rig
-    found = refined["cameras"]
+    cameras = refined["cameras"]
     return Rig(
         tuple(
-            _posed(camera, found[camera.name]["pose"], found[camera.name]["focal"]) if camera.name in found else camera
+            _posed(camera, cameras[camera.name]["pose"], cameras[camera.name]["focal"])
+            if camera.name in cameras
+            else camera
             for camera in rig.cameras
         )
     )

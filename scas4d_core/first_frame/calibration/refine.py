@@ -38,9 +38,9 @@ def first_calibration(
     if not (measured or settings.refine_calibration):
         return None
     on_progress(Progress("calibration", 0, 1))
-    found = checked_calibration(rig, frame.images, refine=settings.refine_calibration)
+    calibration = checked_calibration(rig, frame.images, refine=settings.refine_calibration)
     on_progress(Progress("calibration", 1, 1))
-    return found
+    return calibration
 
 
 def checked_calibration(rig: Rig, images: Mapping[str, NDArray[np.uint8]], *, refine: bool) -> Calibration | None:
@@ -75,7 +75,7 @@ def checked_calibration(rig: Rig, images: Mapping[str, NDArray[np.uint8]], *, re
 
 def _sentences(cameras: Mapping[str, CameraResidual], off: Sequence[str], matches: Matches) -> list[str]:
     """Sentences on what is off, for people."""
-    known = {name: found.pixels for name, found in cameras.items() if np.isfinite(found.pixels)}
+    known = {name: fit.pixels for name, fit in cameras.items() if np.isfinite(fit.pixels)}
     if not known:
         return []
     usual = float(np.median(list(known.values())))
@@ -102,8 +102,10 @@ def refined_rig(rig: Rig, matches: Matches) -> Refinement:
     """
     learnt, held = matches.split()
     told = list(residuals(matches)[0].values())
-    counts = [found.matches for found in told]
-    fixed = [i for i, found in enumerate(told) if found.matches < FEWEST or not np.isfinite(found.pixels)]
+    counts = [camera_fit.matches for camera_fit in told]
+    fixed = [
+        i for i, camera_fit in enumerate(told) if camera_fit.matches < FEWEST or not np.isfinite(camera_fit.pixels)
+    ]
     if len(counts) - len(fixed) < LEAST_CAMERAS:
         return _kept(f"only {len(counts) - len(fixed)} cameras have {FEWEST} matches or more")
     before = list(matches.cameras)
@@ -162,13 +164,13 @@ class _Test:
 def _refinement(rig: Rig, matches: Matches, test: _Test, fixed: Sequence[int], *, focal: bool) -> Refinement:
     before, after = residuals(matches)[0], residuals(matches.seen_by(test.cameras))[0]
     cameras = {}
-    for index, (given, found) in enumerate(zip(matches.cameras, test.cameras, strict=True)):
+    for index, (given, fitted) in enumerate(zip(matches.cameras, test.cameras, strict=True)):
         name = given.name
-        turned, moved = _moved(given, found)
-        factor = found.fx / given.fx
+        turned, moved = _moved(given, fitted)
+        factor = fitted.fx / given.fx
         cameras[name] = RefinedCamera(
             turned, moved, factor, before[name].pixels, after[name].pixels, index in fixed,
-            pose=found.world_to_camera.tolist() if index not in fixed else rig[name].world_to_camera.tolist(),
+            pose=fitted.world_to_camera.tolist() if index not in fixed else rig[name].world_to_camera.tolist(),
         )  # fmt: skip
     far = max(cameras, key=lambda name: cameras[name].turned)
     text = (

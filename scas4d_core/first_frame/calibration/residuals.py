@@ -62,19 +62,21 @@ def residuals(matches: Matches) -> tuple[dict[str, CameraResidual], list[str]]:
     measured = [(pair, epipolar_distances(matches, pair)) for pair in matches.pairs]
     off: list[int] = []
     while True:
-        found = [_of_camera(index, measured, off) for index in range(len(matches.cameras))]
-        known = {index: one for index, one in enumerate(found) if not np.isnan(one.median) and index not in off}
+        camera_residuals = [_of_camera(index, measured, off) for index in range(len(matches.cameras))]
+        known = {
+            index: one for index, one in enumerate(camera_residuals) if not np.isnan(one.median) and index not in off
+        }
         worst = max(known, key=lambda index: known[index].least, default=None)
         if worst is None or known[worst].least <= max(OFF, TIMES * float(np.median([m for m, *_ in known.values()]))):
             break
         off.append(worst)
         if 2 * len(off) >= len(known) + len(off):
             off = []
-            found = [_of_camera(index, measured, off) for index in range(len(matches.cameras))]
+            camera_residuals = [_of_camera(index, measured, off) for index in range(len(matches.cameras))]
             break
     cameras = {
         camera.name: CameraResidual(one.median * float(scale), one.right)
-        for camera, scale, one in zip(matches.cameras, matches.scale, found, strict=True)
+        for camera, scale, one in zip(matches.cameras, matches.scale, camera_residuals, strict=True)
     }
     return cameras, [matches.cameras[index].name for index in sorted(off)]
 

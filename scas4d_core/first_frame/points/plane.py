@@ -134,8 +134,8 @@ def agreed_plane(views: Sequence[PosedPicture]) -> Plane:
     Raises:
         InitialPointsError: they agree on none, or hardly more than mirrored pictures do.
     """
-    found = [(_best(views, start), start) for start in _starts(views)]
-    (score, plane), start = max(found, key=lambda one: one[0][0])
+    candidates = [(_best(views, start), start) for start in _starts(views)]
+    (score, plane), start = max(candidates, key=lambda one: one[0][0])
     mirrored = [replace(view, image=np.ascontiguousarray(view.image[:, ::-1])) for view in views]
     cells = _agreed_cells(views, plane, CELLS)
     if cells.sum() < FEWEST_CELLS or score < BEYOND_CHANCE * _best(mirrored, start, refine=False)[0]:

@@ -91,8 +91,10 @@ def planned(views: Sequence[PosedPicture], middle: Float, iterations: int, limit
         limit.shortened.append("no stereo")
         return None
     if index:
-        found = efforts[index]
-        limit.shortened.append(f"stereo on pictures of {found.width} pixels at most, {found.iterations} rounds")
+        planned_effort = efforts[index]
+        limit.shortened.append(
+            f"stereo on pictures of {planned_effort.width} pixels at most, {planned_effort.iterations} rounds"
+        )
     return efforts[index]
 
 
@@ -238,11 +240,11 @@ def _agreement(views: Sequence[PosedPicture], depths: Sequence[Float], index: in
         if j == index:
             continue
         column, line, there, inside = pixels_inside(view.camera, points)
-        found = depths[j][line, column]
+        other_depth = depths[j][line, column]
         with np.errstate(divide="ignore", invalid="ignore"):
-            good = inside & (found > 0) & (np.abs(found - there) <= DEPTH_AGREEMENT * there)
+            good = inside & (other_depth > 0) & (np.abs(other_depth - there) <= DEPTH_AGREEMENT * there)
         seen, _ = view.camera.project(points[good])
-        back = view.camera.unproject(seen, found[good])
+        back = view.camera.unproject(seen, other_depth[good])
         again, _ = camera.project(back)
         close = np.linalg.norm(again - uv[good], axis=-1) <= REPROJECTION
         count[rows[good][close], columns[good][close]] += 1

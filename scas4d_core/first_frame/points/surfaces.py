@@ -144,9 +144,9 @@ def fit_surfaces(points: Float, centres: Float, tolerance: float, *, most: int =
     """
     rng = np.random.default_rng(seed)
     rest = points
-    found: list[Support] = []
+    supports: list[Support] = []
     needed = max(MIN_INLIERS, int(MIN_SHARE * len(points)))
-    while len(found) < most and len(rest) >= needed:
+    while len(supports) < most and len(rest) >= needed:
         best: Surface | None = None
         most_inliers = 0
         for trial in range(TRIALS):
@@ -169,10 +169,10 @@ def fit_surfaces(points: Float, centres: Float, tolerance: float, *, most: int =
         on = np.abs(best.offsets(rest)) <= tolerance
         if on.sum() < needed:
             break
-        found.append(Support(best, rest[on]))
+        supports.append(Support(best, rest[on]))
         # Points close to a surface that was found support no second one beside it.
         rest = rest[np.abs(best.offsets(rest)) > 2.0 * tolerance]
-    return found
+    return supports
 
 
 def _bounds(surface: Surface, points: Float, centres: Float, tolerance: float) -> bool:

@@ -79,5 +79,5 @@ def surroundings(views: Sequence[PosedPicture], distances: Sequence[float]) -> I
         points.append(camera.unproject(uv, np.full(len(uv), distance + BEHIND * farthest)))
         colours.append(view.image[line, column] / np.float32(255))
     masked = any(view.mask is not None for view in views)
-    found = np.concatenate(points)
-    return InitialPoints(found, np.concatenate(colours), np.zeros(len(found), np.float32) if masked else None)
+    positions = np.concatenate(points)
+    return InitialPoints(positions, np.concatenate(colours), np.zeros(len(positions), np.float32) if masked else None)

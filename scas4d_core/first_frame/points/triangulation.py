@@ -84,18 +84,18 @@ def _all_features(
     views: Sequence[PosedPicture], extract: Callable[[NDArray[np.float32]], Any], limit: TimeLimit
 ) -> list[tuple[Float, NDArray[np.float32]]]:
     """``features`` by a function that takes grey pictures; the first picture tells the pace."""
-    found: list[tuple[Float, NDArray[np.float32]]] = []
+    features_by_view: list[tuple[Float, NDArray[np.float32]]] = []
     size, began, divisor = [view.camera.width * view.camera.height for view in views], limit.clock(), 1
     for view in views:
-        if len(found) == 1 and divisor == 1:
+        if len(features_by_view) == 1 and divisor == 1:
             each = (limit.clock() - began) / size[0]
             index = limit.chosen(FEATURES, [each * sum(size[1:]), *(each * sum(size) / n**2 for n in (2, 4))])
             if index:
                 divisor = 2 ** min(index, 2)
                 limit.shortened.append(f"features of pictures of a size of 1/{divisor}")
-                found = [_features(views[0], extract, divisor)]
-        found.append(_features(view, extract, divisor))
-    return found
+                features_by_view = [_features(views[0], extract, divisor)]
+        features_by_view.append(_features(view, extract, divisor))
+    return features_by_view
 
 
 def _features(
@@ -140,8 +140,8 @@ def guided_matches(
 
 def descriptor_distances(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
     """[A, B] distances of unit descriptors."""
-    found: NDArray[np.float32] = np.sqrt(np.maximum(2.0 - 2.0 * (first @ second.T), 0.0))
-    return found
+    distances: NDArray[np.float32] = np.sqrt(np.maximum(2.0 - 2.0 * (first @ second.T), 0.0))
+    return distances
 
 
 def mutual_best(distance: NDArray[np.float32]) -> NDArray[np.intp]:
@@ -188,12 +188,12 @@ def matched_tracks(views: Sequence[PosedPicture], limit: TimeLimit | None = None
     """
     limit = limit or TimeLimit(None)
     told = features(views, limit)
-    found = [(view.camera, uv, descriptors) for view, (uv, descriptors) in zip(views, told, strict=True)]
-    offsets = np.concatenate([[0], np.cumsum([len(uv) for _, uv, _ in found])])
+    described = [(view.camera, uv, descriptors) for view, (uv, descriptors) in zip(views, told, strict=True)]
+    offsets = np.concatenate([[0], np.cumsum([len(uv) for _, uv, _ in described])])
     owner = np.repeat(np.arange(len(views)), np.diff(offsets))
-    pixels = np.concatenate([uv for _, uv, _ in found]) if len(owner) else np.zeros((0, 2))
-    chosen = _pairs_in_time(found, limit)
-    pairs = [guided_matches(found[a], found[b]) + offsets[[a, b]] for a, b in chosen]
+    pixels = np.concatenate([uv for _, uv, _ in described]) if len(owner) else np.zeros((0, 2))
+    chosen = _pairs_in_time(described, limit)
+    pairs = [guided_matches(described[a], described[b]) + offsets[[a, b]] for a, b in chosen]
     edges = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.intp)
     return Tracks(pixels, owner, grouped(joined(edges, len(owner))))
 

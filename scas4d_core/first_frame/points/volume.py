@@ -92,10 +92,10 @@ def stage_distances(views: Sequence[PosedPicture], known: Float, radius: float) 
             cameras look in one direction.
     """
     middle = look_at_point(views)
-    found = []
+    distances = []
     for view in views:
         depth = view.camera.to_camera(known)[:, 2] if len(known) else np.zeros(0)
         depth = depth[depth > 0]
         ahead = float(view.camera.to_camera(middle[None])[0, 2])
-        found.append(float(np.median(depth)) if len(depth) >= FEW else ahead if ahead > radius / 10 else radius)
-    return found
+        distances.append(float(np.median(depth)) if len(depth) >= FEW else ahead if ahead > radius / 10 else radius)
+    return distances

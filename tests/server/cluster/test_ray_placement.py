@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -21,7 +20,7 @@ from server.processes import worker
 from server.storage.fencing import epoch_read, epochs
 from server.storage.layout import DataFolder
 from studies.cluster.nodes import Nodes
-from studies.running.process import Service, StudyError
+from studies.running.process import Service
 
 pytest.importorskip("ray", reason="Ray is not installed: pip install 'scas4d[ray]'")
 pytestmark = [pytest.mark.filterwarnings("default"), pytest.mark.ray, pytest.mark.service]
@@ -36,22 +35,12 @@ def nodes() -> Iterator[Nodes]:
             yield nodes
 
 
-def start(service: Service) -> None:
-    """Starts it, again where it ends: it gives a node half a minute to look at the data folder."""
-    until = time.monotonic() + HANG_S
-    while True:
-        try:
-            return service.start()
-        except StudyError:
-            assert time.monotonic() < until
-
-
 @pytest.fixture(scope="module")
 def service(nodes: Nodes, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Service]:
     data = tmp_path_factory.mktemp("cluster") / "data"
     environment = fakes.environment(SCAS4D_PLACEMENT=f"ray={nodes.address}", SCAS4D_LOG_LEVEL="info")
     service = Service(data, environment)
-    start(service)
+    service.start()
     yield service
     service.stop()
 
@@ -204,7 +193,7 @@ def test_scenes_are_found_again_after_the_service_was_killed(service: Service, s
     sent(service, scene, range(3))
     wait_for(lambda: committed(service, scene) == 3)
     service.kill()
-    start(service)
+    service.start()
     wait_for(lambda: service.http.get(f"/v1/scenes/{scene}").status_code == 200)
     sent(service, scene, range(3, 4))
     wait_for(lambda: committed(service, scene) == 4)
@@ -231,7 +220,7 @@ def test_another_service_of_the_cluster_passes_on_what_is_not_its_own(
     service: Service, nodes: Nodes, scene: str, tmp_path: Path
 ) -> None:
     other = Service(tmp_path / "data", fakes.environment(SCAS4D_PLACEMENT=f"ray={nodes.address}"))
-    start(other)
+    other.start()
     try:
         sent(other, scene, range(2))
         wait_for(lambda: committed(other, scene) == committed(service, scene) == 2)
@@ -251,7 +240,7 @@ def test_another_service_of_the_cluster_passes_on_what_is_not_its_own(
 def test_a_scene_goes_on_when_the_node_of_its_service_is_lost(service: Service, nodes: Nodes, scene: str) -> None:
     """Ray ends all that was started by that node, wherever it runs; it places nothing more for a service that stays."""
     other = Service(service.data.parent / "other", fakes.environment(SCAS4D_PLACEMENT=f"ray={nodes.address}"))
-    start(other)
+    other.start()
     try:
         late = create(other.http)
         sent(service, scene, range(2))
