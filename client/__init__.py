@@ -1,4 +1,4 @@
-"""Client of the service: wire models, SDK, rig simulator, and the `scas4d` command. Imports neither torch nor Numba."""
+"""The client: wire models, SDK, rig simulator and the `scas4d` command. Imports neither torch nor Numba."""
 
 from importlib.metadata import PackageNotFoundError, version
 

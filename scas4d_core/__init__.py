@@ -1,4 +1,4 @@
-"""The SCas4D method: arrays in, arrays out. No HTTP, no processes; see docs/architecture.md for the data flow."""
+"""The SCas4D method: arrays in, arrays out; no HTTP, no processes."""
 
 import os
 

@@ -63,28 +63,28 @@ INFINITY = float("inf")
 NOT_FINITE = _guard(
     "not_finite", 1e15, NAN,
     unit="m", where="kernels/projection.py, engines/torch/rasterizer.py",
-    reason="A Gaussian is left out whose mean, factor, opacity or features are NaN, infinite or beyond this: it would "
-    "turn every pixel that it reaches into NaN. Its gradients are 0.",
+    reason="A Gaussian is left out if its mean, factor, opacity or features are NaN, infinite or larger: it would turn "
+    "every pixel that it reaches into NaN. Its gradients are 0.",
     counted="Gaussians left out of a picture",
 )  # fmt: skip
 FEATURE_CEILING = _guard(
     "feature_ceiling", 1e9, INFINITY,
     unit="1", where="kernels/projection.py, engines/torch/rasterizer.py",
-    reason="The same for features beyond this: the fourth powers in SSIM would overflow. Colours are nominally 0…1.",
+    reason="The same for larger features: the fourth powers in SSIM would overflow. Colours are nominally 0…1.",
     counted="under not_finite",
 )  # fmt: skip
 FOOTPRINT_CEILING = _guard(
     "footprint_ceiling", 1e30, INFINITY,
     unit="pixels⁴", where="kernels/projection.py",
-    reason="Determinant of the projected covariance from which on a Gaussian is left out (3e7 pixels wide): the conic "
-    "is a quotient of numbers that overflow. Also left out: a determinant that is not positive.",
+    reason="A Gaussian is left out if the determinant of its projected covariance is larger (3e7 pixels wide) or not "
+    "positive: the conic is a quotient of numbers that would overflow.",
     counted="Gaussians left out of a picture",
 )  # fmt: skip
 GRADIENT_NOT_FINITE = _guard(
     "gradient_not_finite", 1e30, NAN,
     unit="loss per unit", where="kernels/projection.py",
-    reason="A Gaussian whose gradient overflowed on the way from the picture gets none: through the pivots and the "
-    "clusters' sums it would reach every other.",
+    reason="A Gaussian whose gradient overflows in the backward pass gets none: through the pivots and the clusters' "
+    "sums it would reach every other.",
     counted="Gaussians without gradient in a backward pass",
 )  # fmt: skip
 
@@ -93,15 +93,15 @@ GRADIENT_NOT_FINITE = _guard(
 HELD_BACK = _guard(
     "held_back", 0.0, NAN,
     unit="–", where="engines/cpu/deformation.py",
-    reason="A Gaussian that is not finite as an update begins is left as it is: the pivot of its cluster, a mean, "
-    "would be NaN, and so all that the cluster holds. It weighs nothing in pivots and neighbour terms.",
+    reason="A Gaussian that is not finite at the start of an update stays unchanged: the pivot of its cluster, a mean, "
+    "would be NaN, and so would the whole cluster. It weighs nothing in pivots and neighbour terms.",
     counted="Gaussians held back in an update",
 )  # fmt: skip
 EMPTY_CLUSTER = _guard(
     "empty_cluster", 1.0, 0.0,
     unit="Gaussians", where="kernels/cascade.py, engines/torch/deformation.py",
-    reason="Least number that a pivot's sum is divided by: a cluster whose Gaussians are all held back has the pivot 0 "
-    "instead of NaN, which its gradient would carry on.",
+    reason="Smallest count by which a pivot's sum is divided: a cluster without a finite Gaussian has the pivot 0 "
+    "instead of NaN, which its gradient would spread.",
     counted="clusters without a Gaussian in an update",
 )  # fmt: skip
 EXPONENT = _guard(
@@ -114,7 +114,7 @@ EXPONENT = _guard(
 HALF_TURN = _guard(
     "half_turn", 1e-12, 0.0,
     unit="1", where="kernels/cascade.py, engines/torch/deformation.py",
-    reason="Floor of the polar rotation's cosine part, and of the radius it is divided by: a map that folds space "
+    reason="Floor of the polar rotation's cosine part and of the radius that divides it: a map that folds space "
     "straight back has no rotation of its own; it counts as none instead of 0/0.",
     counted="Gaussians in a layer, forward",
 )  # fmt: skip
@@ -124,14 +124,14 @@ HALF_TURN = _guard(
 GRADIENT_CEILING = _guard(
     "gradient_ceiling", 1e18, INFINITY,
     unit="loss per unit", where="kernels/adam.py",
-    reason="Gradients are clamped to ± this, NaN to 0: their squares would overflow, the second moment stay infinite, "
-    "and the parameter stand still for the rest of the update.",
+    reason="Gradients are clamped to ± this value, NaN to 0: their squares would overflow, the second moment would "
+    "stay infinite, and the parameter would not move for the rest of the update.",
     counted="numbers of a gradient in a step",
 )  # fmt: skip
 MOMENT_FLOOR = _guard(
     "moment_floor", 1e-19, 0.0,
     unit="loss per unit", where="kernels/adam.py",
-    reason="Gradients and first moments below are 0, as are second moments below its square: they would be denormal "
+    reason="Smaller gradients and first moments are 0, and second moments below its square: they would be denormal "
     "numbers, with which a step takes 3.5 times as long (docs/stability.md), for the rest of the update.",
     counted="numbers of a gradient in a step",
 )  # fmt: skip
@@ -141,14 +141,15 @@ MOMENT_FLOOR = _guard(
 QUATERNION_FLOOR = _guard(
     "quaternion_floor", 1e-30, -1.0,
     unit="1", where="kernels/activation.py",
-    reason="A quaternion whose squared length is not above this has no direction: it counts as no rotation, and has no "
+    reason="A quaternion with at most this squared length counts as no rotation: it has no direction, and gets no "
     "gradient.",
     counted="Gaussians in an activation",
 )  # fmt: skip
 LEFT_OUT = _guard(
     "left_out_of_hierarchy", 0.0, NAN,
     unit="–", where="structure/hierarchy.py",
-    reason="A moving Gaussian that is not finite belongs to no cluster and stands: K-means would refuse all others.",
+    reason="A moving Gaussian that is not finite belongs to no cluster and stays in place: K-means would refuse all "
+    "others.",
     counted="Gaussians in a clustering",
 )  # fmt: skip
 

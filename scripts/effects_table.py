@@ -13,16 +13,16 @@ BEGIN, END = "<!-- effects -->\n", "<!-- end -->"
 
 
 def table() -> str:
-    """One line for each effect, in the order of the registry."""
-    lines = ["| effect | group | | on | gauge | cost |", "|---|---|---|---|---|---|"]
+    """One row per effect, in the order of the registry."""
+    lines = ["| effect | group | models | on by default |", "|---|---|---|---|"]
     for one in map(effect, EFFECTS):
-        on = "by evidence" if one.auto else "where the settings allow it"
-        lines.append(f"| `{one.name}` | {one.group.value} | {one.says} | {on} | {one.gauge} | {one.cost} |")
+        on = "by evidence" if one.auto else "yes"
+        lines.append(f"| `{one.name}` | {one.group.value} | {one.says} | {on} |")
     return "\n".join(lines) + "\n"
 
 
 def written(page: str) -> str:
-    """The page with today's table."""
+    """Returns the page with its table replaced."""
     head, rest = page.split(BEGIN)
     return head + BEGIN + table() + END + rest.split(END, 1)[1]
 

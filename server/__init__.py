@@ -1,1 +1,1 @@
-"""The service: scenes in worker processes, frames in over HTTP, views, tracks and parts out."""
+"""The service: takes frames over HTTP, runs scenes in worker processes, answers views, tracks and parts."""

@@ -28,6 +28,21 @@ Changes = Annotated[
 Again = Annotated[bool, typer.Option("--again", help="Measure rows anew that are there (kept frames 0 are used).")]
 
 
+def write_part(path: Path, text: str) -> None:
+    """Replaces the part of a page between two marks, the first and the last line of ``text``.
+
+    The rest of the page stays. Without the marks the text goes to the end.
+    """
+    begin, end = text.splitlines()[0], text.splitlines()[-1]
+    old = path.read_text() if path.exists() else ""
+    if begin in old and end in old:
+        new = old[: old.index(begin)] + text + old[old.index(end) + len(end) :]
+    else:
+        new = f"{old.rstrip()}\n\n{text}\n".lstrip()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(new)
+
+
 def write_page(out: Path | None, text: str) -> None:
     """Writes the text to `out`, whose folder is made when missing; does nothing for None."""
     if out is not None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -56,3 +58,8 @@ def test_named_variables_are_settings(page: Path) -> None:
     known = {f"{PREFIX}{name.upper()}" for name in ServerSettings.model_fields} | {CONFIG, URL}
     unknown = set(re.findall(r"SCAS4D_[A-Z][A-Z_]*[A-Z]", page.read_text())) - known
     assert not unknown, f"{page.name} names variables that are no settings: {', '.join(unknown)}"
+
+
+def test_the_table_of_folders_is_current() -> None:
+    command = [sys.executable, "scripts/folder_table.py", "--check"]
+    assert subprocess.run(command, cwd=ROOT, check=False).returncode == 0, "run scripts/folder_table.py"

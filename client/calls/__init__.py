@@ -1,4 +1,4 @@
-"""Requests of the service as values, one file a noun: the sync and the async client send the same ones.
+"""Requests as values, one file per resource; the sync and the async client send the same ones.
 
 In the examples `client` is a `client.sdk.Client`, `scene` the id of a scene with frames 0 to 2 committed, `rig` its
 rig of two cameras, `open_scene` the id of a scene that takes further frames, `pictures` a PNG file by camera, and `np`

@@ -1,1 +1,1 @@
-"""Writes states in the formats of other tools, as pages and as videos, from a scene, a folder or a file."""
+"""Writes the states of a scene, a folder or a file: formats of other tools, pages, recordings."""

@@ -1,1 +1,1 @@
-"""Captures as calibration tools and cameras leave them, made into pinhole cameras and pictures."""
+"""Reads captures as calibration tools and cameras write them: rigs, lenses, pictures, videos."""

@@ -1,4 +1,4 @@
-"""The rig simulator: a capture on disk, sent as a rig would send it."""
+"""The rig simulator: sends a capture on disk as a rig would."""
 
 from client.rig.delivery import Delivery, Lateness
 from client.rig.pace import Pace

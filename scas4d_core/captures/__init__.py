@@ -1,4 +1,4 @@
-"""Reads captures on disk, by `open_capture`. Numpy and Pillow only."""
+"""Reads captures from disk: cameras, pictures, masks, ground truth. Needs only numpy and Pillow."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Compiles the kernels before they are needed: which there are, which are in the cache, and who compiles the others."""
+"""Compiles the kernels before they are needed, in several processes, and knows which are cached."""

@@ -1,5 +1,5 @@
-"""Effects: the parts that an update is made of, one file each (docs/effects.md).
+"""Effects: the named parts of an update, one file each.
 
-``registry`` names them, ``effect`` has their interface, ``parts`` puts those that are on together for the loop of an
-update, ``switches`` decides which are on. The loop knows none of them by name.
+``scas4d_core.effect_names`` lists them, ``effect`` has their interface, ``switches`` decides which are on, and
+``scas4d_core.update.parts`` puts these together for the loop of an update, which knows none by name.
 """

@@ -1,4 +1,4 @@
-"""Engines: the arithmetic of an update, one engine a device, behind one interface (``engine.UpdateEngine``).
+"""Engines: the arithmetic of updates and fits behind one interface, one engine per device.
 
 ``cpu`` has the kernels that the service runs. ``torch`` is the reference: plain torch with autograd in float64, which
 every other engine is tested against. ``plan`` and ``engine`` have the values that cross the interface; ``renderer`` is

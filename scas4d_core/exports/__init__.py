@@ -1,4 +1,4 @@
-"""Writes frames and sequences for other programs (docs/exports.md has the formats)."""
+"""Writes states in the formats of other tools: splats, glTF, USD, tables."""
 
 from scas4d_core.exports.formats import FORMATS, Format, format_of
 from scas4d_core.exports.sequence import export_sequence

@@ -1,1 +1,1 @@
-"""Frame 0: initial points, and 3D Gaussian Splatting with adaptive density control."""
+"""Frame 0: initial points, then 3D Gaussian Splatting with density control."""

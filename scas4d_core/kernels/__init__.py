@@ -1,1 +1,1 @@
-"""Fused CPU kernels: flat Numba functions over arrays. Each is tested against plain torch in ``engines.torch``."""
+"""Numba kernels of the CPU engine: flat functions over arrays, each tested against torch."""

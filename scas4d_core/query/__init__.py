@@ -1,1 +1,1 @@
-"""Reads committed states: views, tracks, parts, exports."""
+"""Answers from committed states: views, tracks, parts, ply."""

@@ -203,7 +203,7 @@ LONGEST = 1.0
 """Radii of the rig that an axis may become long."""
 SHRUNK, STRETCHED = 0.1, 10.0
 """Times its length in frame 0 that an axis may become short or long: thousands of updates add up what each leaves, and
-the axes would wander without end (docs/stability.md, Time). Such an axis is set to the bound, and counted."""
+the axes would wander without end (docs/stability.md, Long runs). Such an axis is set to the bound, and counted."""
 BRIGHTEST = 8.0
 """Size that a colour may have; 0…1 is what a camera shows, a gain of a camera stretches it."""
 FEW = 0.01

@@ -1,1 +1,1 @@
-"""The structure of what moves: clusters, neighbours, the motion mask."""
+"""The clusters and the neighbour graph of the moving Gaussians."""

@@ -1,4 +1,4 @@
-"""Update of one frame (paper, algorithm 1): Θ_{t−1} and the pictures of frame t in, Θ_t out.
+"""The update of one frame (paper, algorithm 1): loop, schedule, rates, warm start, choice of Θ_t.
 
 ``frame_update`` has the loop. It keeps the schedule, the stopping rule, the gate on outlying cameras, looks and the
 best state; an iteration is one call of an engine (``scas4d_core.engines``). It uses ``schedule`` (order of views,

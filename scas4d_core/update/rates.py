@@ -29,20 +29,20 @@ The coarse motion is found first: all at once, the finer layers take a part of i
 
 LAYER_RESTS = (0.5, 0.75, 1.0)
 """Share of the iterations after which a layer rests, coarse to fine. 0.5 to 0.6 and 0.7 to 0.8 came out alike
-(docs/method.md)."""
+(docs/tried.md)."""
 FIRST_RESTS = (0.8, 0.9, 1.0)
 """The same of the first update, which is tried in several orders of its views: what one has not found by then, another
-finds. It gained 0.0 to 0.5 dB (docs/method.md)."""
+finds. It gained 0.0 to 0.5 dB (docs/tried.md)."""
 NEAR_FINEST = 4.0
 """Times its rates that the finest layer learns by where the layers above it rest, ..."""
 NEAR_OWN = 2.0
 """... and the Gaussians' own displacement: what is left to find is theirs. Their turns and scales learn as ever: where
-they learn faster, made-up scenes are met less well (docs/method.md)."""
+they learn faster, made-up scenes are met less well (docs/tried.md)."""
 LEAST_TIME = 0.3
 """Share of the iterations that a layer has at least before it rests."""
 NEAR = 0.6
 """Share of what changed that the motion before may leave unexplained, where layers rest. With every second frame left
-out it left about 0.55 to 1.2, and layers that always rested cost 0.6 to 3.4 dB (docs/method.md)."""
+out it left about 0.55 to 1.2, and layers that always rested cost 0.6 to 3.4 dB (docs/tried.md)."""
 
 
 FASTER_IN_CHANGING_LIGHT = 2.0

@@ -1,4 +1,4 @@
-"""Processes of scenes on the nodes of a Ray cluster (docs/cluster.md)."""
+"""Runs the processes of scenes on the nodes of a Ray cluster."""
 
 import os
 

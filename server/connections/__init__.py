@@ -1,1 +1,1 @@
-"""Connections: what one peer may hold open, send slowly or send too much of, before the application is asked."""
+"""Limits of connections, before the application sees a request: sizes, deadlines, number per address."""

@@ -1,1 +1,1 @@
-"""The state of the service for operators: readiness, estimates, gauges, logs."""
+"""The state of the service for operators: readiness, estimates, gauges for Prometheus, logs."""

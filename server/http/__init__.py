@@ -1,1 +1,1 @@
-"""Requests and answers: authentication, origins, body limits, validation, problem documents."""
+"""Middleware of all requests: authentication, permissions, origins, body limits, compression, errors."""

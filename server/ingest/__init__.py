@@ -1,1 +1,1 @@
-"""Accepts frames: receives, checks, writes, orders, acknowledges."""
+"""Receives frames: checks, writes, orders and acknowledges them."""

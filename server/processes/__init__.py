@@ -1,1 +1,1 @@
-"""The processes of a scene: worker, readers, replayer, exporter; how they are started, and queries to the readers."""
+"""The processes of a scene: worker, readers, replayer, exporter; their start, and queries to the readers."""

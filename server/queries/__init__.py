@@ -1,1 +1,1 @@
-"""Requests of clients for views and tracks, checked and made into queries to a scene's readers."""
+"""Checks requests for views and tracks, and turns them into queries to the readers of a scene."""

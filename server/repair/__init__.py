@@ -1,1 +1,1 @@
-"""Finds and repairs damaged files."""
+"""Finds damaged files and repairs them."""

@@ -1,1 +1,1 @@
-"""One file a resource."""
+"""HTTP routes, one file per resource."""

@@ -1,1 +1,1 @@
-"""The life of a scene: how its parts are put together, its status, replays, exports, sleep, a new beginning."""
+"""The life of a scene: creation, status, sleep, replays, exports, a new beginning, deletion."""

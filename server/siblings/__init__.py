@@ -1,1 +1,1 @@
-"""Siblings: the other services of a cluster. Requests for a scene go on to the one that has it (docs/cluster.md)."""
+"""Several services of one cluster: passes a request on to the service that has the scene."""

@@ -1,1 +1,1 @@
-"""Durability: record log, journal, ledger, frame store, recovery."""
+"""Durability: frame log, journal, ledger, epochs, recovery."""

@@ -1,1 +1,1 @@
-"""Subscriptions: the listeners of scenes, their messages and their live queries."""
+"""Subscriptions: the subscribers of scenes, their messages and their live queries."""

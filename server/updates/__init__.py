@@ -1,1 +1,1 @@
-"""Updates of a scene: the worker process, the frame it has, and what becomes of each frame."""
+"""The updates of a scene: gives frames to the worker process and records their outcome."""

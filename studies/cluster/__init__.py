@@ -1,1 +1,1 @@
-"""The service on a Ray cluster of several nodes, all on this machine."""
+"""The service on a Ray cluster whose nodes all run on this machine."""

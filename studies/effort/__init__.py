@@ -1,1 +1,1 @@
-"""Budgets kept, and effort spared on frames that show nothing new."""
+"""Time budgets, and iterations saved on frames that show nothing new."""

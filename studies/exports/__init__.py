@@ -1,1 +1,1 @@
-"""Exports, read back by other programs' readers and rendered."""
+"""Exports, read back by other tools' readers and rendered."""

@@ -1,1 +1,1 @@
-"""Hard cases of single functions, on every backend."""
+"""Numerical hard cases of single functions, on every backend."""

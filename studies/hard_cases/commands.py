@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from studies.options import QUALITY, Again, Captures, Changes
+from studies.options import QUALITY, Again, Captures, Changes, write_part
 
 
 def stability(
@@ -51,7 +51,7 @@ def stability(
     if out is not None:
         if cases or fast:
             raise typer.BadParameter("a page has all cases; leave out --cases and --fast, or --out")
-        run.write_page(out, run.page(lines, failing, *run.here()))
+        write_part(out, run.page(lines, failing, *run.here()))
     if any(line.violations for line in lines) or (mutate and not all((failing or {}).values())):
         raise typer.Exit(1)
 

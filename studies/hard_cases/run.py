@@ -7,7 +7,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -101,76 +100,50 @@ def in_words(guards: dict[str, int]) -> str:
 
 
 def catalogue_table(lines: Sequence[CaseResult]) -> str:
-    """One row a case: what is hard, its source, its sizes, and those that do not hold."""
-    by_case: dict[str, list[CaseResult]] = {}
-    for line in lines:
-        by_case.setdefault(line.case, []).append(line)
-    text = []
+    """One row per section: its cases, with and without their sizes, and those that do not hold."""
+    text = ["| section | cases | with sizes | do not hold |", "|" + "---|" * 4]
     for title, cases in SECTIONS:
-        text += [
-            f"### {title}",
-            "",
-            "| case | what | from | sizes |",
-            "|" + "---|" * 4,
-        ]
-        for case in cases:
-            results = by_case.get(case.name, [])
-            if not results:
-                continue
-            failed = [line.size for line in results if line.violations]
-            sizes = ", ".join(line.size for line in results) + (f"; **fails**: {', '.join(failed)}" if failed else "")
-            text.append(f"| {case.name} | {case.what} | {case.source} | {sizes} |")
-        text.append("")
+        names = {case.name for case in cases}
+        ran = [line for line in lines if line.case in names]
+        failed = ", ".join(f"{line.case} {line.size}" for line in ran if line.violations)
+        text.append(f"| {title} | {len({line.case for line in ran})} | {len(ran)} | {failed or '–'} |")
     return "\n".join(text)
 
 
-def guards_table(guards: Iterable[Guard], failing: dict[str, list[str]] | None = None, last: str = "counted") -> str:
-    """One row a guard; with the cases that fail without it, where they are known."""
-    lines = [f"| guard | value | unit | where | why | {last} | without it fail |", "|" + "---|" * 7]
+def guards_table(guards: Iterable[Guard]) -> str:
+    """One row per guard: its value, and the first clause of its reason."""
+    lines = ["| guard | value | acts on | counts |", "|" + "---|" * 4]
     for guard in guards:
-        cases = (failing or {}).get(guard.name)
-        words = "not tried" if cases is None else (", ".join(cases) if cases else "**none**")
-        lines.append(
-            f"| `{guard.name}` | {guard.value:g} | {guard.unit} | `{guard.where}` | {guard.reason} | {guard.counted} "
-            f"| {words} |"
-        )
+        clause = guard.reason.split(":")[0].split(". ")[0].rstrip(".")
+        lines.append(f"| `{guard.name}` | {guard.value:g} {guard.unit} | {clause} | {guard.counted} |")
     return "\n".join(lines)
 
 
 def page(lines: Sequence[CaseResult], failing: dict[str, list[str]] | None, on: str, date: str) -> str:
-    """The generated part of docs/hard-cases.md."""
+    """The generated part of docs/stability.md."""
     count, failed = len({line.case for line in lines}), sum(bool(line.violations) for line in lines)
-    observed = "\n".join(f"- `{name}`: {words}" for name, words in OBSERVED.items())
     tried = "" if failing is None else (
-        f"`scripts/bench stability --mutate` removed each guard and each convention in turn, in a copy of the sources, "
-        f"and ran the catalogue: {sum(bool(cases) for cases in failing.values())} of {len(failing)} removals make a "
-        f"case fail."
+        f" `scripts/bench stability --mutate` removes each guard and each convention in turn: "
+        f"{sum(bool(cases) for cases in failing.values())} of {len(failing)} removals make a case fail."
     )  # fmt: skip
+    observed = "\n".join(f"- `{name}`: {words}" for name, words in OBSERVED.items())
+    conventions = ", ".join(f"`{guard.name}`" for guard in CONVENTIONS.values())
     return f"""{BEGIN}
 
-Written by `scripts/bench stability --out docs/hard-cases.md` on {date} ({on}).
-
-## The catalogue
-
-{count} cases, {len(lines)} with their sizes; {failed} do not hold.
-Each runs on every backend that has its stage: the kernels, and the torch twins in float64 and float32.
+`scripts/bench stability --out docs/stability.md` on {date} ({on}): {count} cases, {len(lines)} with their sizes;
+{failed} do not hold.{tried}
 
 {catalogue_table(lines)}
-## Guards
 
-A guard is counted each time it acts; `guards` of a frame's report has the counts. {tried}
+The report of a frame counts how often each guard acted (`guards`):
 
-{guards_table(GUARDS.values(), failing)}
+{guards_table(GUARDS.values())}
 
 Also counted, without a change of the result:
 
 {observed}
 
-## Conventions
-
-Conventions are part of the equations and act all the time; the sixth column says why they are not counted.
-
-{guards_table(CONVENTIONS.values(), failing, "why not counted")}
+Conventions act all the time and are not counted: {conventions}.
 
 {END}"""
 
@@ -178,14 +151,3 @@ Conventions are part of the equations and act all the time; the sixth column say
 def here() -> tuple[str, str]:
     """The machine, in words, and the date."""
     return in_words_of(machine()), datetime.now(UTC).date().isoformat()
-
-
-def write_page(path: Path, text: str) -> None:
-    """Puts the generated part between its two marks; the rest of the page stays. Without marks it goes to the end."""
-    old = path.read_text() if path.exists() else "# Numerical stability\n"
-    if BEGIN in old and END in old:
-        new = old[: old.index(BEGIN)] + text + old[old.index(END) + len(END) :]
-    else:
-        new = old.rstrip("\n") + "\n\n" + text + "\n"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(new)

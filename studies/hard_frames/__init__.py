@@ -1,1 +1,1 @@
-"""Hard frames: pictures that should not be believed, long runs."""
+"""Faulty pictures and cameras, and long runs."""

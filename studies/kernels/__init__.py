@@ -1,1 +1,1 @@
-"""Costs of the kernels, and of a start."""
+"""Cost of the kernels, and of the start of the service."""

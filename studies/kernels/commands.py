@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from studies.options import QUALITY, Capture, Changes, Page, write_page
+from studies.options import QUALITY, Capture, Changes, Page, write_page, write_part
 
 
 def kernels(
@@ -28,7 +28,8 @@ def kernels(
 
     settings = settings_of(preset, changes=changes or ())
     row = study.study(capture, settings, store, frames=frames, repeats=repeats)
-    write_page(out, study.page(row))
+    if out is not None:
+        write_part(out, study.page(row))
 
 
 def moving(

@@ -225,7 +225,7 @@ def table(row: Row) -> str:
             line(f"rasterizer on {name}, forward", ns["forward"], "ns per pair"),
             line(f"rasterizer on {name}, backward", ns["backward"], "ns per pair"),
             line(f"rasterizer on {name}, both", ns["rasterizer"], "ns per pair"),
-            line("the same arithmetic alone, both", ns["micro"], "ns per pair"),
+            line("arithmetic alone, both", ns["micro"], "ns per pair"),
             line(f"rasterizer on {name} over arithmetic", on["ratio"], "×", metric),
             line("the same, by place in a block", on["ratio_places"], "×"),
         ]
@@ -239,39 +239,38 @@ def table(row: Row) -> str:
     return "\n".join(["| | median | smallest | unit | target | |", "|---|---|---|---|---|---|", *lines])
 
 
-def page(row: Row) -> str:
-    """The page of the documentation: command, machine, date, table, and what it was measured on."""
-    stages = sorted(row["seconds_stages"].items(), key=lambda item: -item[1])
-    lines = "\n".join(f"| {name} | {seconds:.3f} |" for name, seconds in stages)
-    return f"""# Cost of the kernels
+BEGIN, END = "<!-- scripts/bench kernels: begin -->", "<!-- scripts/bench kernels: end -->"
 
-Written by `scripts/bench kernels CAPTURES/{row["capture"]} --out docs/kernels.md` on {row["measured"][:10]}
-({in_words(row["machine"])}; sources of the core {row["core"]}).
+
+def page(row: Row) -> str:
+    """The generated part of docs/kernels.md: command, machine, date, tables, and what was measured."""
+    stages = sorted(row["seconds_stages"].items(), key=lambda item: -item[1])
+    names = "|".join(f" {name} " for name, _ in stages)
+    seconds = "|".join(f" {value:.3f} " for _, value in stages)
+    return f"""{BEGIN}
+
+`scripts/bench kernels CAPTURES/{row["capture"]} --out docs/kernels.md` on {row["measured"][:10]}
+({in_words(row["machine"])}; sources of the core {row["core"]}):
 
 {table(row)}
 
-- A pair is one pixel that one Gaussian is blended into: its alpha there is at least 1/255 and the pixel is not
-  finished. Pairs are counted one by one (`studies/kernels/pairs.py`).
+- A pair is one pixel into which one Gaussian is blended.
 - Frame 0: {_scene_words(row["frame_0"])}.
 - Cloud: {_scene_words(row["cloud"])}.
-- The rasterizer's time covers projection, depth order, tile lists, blending, and the backward of these. It works in
-  blocks of 4×4 pixels; "places" are all pixels of the blocks that a support meets: "by place" compares with the
-  arithmetic of these blocks.
-- "The same arithmetic alone" computes the exp and the multiply-adds of as many pairs, forward and backward with four
-  channels, in the same blocks, on Gaussians that cover them wholly and stay in cache. Both ran in turn; the ratio
-  is the median of the ratios.
-- Times are CPU times with one thread and wall-clock times with more.
-- The algorithm, and alternatives without gain: [rasterizer.md](rasterizer.md).
-- The update is the whole `Reconstruction.step`, decoding and commit included; medians over {row["updates"]} updates.
-  Its passes are its stages "render" and "render backward".
-- Peak memory is that of a fresh process that fits frame 0 and runs {row["frames"] - 1} updates.
+- The rasterizer covers projection, depth order, tile lists, blending, and their backward pass. "Arithmetic alone"
+  is the exp and the multiply-adds of as many pairs, in cache, forward and backward with four channels.
+- "By place" compares with the arithmetic of all pixels of the 4×4 blocks that are visited.
+- Times are CPU times with one thread, and wall-clock times with more. Ratios are medians of runs in turns.
+- An update is the whole `Reconstruction.step`, median of {row["updates"]}. Peak memory is that of a process that
+  fits frame 0 and runs {row["frames"] - 1} updates.
 
 Median seconds of an update by stage:
 
-| stage | s |
-|---|---|
-{lines}
-"""
+|{names}|
+|{"---|" * len(stages)}
+|{seconds}|
+
+{END}"""
 
 
 def _scene_words(on: Row) -> str:

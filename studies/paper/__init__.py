@@ -1,1 +1,1 @@
-"""The paper's experiments beside ours."""
+"""The paper's experiments on our captures."""

@@ -1,1 +1,1 @@
-"""Reconstruction quality: captures by settings and seeds against the ground truth."""
+"""Reconstruction quality: captures, settings and seeds against the ground truth."""

@@ -1,1 +1,1 @@
-"""Studies of rigs: those of other people, calibrations that are off, and cameras that drift."""
+"""Rigs of other people, calibrations that are off, cameras that drift."""

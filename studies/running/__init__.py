@@ -1,1 +1,1 @@
-"""A service under study: its process, the frames sent to it, and the outcomes of scenarios."""
+"""A service under study: its process, the frames sent to it, and scenarios."""

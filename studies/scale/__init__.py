@@ -1,1 +1,1 @@
-"""Cost against size: pixels, Gaussians, cameras, the share that moves, frames."""
+"""Cost against size: pixels, Gaussians, cameras, share of moving pixels, frames."""

@@ -1,1 +1,1 @@
-"""The service under load, faults and strangers."""
+"""The service under load, faults and hostile requests."""

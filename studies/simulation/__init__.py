@@ -1,1 +1,1 @@
-"""A big cluster by a virtual clock: the service's own supervision and fencing, on modelled nodes and workers."""
+"""A large cluster on a virtual clock: the service's own supervision on modelled nodes and workers."""

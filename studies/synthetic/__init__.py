@@ -1,1 +1,1 @@
-"""Made-up scenes whose motion is known: a ball over a floor, and a wall."""
+"""Synthetic scenes with known motion: a ball over a floor, and a wall."""

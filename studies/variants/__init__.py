@@ -1,4 +1,4 @@
-"""Variants of captures that cost nothing to make, and contenders for the default that are tried on them.
+"""Settings compared on variants of captures: backwards, fewer cameras, fewer pixels.
 
 A setting that was chosen on some captures wins on these; whether it wins is told by captures that had no say.
 """

@@ -1,1 +1,1 @@
-"""Videos: paths of the camera, states at times, what is drawn over pictures, and the encoding."""
+"""Videos: camera paths, states at any time, overlays, encoding."""

@@ -1,1 +1,1 @@
-"""Readers of calibrations, one file a tool; each returns a `Calibration`."""
+"""Readers of calibrations, one file per tool; each returns a `Calibration`."""

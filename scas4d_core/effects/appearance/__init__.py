@@ -1,1 +1,1 @@
-"""Effects on what the pictures show of a Gaussian: its colour, the light, the cameras' gains."""
+"""Effects on colour: light, shading, shadows, gloss, camera gains."""

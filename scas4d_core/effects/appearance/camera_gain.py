@@ -110,9 +110,9 @@ class CameraGain(Effect):
 EFFECT = CameraGain(
     name=NAME,
     group=Group.APPEARANCE,
-    says="Each camera has a gain for each channel, which may drift.",
+    says="Each camera has a gain per channel, which may drift.",
     gauge="Per channel the product over the cameras is 1: what all cameras share is light, and goes into the colours.",
-    cost="the median over some 4,000 pixels an iteration, 1 % of an update",
+    cost="the median over about 4,000 pixels per iteration, 1 % of an update",
     auto=True,
     on_above=0.04,
     off_below=0.02,

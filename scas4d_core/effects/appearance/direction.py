@@ -104,9 +104,9 @@ class Direction(Effect):
 EFFECT = Direction(
     name="direction",
     group=Group.APPEARANCE,
-    says="Colour by direction: glossy things mirror lamps and surroundings, which stay while the things turn.",
-    gauge="The environment sums to nothing over the sphere: what is seen from everywhere is colour.",
-    cost="two passes over the Gaussians a rendered view; a trial in frame 0, which takes half as long again where on",
+    says="Colour depends on direction: glossy objects mirror lights and surroundings, which stay as the objects move.",
+    gauge="The environment sums to zero over the sphere: what is seen from everywhere is colour.",
+    cost="two passes over the Gaussians per rendered view; a trial in frame 0, which takes half as long again where on",
     auto=True,
     on_above=0.1,  # the trial has 0.25 on `gloss`, at most 0.03 on the five objects
 )

@@ -94,8 +94,8 @@ class Light(Effect):
 EFFECT = Light(
     name="light",
     group=Group.APPEARANCE,
-    says="While the light changes colours follow faster, those of what moves as fast as those of what stands.",
-    gauge="Colours are in the light of their frame; what differs from camera to camera is gain, and what flickers too.",
+    says="While the light changes, colours follow faster, those of moving Gaussians as fast as those of static ones.",
+    gauge="Colours hold the light of their frame; differences between cameras, and flicker, are gains.",
     cost="none that can be measured",
     auto=True,
     on_above=0.035,

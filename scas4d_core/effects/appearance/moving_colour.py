@@ -28,7 +28,7 @@ class MovingColour(Effect):
 EFFECT = MovingColour(
     name="moving_colour",
     group=Group.APPEARANCE,
-    says="The colours of what moves follow the pictures, slowly: shading changes as things turn.",
-    gauge="The mean absolute change of all colours is a term: what moves or a gain explains is not put into colours.",
-    cost="one step of Adam over RGB an iteration, shared with the other colours",
+    says="The colours of moving Gaussians follow the pictures slowly: shading changes as objects rotate.",
+    gauge="The mean absolute colour change is a loss term: motion and gains are not absorbed by colours.",
+    cost="one Adam step over RGB per iteration, shared with the other colours",
 )

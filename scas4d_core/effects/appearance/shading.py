@@ -51,7 +51,7 @@ class Shading(Effect):
 EFFECT = Shading(
     name="shading",
     group=Group.APPEARANCE,
-    says="Things turn in the light: the colours of what moves follow the pictures once a frame.",
-    gauge="It is of what moves, once the motion of the frame is found; gains of cameras are taken out before.",
-    cost="one render of each view and the weights in it, a frame",
+    says="The colours of moving Gaussians follow the pictures once per frame, as objects rotate in the light.",
+    gauge="Moving Gaussians only, once the motion of the frame is found; camera gains are removed before.",
+    cost="one render of each view, with its blending weights, per frame",
 )

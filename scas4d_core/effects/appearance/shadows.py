@@ -134,9 +134,9 @@ def _hidden(view: TrainingView, state: Gaussians, renderer: Renderer) -> NDArray
 EFFECT = Shadows(
     name=NAME,
     group=Group.APPEARANCE,
-    says="Shadows and light wander over what stands: its colours follow the pictures once a frame.",
-    gauge="It is of what stands, where that looks other than in frame 0; gains of cameras are taken out before.",
-    cost="one render of each view and the weights in it, a frame",
+    says="The colours of static Gaussians follow the pictures once per frame, as shadows and light move over them.",
+    gauge="Static Gaussians only, where they look different from frame 0; camera gains are removed before.",
+    cost="one render of each view, with its blending weights, per frame",
     auto=True,
     on_above=0.02,
     off_below=0.005,

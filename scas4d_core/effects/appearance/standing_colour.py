@@ -29,8 +29,8 @@ class StandingColour(Effect):
 EFFECT = StandingColour(
     name="standing_colour",
     group=Group.APPEARANCE,
-    says="The colours of what stands follow the pictures in every iteration, where it is pinned on.",
-    gauge="The mean absolute change of all colours is a term: what moves or a gain explains is not put into colours.",
-    cost="whole pictures are rendered, and one step of Adam over RGB an iteration",
+    says="The colours of static Gaussians follow the pictures in every iteration; only where it is pinned on.",
+    gauge="The mean absolute colour change is a loss term: motion and gains are not absorbed by colours.",
+    cost="full pictures are rendered, and one Adam step over RGB per iteration",
     auto=True,
 )

@@ -1,1 +1,1 @@
-"""Effects on the cameras: their poses."""
+"""Effects on cameras: their poses."""

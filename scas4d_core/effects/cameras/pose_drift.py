@@ -303,9 +303,9 @@ def _rendered(seen: Seen, view: TrainingView) -> tuple[Array, Array]:
 EFFECT = PoseDrift(
     name=NAME,
     group=Group.CAMERAS,
-    says="Cameras drift or are knocked by a pixel or a few: their poses follow the pictures, once a frame.",
-    gauge="The median twist of the cameras is 0, number by number: what most of them share is motion of the scene.",
-    cost="a look at some pixels of eight renderings a frame, one render of each set aside; on, of those off and of six",
+    says="Cameras drift, or are knocked by a few pixels: their poses follow the pictures once per frame.",
+    gauge="The median twist over the cameras is 0: what most cameras share is motion of the scene.",
+    cost="samples of eight renderings per frame; where on, one render of each camera that is off, and of six others",
     auto=True,
     on_above=0.2,
     off_below=0.08,

@@ -1,1 +1,1 @@
-"""Effects that tie what moves together."""
+"""Effects that tie the motion of neighbouring Gaussians together."""

@@ -31,7 +31,7 @@ class AxisLength(Effect):
 EFFECT = AxisLength(
     name="axis_length",
     group=Group.COHERENCE,
-    says="No Gaussian grows longer than in frame 0, or 2 cm.",
+    says="No Gaussian grows longer than in frame 0, or than 2 cm.",
     gauge="Lengths of frame 0.",
-    cost="none that can be measured: the cascade's backward has it in itself",
+    cost="none measurable: a part of the cascade's backward pass",
 )

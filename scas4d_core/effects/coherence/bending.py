@@ -115,9 +115,9 @@ class Bending(Effect):
 EFFECT = Bending(
     name="bending",
     group=Group.COHERENCE,
-    says="Things bend all over, as cloth does: neighbours turn each in their own way, and rotation is left out.",
-    gauge="Turns of patches beyond what of their motion is no turn; joints between rigid parts are too few to count.",
-    cost="1 % of an update: the turns of 400 patches a frame",
+    says="Neighbours rotate each in their own way, as in cloth: the term rotation is left out.",
+    gauge="Rotations of patches beyond the rest of their motion; joints between rigid parts are too few to count.",
+    cost="1 % of an update: the rotations of 400 patches per frame",
     auto=True,
     on_above=0.018,
     off_below=0.012,

@@ -59,7 +59,7 @@ class Floor(Effect):
 EFFECT = Floor(
     name="floor",
     group=Group.COHERENCE,
-    says="What moves stays above the floor that the scene names.",
+    says="Moving Gaussians stay above the floor plane of the scene.",
     gauge="A plane in the user's world.",
-    cost="one dot product for each moving Gaussian an iteration",
+    cost="one dot product per moving Gaussian and iteration",
 )

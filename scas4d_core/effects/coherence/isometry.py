@@ -32,7 +32,7 @@ class Isometry(Effect):
 EFFECT = Isometry(
     name="isometry",
     group=Group.COHERENCE,
-    says="Neighbours keep the distance that they had in frame 0; things bend, and do not tear.",
-    gauge="Distances of frame 0; it does not see rotations.",
-    cost="one pass over 4,000 Gaussians and their neighbours an iteration, shared by rigidity, isometry and rotation",
+    says="Neighbours keep the distance that they had in frame 0: objects bend, but do not tear.",
+    gauge="Distances of frame 0; it ignores rotations.",
+    cost="one pass over 4,000 Gaussians and their neighbours per iteration, shared with rigidity and rotation",
 )

@@ -32,7 +32,7 @@ class Rigidity(Effect):
 EFFECT = Rigidity(
     name="rigidity",
     group=Group.COHERENCE,
-    says="What is rigid stays so: neighbours keep the offsets that they had in the frame before.",
-    gauge="It ties motion, not colour: nothing else explains it.",
-    cost="one pass over 4,000 Gaussians and their neighbours an iteration, shared by rigidity, isometry and rotation",
+    says="Neighbours keep the offsets that they had in the previous frame.",
+    gauge="It constrains motion, not colour: nothing else explains it.",
+    cost="one pass over 4,000 Gaussians and their neighbours per iteration, shared with isometry and rotation",
 )

@@ -32,7 +32,7 @@ class Rotation(Effect):
 EFFECT = Rotation(
     name="rotation",
     group=Group.COHERENCE,
-    says="Neighbours turn alike.",
-    gauge="Turns since the frame before.",
-    cost="one pass over 4,000 Gaussians and their neighbours an iteration, shared by rigidity, isometry and rotation",
+    says="Neighbours rotate alike.",
+    gauge="Rotations since the previous frame.",
+    cost="one pass over 4,000 Gaussians and their neighbours per iteration, shared with rigidity and isometry",
 )

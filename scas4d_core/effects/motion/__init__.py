@@ -1,1 +1,1 @@
-"""Effects on how things move: the parameters of the deformation that are free."""
+"""Effects that free the parameters of the deformation, and its start from the previous motion."""

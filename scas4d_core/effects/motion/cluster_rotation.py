@@ -11,7 +11,7 @@ from scas4d_core.effects.motion.free_columns import ClusterColumns
 EFFECT = ClusterColumns(
     name="cluster_rotation",
     group=Group.MOTION,
-    says="Clusters turn: the parts of a thing, and the parts of these.",
-    gauge="About the middle of the cluster, beside a translation; coarse layers begin before fine ones.",
-    cost="none that can be measured: off saves three numbers of each cluster in the step of Adam, not the cascade",
+    says="Clusters rotate: the parts of an object, and the parts of these.",
+    gauge="About the cluster's centroid, beside a translation; coarse layers learn first.",
+    cost="none measurable: off saves three numbers per cluster in Adam's step, not the cascade",
 )

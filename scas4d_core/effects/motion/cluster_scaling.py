@@ -11,7 +11,7 @@ from scas4d_core.effects.motion.free_columns import ClusterColumns
 EFFECT = ClusterColumns(
     name="cluster_scaling",
     group=Group.MOTION,
-    says="Clusters stretch and shrink, by another factor in each place: things that bend, breathe and swing.",
-    gauge="About the middle of the cluster; isometry holds it back where neighbours keep their distance.",
-    cost="none that can be measured: off saves four numbers of each cluster in the step of Adam, not the cascade",
+    says="Clusters stretch and shrink, by a factor that varies within a cluster: objects that bend, breathe or swing.",
+    gauge="About the cluster's centroid; isometry limits it where neighbours keep their distance.",
+    cost="none measurable: off saves four numbers per cluster in Adam's step, not the cascade",
 )

@@ -11,7 +11,7 @@ from scas4d_core.effects.motion.free_columns import ClusterColumns
 EFFECT = ClusterColumns(
     name="cluster_translation",
     group=Group.MOTION,
-    says="Clusters shift: things as a whole, then their parts.",
-    gauge="Of the middle of the cluster, beside a rotation; coarse layers begin before fine ones.",
-    cost="none that can be measured: off saves three numbers of each cluster in the step of Adam, not the cascade",
+    says="Clusters translate: whole objects first, then their parts.",
+    gauge="Of the cluster's centroid, beside a rotation; coarse layers learn first.",
+    cost="none measurable: off saves three numbers per cluster in Adam's step, not the cascade",
 )

@@ -8,7 +8,7 @@ from scas4d_core.effects.motion.free_columns import FreeColumns
 EFFECT = FreeColumns(
     name="own_position",
     group=Group.MOTION,
-    says="Each Gaussian may leave the place that its clusters give it.",
-    gauge="It begins once all layers of clusters have begun, at a small rate: it finds what they leave.",
-    cost="a third of the step of Adam over 9 numbers of each moving Gaussian; one off saves no time, all three 1 %",
+    says="Each Gaussian may move away from the place that its clusters give it.",
+    gauge="It learns last and slowly, so it finds only what the clusters leave.",
+    cost="1 % of an update, together with own_rotation and own_scale",
 )

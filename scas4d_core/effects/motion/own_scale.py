@@ -25,6 +25,6 @@ EFFECT = OwnScale(
     name="own_scale",
     group=Group.MOTION,
     says="Each Gaussian's axes may grow and shrink.",
-    gauge="The limit of the axes' lengths; it begins once all layers of clusters have begun.",
-    cost="a third of the step of Adam over 9 numbers of each moving Gaussian; one off saves no time, all three 1 %",
+    gauge="The limit of the axes' lengths; it learns last and slowly.",
+    cost="1 % of an update, together with own_position and own_rotation",
 )

@@ -38,7 +38,7 @@ class Prediction(Effect):
 EFFECT = Prediction(
     name="prediction",
     group=Group.MOTION,
-    says="Motion goes on: an update starts where the motion of the frame before leads, if that shows the frame better.",
-    gauge="The start alone: the pictures decide where the update ends.",
-    cost="one comparison of small pictures of four views before each update",
+    says="An update starts from the motion of the previous frame, if that shows the frame better.",
+    gauge="It sets the start alone: the pictures decide where the update ends.",
+    cost="one comparison of half-size pictures of four views per update",
 )

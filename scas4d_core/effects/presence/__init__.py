@@ -1,1 +1,1 @@
-"""Effects on what is there: what moves and what stands, what enters and what leaves."""
+"""Effects on which Gaussians exist and which move: masks, labels, objects that enter or leave."""

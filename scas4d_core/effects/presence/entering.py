@@ -219,9 +219,9 @@ def _evidence(share: float, cameras: int) -> Evidence:
 EFFECT = Entering(
     name=NAME,
     group=Group.PRESENCE,
-    says="Things enter the scene: where cameras agree that nothing explains the pictures, Gaussians are born.",
-    gauge="Only what no Gaussian covers is new, and only beyond what has moved away elsewhere.",
-    cost="a look at the pictures that an update rendered last; where something enters, about an update more",
+    says="Objects enter the scene: Gaussians are added where cameras agree that nothing explains the pictures.",
+    gauge="Only what no Gaussian covers, beyond what has moved away elsewhere.",
+    cost="a check of the last rendered pictures; where something enters, about an update more",
     auto=True,
     on_above=SHARE,
     off_below=WORTH,

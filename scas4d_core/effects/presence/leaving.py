@@ -99,9 +99,9 @@ def _evidence(share: float) -> Evidence:
 EFFECT = Leaving(
     name=NAME,
     group=Group.PRESENCE,
-    says="Things leave the scene: what is in no picture any more is retired, and can come back as itself.",
+    says="Objects leave the scene: Gaussians in no picture are retired, and may come back under their ids.",
     gauge="None is needed: what is in no picture explains nothing.",
-    cost="one projection of what moves a frame; an update costs less by what has left",
+    cost="one projection of the moving Gaussians per frame; an update costs less without what has left",
     auto=True,
     on_above=SHARE,
     off_below=IDLE_SHARE,

@@ -38,8 +38,8 @@ class MaskTerm(Effect):
 EFFECT = MaskTerm(
     name="mask_term",
     group=Group.PRESENCE,
-    says="Where masks are given, what moves and what stands must cover the pixels that the masks say.",
-    gauge="Labels are those of frame 0 and no parameter: the term moves Gaussians, and relabels none.",
-    cost="a fourth channel beside RGB, rendered forward and backward; without masks nothing",
+    says="With masks, moving and static Gaussians must cover the pixels that the masks give them.",
+    gauge="Labels come from frame 0 and are no parameter: the term moves Gaussians, and relabels none.",
+    cost="a fourth channel beside RGB, forward and backward; without masks nothing",
     without_masks=False,
 )

@@ -23,7 +23,7 @@ class MotionLabels(Effect):
 EFFECT = MotionLabels(
     name="motion_labels",
     group=Group.PRESENCE,
-    says="Without masks only Gaussians that most cameras have seen in changed pixels move; all else stands.",
-    gauge="What has moved once may always move: a label is given and never taken back.",
-    cost="a comparison of each view with the one before, a picture and its weights a view; it saves what stands",
+    says="Without masks, only Gaussians that most cameras have seen in changed pixels move.",
+    gauge="A Gaussian that has moved once may always move: labels are added and never removed.",
+    cost="a comparison of each view with the previous frame; static Gaussians save more than that",
 )

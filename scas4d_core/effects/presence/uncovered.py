@@ -111,9 +111,9 @@ def _evidence(share: float) -> Evidence:
 EFFECT = UncoveredEffect(
     name=NAME,
     group=Group.PRESENCE,
-    says="What moves uncovers what it hid: Gaussians that stand are born where nothing was known.",
-    gauge="Only pixels in which the state has nothing are bare.",
-    cost="a look at the pictures that an update rendered last; where something is bare, about half an update more",
+    says="Motion uncovers what was hidden: static Gaussians are added where nothing was known.",
+    gauge="Only pixels in which the state has nothing.",
+    cost="a check of the last rendered pictures; where something is uncovered, about half an update more",
     auto=True,
     on_above=SHARE,
     off_below=WORTH,

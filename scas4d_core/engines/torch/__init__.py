@@ -1,4 +1,4 @@
-"""The reference engine: plain torch in float64, slow and exact, with the derivatives of autograd.
+"""The reference engine: torch with autograd in float64, slow and exact.
 
 ``engine`` is an iteration; ``parameters`` has what is learnt, ``scene`` the tensors of an attempt. ``deformation`` has
 equations (5) to (7), ``losses`` equation (8) and the other terms, ``rasterizer`` the pictures, ``gloss`` colours by

@@ -1,4 +1,4 @@
-"""Reads exports back as states, where it is told which Gaussian is which (docs/exports.md, "And back")."""
+"""Reads exports back as states, where they identify each Gaussian."""
 
 from scas4d_core.exports.reading.sources import open_export
 from scas4d_core.exports.reading.states import ReadStates

@@ -1,1 +1,1 @@
-"""The calibration held against the pictures of frame 0: measured always, refined on request."""
+"""Compares the calibration with the pictures of frame 0, and refines it on request."""

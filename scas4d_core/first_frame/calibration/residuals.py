@@ -21,7 +21,7 @@ PURE = 0.5
 """Share of the matches nearer than ``NEAR`` that have to be right: else their distances are those of chance."""
 OFF, TIMES = 0.9, 2.0
 """Pixels at which features were found, and times the median of the rig, above which a camera is off. Right captures
-have 0.1 to 0.6, up to 1.6 times the median; a camera turned by two pixels has 0.9 to 2.2 (docs/method.md)."""
+have 0.1 to 0.6, up to 1.6 times the median; a camera turned by two pixels has 0.9 to 2.2 (docs/calibration.md)."""
 
 
 class Spread(NamedTuple):

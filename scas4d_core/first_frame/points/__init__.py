@@ -1,1 +1,1 @@
-"""Initial points: what pictures of calibrated cameras say of the surfaces of one moment."""
+"""Initial points from the pictures of one moment: triangulation, visual hull, stereo, planes."""

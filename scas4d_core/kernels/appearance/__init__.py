@@ -1,1 +1,1 @@
-"""Kernels of the effects on what the pictures show of a Gaussian. Of other files here they use ``jit`` alone."""
+"""Kernels of the appearance effects; of the other files here they use only ``jit``."""

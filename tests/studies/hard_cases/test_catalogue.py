@@ -11,6 +11,7 @@ import pytest
 from scas4d_core.guards import CONVENTIONS, GUARDS
 from studies.hard_cases import mutate, run
 from studies.hard_cases.case import BackendResult, HardCase
+from studies.options import write_part
 
 FAST = [(case, size) for case in run.CASES for size in case.sizes if not case.slow]
 
@@ -48,7 +49,7 @@ def test_what_does_not_hold_or_raises_is_told() -> None:
 def test_the_page_keeps_what_stands_beside_its_marks(tmp_path: Path) -> None:
     path = tmp_path / "stability.md"
     path.write_text(f"# Title\n\nbefore\n\n{run.BEGIN}\nold\n{run.END}\n\nafter\n")
-    run.write_page(path, f"{run.BEGIN}\nnew\n{run.END}")
+    write_part(path, f"{run.BEGIN}\nnew\n{run.END}")
     assert path.read_text() == f"# Title\n\nbefore\n\n{run.BEGIN}\nnew\n{run.END}\n\nafter\n"
 
 
