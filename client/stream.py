@@ -47,7 +47,7 @@ from client.subscriptions import (
 from client.wire.stream import (
     SCENE_GONE,
     FrameMessage,
-    Gone,
+    SceneGone,
     SceneMessage,
 )
 
@@ -149,7 +149,7 @@ class Stream:
                     return None
                 continue
             event = self._session.read(data)
-            if isinstance(event, Gone):
+            if isinstance(event, SceneGone):
                 return None
             if event is not None:
                 return event
@@ -239,7 +239,7 @@ class AsyncStream:
                     return None
                 continue
             event = self._session.read(data)
-            if isinstance(event, Gone):
+            if isinstance(event, SceneGone):
                 return None
             if event is not None:
                 return event

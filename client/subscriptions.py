@@ -25,9 +25,9 @@ from client.wire.stream import (
     STREAM_PROTOCOL,
     BulkHead,
     FrameMessage,
-    Gone,
     NoRequest,
     PartsSubscription,
+    SceneGone,
     SceneMessage,
     StreamProblem,
     Subscribe,
@@ -249,7 +249,7 @@ class StreamSession:
         self.subscriptions.pop(id)
         return Unsubscribe(id=id).model_dump_json()
 
-    def read(self, data: str | bytes) -> Event | Gone | None:
+    def read(self, data: str | bytes) -> Event | SceneGone | None:
         """Reads a message; None for one that is of no interest to the caller.
 
         Raises:
@@ -260,7 +260,7 @@ class StreamSession:
         message = SERVER_MESSAGE.validate_json(data)
         if isinstance(message, StreamProblem):
             raise error_of_problem(message.problem)
-        return message if isinstance(message, SceneMessage | FrameMessage | Gone) else None
+        return message if isinstance(message, SceneMessage | FrameMessage | SceneGone) else None
 
     def connected(self) -> None:
         """Forgets earlier failures."""

@@ -83,10 +83,10 @@ class CarryOver:
             past=replace(past, fitted=time) if result.outcome.learnt else past,
             effects=result.carried,
         )
-        if result.outcome.held:
+        if result.outcome.rejected:
             return carried
         # A change of another light is no motion; a motion too small to be seen between two frames adds up.
-        resting = self.labels is None and result.outcome is FrameOutcome.STOOD and bool(self.seen)
+        resting = self.labels is None and result.outcome is FrameOutcome.UNCHANGED and bool(self.seen)
         if views is not None and result.exposure == 1.0 and not resting:
             carried = replace(carried, seen=[view for view in views if view.name not in result.trace.left_out])
         return replace(carried, shown=shown)

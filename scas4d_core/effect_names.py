@@ -28,7 +28,7 @@ EFFECTS = {
     "mask_term": "scas4d_core.effects.presence.mask_term",
     "motion_labels": "scas4d_core.effects.presence.motion_labels",
     "moving_colour": "scas4d_core.effects.appearance.moving_colour",
-    "standing_colour": "scas4d_core.effects.appearance.standing_colour",
+    "static_colour": "scas4d_core.effects.appearance.static_colour",
     "direction": "scas4d_core.effects.appearance.direction",
     "shading": "scas4d_core.effects.appearance.shading",
     "shadows": "scas4d_core.effects.appearance.shadows",

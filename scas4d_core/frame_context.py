@@ -16,7 +16,7 @@ from scas4d_core.update.result import Stopwatch, UpdateResult
 
 
 @dataclass(frozen=True, eq=False)
-class Observed:
+class FrameInput:
     """What the pictures of a frame say before any update.
 
     Attributes:
@@ -65,7 +65,7 @@ class FrameContext:
     watch: Stopwatch
     dropped: Mapping[str, str] | None
     notes: Mapping[str, Any]
-    observed: Observed = field(init=False)
+    observed: FrameInput = field(init=False)
     prepared: Prepared = field(init=False)
     given: UpdateInput = field(init=False)
     result: UpdateResult = field(init=False)

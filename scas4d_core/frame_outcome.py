@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, TypedDict
 
-HELD_TEXT = "held as it was: "
+REJECTED_TEXT = "held as it was: "
 """The beginning of the text for a frame whose state is the one before."""
 
 
@@ -20,7 +20,7 @@ class Candidate(StrEnum):
 
     END = "end"
     """The end of the update."""
-    STILL = "still"
+    PREVIOUS = "previous"
     """Θ_{t−1}, not moved."""
     WARM = "warm"
     """Θ_{t−1} moved on by the warm start alone."""
@@ -29,13 +29,13 @@ class Candidate(StrEnum):
 class FrameOutcome(StrEnum):
     """The outcome of a frame.
 
-    >>> FrameOutcome.HELD_UNMET.held, FrameOutcome.RELOCATED.degraded, FrameOutcome.STOOD.learnt
+    >>> FrameOutcome.REJECTED_MISFIT.rejected, FrameOutcome.RELOCATED.degraded, FrameOutcome.UNCHANGED.learnt
     (True, True, False)
     """
 
     UPDATED = "updated"
     """The update went as it should."""
-    STOOD = "stood"
+    UNCHANGED = "unchanged"
     """Θ_{t−1} shows the frame already; no iteration was needed, and nothing was learnt."""
     RETRIED = "retried"
     """Committed by a later attempt, with smaller steps or rigid layers: those before gave no plausible state."""
@@ -43,27 +43,27 @@ class FrameOutcome(StrEnum):
     """Committed after a longer search: the update as set had not met the frame."""
     ACCEPTED = "accepted"
     """Committed although it is not met: as many frames as the patience allows were held before it."""
-    HELD_UNUSABLE = "held_unusable"
+    REJECTED_UNUSABLE = "rejected_unusable"
     """Θ_{t−1} stays: the pictures are too dark or too bright to learn from."""
-    HELD_IMPLAUSIBLE = "held_implausible"
+    REJECTED_IMPLAUSIBLE = "rejected_implausible"
     """Θ_{t−1} stays: no attempt gave a finite, bounded and plausible state."""
-    HELD_UNMET = "held_unmet"
+    REJECTED_MISFIT = "rejected_misfit"
     """Θ_{t−1} stays: no state was found that shows the frame."""
 
     @property
-    def held(self) -> bool:
+    def rejected(self) -> bool:
         """True where the state of the frame before stays, because the frame was not believed."""
-        return self in (self.HELD_UNUSABLE, self.HELD_IMPLAUSIBLE, self.HELD_UNMET)
+        return self in (self.REJECTED_UNUSABLE, self.REJECTED_IMPLAUSIBLE, self.REJECTED_MISFIT)
 
     @property
     def degraded(self) -> bool:
         """True where the state is not the frame's, or only in part."""
-        return self not in (self.UPDATED, self.STOOD)
+        return self not in (self.UPDATED, self.UNCHANGED)
 
     @property
     def learnt(self) -> bool:
         """True where the state was updated to the frame's pictures."""
-        return not self.held and self is not self.STOOD
+        return not self.rejected and self is not self.UNCHANGED
 
 
 class AlarmKind(StrEnum):
@@ -85,7 +85,7 @@ class AlarmKind(StrEnum):
     """All cameras send the same pictures again, bit by bit."""
     FRAME_IN_PART = "frame_in_part"
     """The frame was committed in part, or after a longer search."""
-    FRAME_HELD = "frame_held"
+    FRAME_REJECTED = "frame_rejected"
     """The frame was not believed, and the state of the frame before stays."""
 
 
@@ -118,12 +118,12 @@ class CameraTiming(TypedDict):
 def degraded_text(outcome: FrameOutcome, reason: str) -> str | None:
     """The sentence of a report for people; None of a frame that went as it should.
 
-    >>> degraded_text(FrameOutcome.HELD_UNMET, "the pictures are met at 12.0 dB")
+    >>> degraded_text(FrameOutcome.REJECTED_MISFIT, "the pictures are met at 12.0 dB")
     'held as it was: the pictures are met at 12.0 dB'
     """
     if not outcome.degraded:
         return None
-    return HELD_TEXT + reason if outcome.held else reason
+    return REJECTED_TEXT + reason if outcome.rejected else reason
 
 
 COVERS_LITTLE = 0.25

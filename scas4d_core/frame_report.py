@@ -74,13 +74,13 @@ class FrameReport:
         attempts: each attempt at the frame, with what came of it.
         exposure: times that the frame was seen to be brighter than the light in which the colours are; of a frame that
             was not tried, as the mean brightness of its pictures says. A light that stays becomes that of the colours.
-        held: Gaussians held one by one as they were before. guards: by name, how often each guard acted.
+        frozen: Gaussians that keep their previous state, one by one. guards: by name, how often each guard acted.
         planned: (iteration, iterations in all) whenever the stopping rule, or the time of frame 0, planned otherwise.
         shortened: of frame 0: what its time (``StaticSettings.seconds``) was too short for, in words; a few iterations
             fewer are in ``planned`` alone. grey: of frame 0: grey cameras, where others have colours.
         curve: of the last attempt.
         errors: mean image loss on the probe views by candidate, in pictures without the gain of ``exposure``.
-            kept: the candidate that the state is; "still" where the frame was held.
+            kept: the candidate that the state is; "previous" where the frame was held.
     """
 
     index: int
@@ -98,7 +98,7 @@ class FrameReport:
     degraded: str | None = None
     attempts: list[str] = field(default_factory=list)
     exposure: float = 1.0
-    held: int = 0
+    frozen: int = 0
     guards: dict[str, int] = field(default_factory=dict)
     planned: list[tuple[int, int]] = field(default_factory=list)
     curve: list[CurvePoint] = field(default_factory=list)
@@ -222,7 +222,7 @@ def report_of_update(
         degraded=degraded_text(result.outcome, result.reason),
         attempts=list(result.attempts),
         exposure=result.exposure,
-        held=result.held,
+        frozen=result.frozen,
         guards={**trace.guards, "axis_bounds": result.bounded},
         planned=trace.planned,
         curve=curve(trace.losses, trace.moments),

@@ -21,7 +21,7 @@ from scas4d_core.effects.appearance.camera_gain import known_gains
 from scas4d_core.effects.cameras.pose_drift import posed
 from scas4d_core.effects.coherence.floor import floor_inside
 from scas4d_core.effects.effect import Effect, effect
-from scas4d_core.effects.evidence import Seen
+from scas4d_core.effects.evidence import FrameObservation
 from scas4d_core.effects.presence.motion_mask import labelled, labels_learnt
 from scas4d_core.effects.switches import (
     Switch,
@@ -29,9 +29,9 @@ from scas4d_core.effects.switches import (
     began,
     decided,
     first_switches,
-    joined,
     names_on,
-    noted,
+    record_arrays,
+    register_effects,
     switched_by,
 )
 from scas4d_core.engines.choose import engine_of
@@ -42,7 +42,7 @@ from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_outcome import FrameOutcome
 from scas4d_core.gaussians import UNBORN, Gaussians
 from scas4d_core.settings import Settings
-from scas4d_core.storage.births import FOUNDERLESS, grown_roots
+from scas4d_core.storage.births import NO_PARENT, grown_roots
 from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.structure.neighbours import Neighbours, build_neighbours
 from scas4d_core.update.frame_update import FrameUpdate
@@ -101,7 +101,7 @@ class Preparation:
         if self._scene.floor is not None:
             self._scene = self._scene.model_copy(update={"floor": floor_inside(self._scene.floor, world)})
 
-    def begun(self, frame: Frame, result: StaticResult) -> tuple[dict[str, Switch], dict[str, Arrays]]:
+    def first_frame_effects(self, frame: Frame, result: StaticResult) -> tuple[dict[str, Switch], dict[str, Arrays]]:
         """The switches of the effects after the first frame, and the arrays that they keep of it.
 
         Args:
@@ -110,7 +110,7 @@ class Preparation:
         switches = first_switches(self._settings, frame.index, result.evidence or {}, len(frame.masks) > 0)
         views = self._factory.views(frame, result.exposures, use_masks=False)
         unmoved = UpdateResult(result.gaussians, None, UpdateTrace())
-        seen = Seen(frame.index, result.gaussians, unmoved, self._factory.rig, views, self._renderer)
+        seen = FrameObservation(frame.index, result.gaussians, unmoved, self._factory.rig, views, self._renderer)
         arrays = began(switches, self._settings, seen)
         return switched_by(arrays, switches, seen), arrays
 
@@ -130,7 +130,7 @@ class Preparation:
         exposures = known_gains(fixed, effects, self._factory.rig.names)
         return self._factory.views(self._factory.scaled(frame), exposures, prepared.plan.mask > 0)
 
-    def again(self, roots: Gaussians, carried: CarryOver) -> Prepared:
+    def rebuild(self, roots: Gaussians, carried: CarryOver) -> Prepared:
         """Prepares the next update anew; a motion that belongs to other clusters is dropped from the carry-over.
 
         Args:
@@ -138,7 +138,7 @@ class Preparation:
         """
         known = {**first_switches(self._settings, 0), **carried.switches}  # where a report was lost, none are carried
         switches = {
-            name: replace(switch, on=switch.on and effect(name).refused(self._settings) is None)
+            name: replace(switch, on=switch.on and effect(name).refusal(self._settings) is None)
             for name, switch in known.items()
         }
         carried = replace(carried, switches=switches)  # a replay may have other settings than the scene
@@ -155,7 +155,7 @@ class Preparation:
         """
         hierarchy = self._clusters(roots)
         builder = PlanBuilder(self._scene, self._settings.update, self._factory, hierarchy, roots)
-        built = joined(builder, names_on(switches))
+        built = register_effects(builder, names_on(switches))
         if not built.plan.freedom.clusters:  # no cascade either
             hierarchy = built.hierarchy = hierarchy.without_layers
         neighbours = self._neighbour_graph(roots, hierarchy) if built.plan.neighbour_terms else None
@@ -177,7 +177,7 @@ class Preparation:
             self._hierarchy = build_hierarchy(*self._made_of, update.clusters, SMALLEST_CLUSTER, update.seed)
         return self._hierarchy
 
-    def relabelled(self, prepared: Prepared, newest: Gaussians, believed: Sequence[TrainingView]) -> Prepared:
+    def learn_labels(self, prepared: Prepared, newest: Gaussians, believed: Sequence[TrainingView]) -> Prepared:
         """Prepared anew with the Gaussians that the pictures show to move, for scenes without masks.
 
         A Gaussian that has moved once stays in the hierarchy. The labels become part of the state with the commit of
@@ -191,29 +191,29 @@ class Preparation:
         labels = labels_learnt(newest, carried.labels, carried.seen, believed, self._renderer)
         if labels is None:
             return prepared
-        return self.again(prepared.roots, replace(carried, labels=labels, motion=None))
+        return self.rebuild(prepared.roots, replace(carried, labels=labels, motion=None))
 
-    def followed(self, prepared: Prepared, seen: Seen, populates: bool) -> tuple[UpdateResult, Prepared]:
+    def after_frame(self, prepared: Prepared, seen: FrameObservation, populates: bool) -> tuple[UpdateResult, Prepared]:
         """The result of a frame that was learnt, and what the next update starts from.
 
         Args:
             seen: the frame. populates: whether Gaussians may come and go.
         """
-        on, seen = names_on(prepared.carried.switches), noted(prepared.carried.switches, self._settings, seen)
+        on, seen = names_on(prepared.carried.switches), record_arrays(prepared.carried.switches, self._settings, seen)
         switches = decided(prepared.carried.switches, self._settings, seen)
         prepared = prepared.carry(effects=seen.result.carried, switches=switches)
-        result = self.populated(on, seen) if populates else seen.result
+        result = self.add_and_retire_gaussians(on, seen) if populates else seen.result
         before, now = seen.result.gaussians, result.gaussians
         other_rows = len(now) != len(before) or not np.array_equal(now.retired, before.retired)
         if result is not seen.result:
             prepared = _grown(prepared, before, result, other_rows)
         if other_rows or names_on(switches) != on:
-            prepared = self.again(prepared.roots, prepared.carried)
+            prepared = self.rebuild(prepared.roots, prepared.carried)
         if other_rows and prepared.carried.motion is None and self._goes_on(result):
             prepared = _with_motion(prepared, seen, result)
         return result, prepared
 
-    def populated(self, names: Sequence[str], seen: Seen) -> UpdateResult:
+    def add_and_retire_gaussians(self, names: Sequence[str], seen: FrameObservation) -> UpdateResult:
         """The result of a frame with all that is born, retired or revived in it; what is not finite is left out.
 
         Args:
@@ -224,8 +224,8 @@ class Preparation:
         """
         for name in names:
             one = effect(name)
-            if type(one).populated is not Effect.populated:
-                result = one.populated(seen)
+            if type(one).add_and_retire_gaussians is not Effect.add_and_retire_gaussians:
+                result = one.add_and_retire_gaussians(seen)
                 _check_rows(name, seen.result, result)
                 arrays = result.gaussians.arrays().values()
                 if all(np.isfinite(array).all() for array in arrays if array.dtype.kind == "f"):
@@ -246,7 +246,7 @@ def _grown(prepared: Prepared, before: Gaussians, result: UpdateResult, other_ro
     """
     now, labels = result.gaussians, prepared.carried.labels
     effects = {
-        name: {key: _lengthened(array, len(before), result.joins) for key, array in arrays.items()}
+        name: {key: _lengthened(array, len(before), result.parents) for key, array in arrays.items()}
         for name, arrays in result.carried.items()
     }
     if not other_rows:
@@ -254,10 +254,10 @@ def _grown(prepared: Prepared, before: Gaussians, result: UpdateResult, other_ro
     if labels is not None:
         labels = np.concatenate([labels, now.foreground[len(labels) :] > 0.5])
     prepared = prepared.carry(effects=effects, labels=labels)
-    return replace(prepared, roots=grown_roots(prepared.roots, now, result.joins))
+    return replace(prepared, roots=grown_roots(prepared.roots, now, result.parents))
 
 
-def _with_motion(prepared: Prepared, seen: Seen, result: UpdateResult) -> Prepared:
+def _with_motion(prepared: Prepared, seen: FrameObservation, result: UpdateResult) -> Prepared:
     """With the motion between the two states, in the clusters of the updater."""
     if seen.result.motion is None:
         return prepared
@@ -274,19 +274,19 @@ def _check_rows(name: str, before: UpdateResult, after: UpdateResult) -> None:
     kept = born >= 0 and np.array_equal(after.gaussians.ids[:count], before.gaussians.ids)
     if not kept or (after.gaussians.ids[count:] != UNBORN).any():
         raise ValueError(f"effect {name}: rows were lost or moved; append with Gaussians.joined, retire the others")
-    had = 0 if before.joins is None else len(before.joins)
-    if (0 if after.joins is None else len(after.joins)) != had + born:
-        raise ValueError(f"effect {name}: joins has not one founder for each of {had + born} that are born")
-    if after.joins is not None and not ((after.joins >= FOUNDERLESS) & (after.joins < count - had)).all():
-        raise ValueError(f"effect {name}: a founder is no row of the frame before")
+    had = 0 if before.parents is None else len(before.parents)
+    if (0 if after.parents is None else len(after.parents)) != had + born:
+        raise ValueError(f"effect {name}: parents has not one parent for each of {had + born} that are born")
+    if after.parents is not None and not ((after.parents >= NO_PARENT) & (after.parents < count - had)).all():
+        raise ValueError(f"effect {name}: a parent is no row of the frame before")
 
 
-def _lengthened(array: NDArray[Any], count: int, joins: NDArray[np.int64] | None) -> NDArray[Any]:
+def _lengthened(array: NDArray[Any], count: int, parents: NDArray[np.int64] | None) -> NDArray[Any]:
     """An array of an effect with rows for the born, where it has one for each Gaussian."""
-    if joins is None or not array.ndim or len(array) != count:
+    if parents is None or not array.ndim or len(array) != count:
         return array
-    rows = array[np.maximum(joins, 0)]
-    rows[joins == FOUNDERLESS] = 0
+    rows = array[np.maximum(parents, 0)]
+    rows[parents == NO_PARENT] = 0
     return np.concatenate([array, rows])
 
 

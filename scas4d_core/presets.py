@@ -40,44 +40,45 @@ def _pinned(on: Iterable[str] = (), off: Iterable[str] = ()) -> dict[str, Mode]:
 PRESETS: dict[str, Settings] = {
     "scas4d": Settings(),
     # Half of the iterations but for the first motion, and none where nothing moved (docs/accuracy-and-time.md).
-    "adaptive": Settings(update=UpdateSettings(iterations=50, cold_longer=6.0, still=0.02)),
+    "adaptive": Settings(update=UpdateSettings(iterations=50, cold_start_iterations=6.0, skip_tolerance=0.02)),
     # Still fewer, and a third of the Gaussians: a third of the default's time.
     "fast": Settings(
-        static=StaticSettings(detail=0.3), update=UpdateSettings(iterations=45, cold_longer=6.0, still=0.02)
+        static=StaticSettings(detail=0.3),
+        update=UpdateSettings(iterations=45, cold_start_iterations=6.0, skip_tolerance=0.02),
     ),
     # What the paper says, in place of what this project chose beside it (docs/method.md); rates it does not give.
     "paper": Settings(
         update=UpdateSettings(
             cluster_map="published",
-            own_start=0.0,
-            cold_longer=1.0,
-            cold_start=1.0,
+            deltas_start=0.0,
+            cold_start_iterations=1.0,
+            cold_start_rates=1.0,
             momentum=1.0,
-            judge=False,
-            still=-1.0,
+            reject_outliers=False,
+            skip_tolerance=-1.0,
             weights=Weights(isometry=2.0),
         ),
-        effects=_pinned(on=("standing_colour",), off=OURS),
+        effects=_pinned(on=("static_colour",), off=OURS),
     ),
     # Per-Gaussian updates with the authors' terms, weights and rates (Dynamic3DGaussians, train.py).
     "dynamic3dgs": Settings(
         update=UpdateSettings(
             clusters=(),
-            own_start=0.0,
+            deltas_start=0.0,
             rate_rotation=0.001,
             rate_scale=0.0,
-            rate_end=1.0,
+            final_rate=1.0,
             beta1=0.9,
             beta2=0.999,
-            rate_colour_standing=0.0025,
+            rate_static_colour=0.0025,
             momentum=1.0,
-            cold_longer=1.0,
-            cold_start=1.0,
-            judge=False,
-            still=-1.0,
+            cold_start_iterations=1.0,
+            cold_start_rates=1.0,
+            reject_outliers=False,
+            skip_tolerance=-1.0,
             weights=Weights(mask=3.0, mask_alone=3.0, isometry=2.0, scale=0.0),
         ),
-        effects=_pinned(on=("standing_colour",), off=OURS),
+        effects=_pinned(on=("static_colour",), off=OURS),
     ),
     # By kind of scene: effects that are pinned, all others "auto"; no weight, no rate (figures: docs/effects.md).
     # A new effect that a kind of scene always or never calls for is pinned here.

@@ -18,7 +18,7 @@ from numba import get_num_threads
 from scas4d_core.cameras import Rig, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, cold_start, find_commit
-from scas4d_core.effects.evidence import FitTime, Seen
+from scas4d_core.effects.evidence import FitTime, FrameObservation
 from scas4d_core.effects.presence.motion_mask import first_labels, labelled
 from scas4d_core.effects.switches import kept_of, switches_record
 from scas4d_core.engines.choose import renderer_of
@@ -30,7 +30,7 @@ from scas4d_core.first_frame.calibration.record import Calibration, in_use
 from scas4d_core.first_frame.calibration.refine import first_calibration
 from scas4d_core.first_frame.start import FirstFrame, as_begun, fit_first, with_background
 from scas4d_core.first_frame.static_result import StaticResult
-from scas4d_core.frame_context import FrameContext, Observed
+from scas4d_core.frame_context import FrameContext, FrameInput
 from scas4d_core.frame_report import FrameReport, report_of_first, report_of_update
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import Preparation, Prepared, room_for_births
@@ -38,7 +38,15 @@ from scas4d_core.progress import Progress
 from scas4d_core.query.committed import CommittedScene
 from scas4d_core.rig_checks import check_rig
 from scas4d_core.robust.alarms import first_watched, sharpness
-from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness, fingerprints, goes_on, lit, noted
+from scas4d_core.robust.checks import (
+    axis_lengths,
+    brightness,
+    check_brightness,
+    fingerprints,
+    light_continues,
+    noted,
+    with_light,
+)
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.solve_frame import FrameSolver
 from scas4d_core.robust.update_input import RESTING, UpdateInput
@@ -67,7 +75,7 @@ class Reconstruction(CommittedScene):
     >>> settings = Settings.model_validate({"scene": {"image_scale": 0.25}, "static": {"iterations": 20}})
     >>> scene = Reconstruction.start(capture.rig, capture.frame(0), settings, points=capture.points)
     >>> report = scene.step(capture.frame(1))
-    >>> report.index, report.iterations, report.outcome.held
+    >>> report.index, report.iterations, report.outcome.rejected
     (1, 300, False)
     >>> scene.render(capture.rig.cameras[0]).colour.shape
     (256, 256, 3)
@@ -82,7 +90,7 @@ class Reconstruction(CommittedScene):
         self.rig = rig_inside(world, rig.scaled(scale).cameras)
         self.settings, self._update = settings, settings.update
         self._factory = ViewFactory(self.rig, None if scale == 1.0 else rig)
-        self._renderer = renderer_of(settings.device, settings.scene.behind, limits)
+        self._renderer = renderer_of(settings.device, settings.scene.background_rgb, limits)
         self._preparation = Preparation(self._factory, self.settings, self.world, self._renderer)
         self.static: StaticResult | None = None
         self.report: FrameReport | None = None
@@ -134,10 +142,15 @@ class Reconstruction(CommittedScene):
         result = static or fit_first(scaled, points, self._factory, self.settings, self.world, told)
         self.static = result = replace(result, gaussians=first_labels(result.gaussians, self.rig, scaled.masks))
         fitted = perf_counter()
-        fixed = len(frame.masks) > 0, result.exposures, axis_lengths(result.gaussians), self.settings.scene.behind
+        fixed = (
+            len(frame.masks) > 0,
+            result.exposures,
+            axis_lengths(result.gaussians),
+            self.settings.scene.background_rgb,
+        )
         self._fixed = FirstFrame(*fixed)
-        switches, effects = self._preparation.begun(scaled, result)
-        self._prepared = self._preparation.again(result.gaussians, CarryOver(switches=switches))
+        switches, effects = self._preparation.first_frame_effects(scaled, result)
+        self._prepared = self._preparation.rebuild(result.gaussians, CarryOver(switches=switches))
         seen = self._factory.views(scaled, {}, False) if self._learns_labels else ()
         load = {} if started is None else {"load": began - started}
         stages = {"calibration": checked - began, "fit": fitted - checked, "prepare": perf_counter() - fitted}
@@ -193,7 +206,7 @@ class Reconstruction(CommittedScene):
         return True
 
     @classmethod
-    def aside(cls, rig: Rig, settings: Settings, history: History, index: int) -> Reconstruction:
+    def fork(cls, rig: Rig, settings: Settings, history: History, index: int) -> Reconstruction:
         """A copy in memory that goes on from a committed frame, cold; ``history`` is read, not changed.
 
         Args:
@@ -212,7 +225,7 @@ class Reconstruction(CommittedScene):
         """Prepare the updates after a committed one; False: the motion that it left does not fit today's clusters."""
         roots = self.history.roots(index)
         self._fixed = replace(self._fixed, lengths=axis_lengths(roots))
-        self._prepared = self._preparation.again(roots, carried)
+        self._prepared = self._preparation.rebuild(roots, carried)
         return self._prepared.carried.structure == carried.structure
 
     def step(
@@ -250,11 +263,11 @@ class Reconstruction(CommittedScene):
         views = self._views(frame)
         watch.lap("decode")
         bright, shown = brightness(frame.images), fingerprints(frame.images)
-        judged = bright if self.settings.update.judge else {}  # then no picture is doubted
+        judged = bright if self.settings.update.reject_outliers else {}  # then no picture is doubted
         exposure, left_out, unusable = check_brightness(past, judged)
-        changes = exposure != 1.0 and goes_on(past, judged)
-        past = noted(lit(past, exposure), bright)
-        context.observed = Observed(seconds, views, bright, shown, exposure, left_out, unusable, changes, past)
+        changes = exposure != 1.0 and light_continues(past, judged)
+        past = noted(with_light(past, exposure), bright)
+        context.observed = FrameInput(seconds, views, bright, shown, exposure, left_out, unusable, changes, past)
         watch.lap("judge")
 
     def _prepare(self, context: FrameContext) -> None:
@@ -262,7 +275,7 @@ class Reconstruction(CommittedScene):
         observed, frame, prepared, newest = context.observed, context.frame, self._prepared, self.history.newest
         believed, learns = observed.believed, observed.steady and self._learns_labels
         if learns and prepared.carried.seen:
-            prepared = self._preparation.relabelled(prepared, newest, believed)
+            prepared = self._preparation.learn_labels(prepared, newest, believed)
         carried, past, shown = prepared.carried, observed.past, observed.fingerprints
         context.prepared = prepared
         context.given = UpdateInput(
@@ -295,7 +308,7 @@ class Reconstruction(CommittedScene):
         context.judging = solver.judging
         context.watch.lap("update")
         context.watch.move("update", "judge", solver.judging)
-        if result.outcome.held:  # motion seen in pictures that are rejected is rejected with them
+        if result.outcome.rejected:  # motion seen in pictures that are rejected is rejected with them
             carried = self._prepared.carried
             context.prepared = self._prepared
             result = replace(result, gaussians=self.history.newest, motion=carried.motion, carried=carried.effects)
@@ -308,15 +321,15 @@ class Reconstruction(CommittedScene):
         carried = context.prepared.carried.after(
             result, context.past, context.frame.time, learnt_from, observed.fingerprints
         )
-        relabelled = context.prepared.updater is not self._prepared.updater
-        context.notes = {"cold": context.given.motion is None, "relabelled": relabelled, **context.notes}
+        learn_labels = context.prepared.updater is not self._prepared.updater
+        context.notes = {"cold": context.given.motion is None, "learn_labels": learn_labels, **context.notes}
         context.prepared = replace(context.prepared, carried=carried)
         context.fits = FitTime(self._budget.end_of_births(context.watch.began))
         if not result.outcome.learnt or result.exposure != 1.0:  # where a change of light was taken out, much looks new
             return
         learnt = [view for view in result.views or believed if view.name not in result.trace.left_out]
         names = {view.name for view in learnt}
-        seen = Seen(
+        seen = FrameObservation(
             index=context.frame.index,
             before=context.given.state,
             result=result,
@@ -328,7 +341,7 @@ class Reconstruction(CommittedScene):
             suspects=[view for view in observed.views if view.name not in names],
         )
         populates = self.populates and observed.exposure == 1.0
-        context.result, context.prepared = self._preparation.followed(context.prepared, seen, populates)
+        context.result, context.prepared = self._preparation.after_frame(context.prepared, seen, populates)
         self._budget.saw_births(context.fits.spent, context.fits.put_off)
         context.watch.lap("presence")
 
@@ -342,7 +355,7 @@ class Reconstruction(CommittedScene):
         """Commits the frame with what was born in it, and lets the budget learn from its time."""
         result, prepared, watch = context.result, context.prepared, context.watch
         grown = prepared.roots is not self._prepared.roots
-        birth = {"roots": prepared.roots, "joins": result.joins} if grown else {}
+        birth = {"roots": prepared.roots, "parents": result.parents} if grown else {}
         self._commit(report, result.gaussians, prepared, context.notes, **birth)
         after = context.judging + watch.seconds.get("presence", 0.0) - context.fits.spent
         after += perf_counter() - watch.began - watch.total
@@ -376,10 +389,15 @@ class Reconstruction(CommittedScene):
         iterations: int | None = None,
         budget_ms: float | None = None,
         stop_gain: float | None = None,
-        still: float | None = None,
+        skip_tolerance: float | None = None,
     ) -> None:
         """Give the updates from here on another budget; None: as made. ValueError: out of ``UpdateSettings``' range."""
-        given = {"iterations": iterations, "budget_ms": budget_ms, "stop_gain": stop_gain, "still": still}
+        given = {
+            "iterations": iterations,
+            "budget_ms": budget_ms,
+            "stop_gain": stop_gain,
+            "skip_tolerance": skip_tolerance,
+        }
         changes = {name: value for name, value in given.items() if value is not None}
         self._update = UpdateSettings.model_validate({**self.settings.update.model_dump(), **changes})
         self._budget.milliseconds = self._update.budget_ms

@@ -66,9 +66,9 @@ def replay(
         StepError: a frame does not follow the one before.
     """
     update = settings.update.model_copy(
-        update={"iterations": iterations, "budget_ms": None, "stop_gain": 0.0, "still": -1.0}
+        update={"iterations": iterations, "budget_ms": None, "stop_gain": 0.0, "skip_tolerance": -1.0}
     )
-    scene = Reconstruction.aside(rig, settings.model_copy(update={"update": update}), history, base)
+    scene = Reconstruction.fork(rig, settings.model_copy(update={"update": update}), history, base)
     reports: list[FrameReport] = []
     for decode in frames:
         began = perf_counter()

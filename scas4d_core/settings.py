@@ -54,7 +54,7 @@ class SceneSettings(SettingsModel):
     )
 
     @property
-    def behind(self) -> tuple[float, float, float]:
+    def background_rgb(self) -> tuple[float, float, float]:
         """The background as RGB; black while 'auto' is not resolved (``first_frame.start.with_background``)."""
         return (0.0, 0.0, 0.0) if self.background == "auto" else self.background
 
@@ -156,18 +156,18 @@ class UpdateSettings(SettingsModel):
         description="An update cools down and ends once ten iterations lower its error on four training views by less "
         "than this share, after all layers have begun. 0: never.",
     )
-    still: float = Field(
+    skip_tolerance: float = Field(
         0.0,
         ge=-1,
         description="A frame needs no iteration where the state before shows it, on some training views, small and "
         "whole, with at most 1 + this times the error that the last update ended with. -1: every frame is updated.",
     )
-    judge: bool = Field(
+    reject_outliers: bool = Field(
         True,
         description="Leave out cameras and hold frames that do not fit what was before, commit no state that is worse "
         "than not moving, and say so in the frame's report.",
     )
-    patience: int = Field(
+    max_rejected_frames: int = Field(
         10,
         ge=1,
         le=1_000_000,
@@ -196,24 +196,26 @@ class UpdateSettings(SettingsModel):
         min_length=1,
         description="One per layer, coarse to fine; with more layers the last is repeated.",
     )
-    own_start: Share = Field(
+    deltas_start: Share = Field(
         0.4,
         description="Share of the iterations after which each Gaussian's own Δp, ΔR and Δs begin to learn; the layers "
         "of clusters begin one after the other before.",
     )
-    cold_longer: Positive = Field(3.0, description="Factor on the iterations where there is no motion to start from.")
-    cold_start: float = Field(
+    cold_start_iterations: Positive = Field(
+        3.0, description="Factor on the iterations where there is no motion to start from."
+    )
+    cold_start_rates: float = Field(
         2.0, ge=1, description="Factor on the layers' rates where there is no motion to start from: further to go."
     )
     rate_position: Positive = Field(1.6e-4, description="Δp, per metre of scene radius.")
     rate_rotation: Positive = Field(0.002, description="ΔR, in units of tan(angle/2).")
     rate_scale: NotNegative = Field(0.001, description="Δs, log.")
     rate_colour: NotNegative = Field(0.0025, description="RGB of the Gaussians that move.")
-    rate_colour_standing: NotNegative = Field(
+    rate_static_colour: NotNegative = Field(
         0.01,
-        description="RGB of the Gaussians that stand, where standing_colour is on; with 0 they keep their colours.",
+        description="RGB of the Gaussians that stand, where static_colour is on; with 0 they keep their colours.",
     )
-    rate_end: float = Field(
+    final_rate: float = Field(
         0.05, gt=0, le=1, description="Rates decay to this fraction by a layer's rest or the end (cosine); 1: constant."
     )
     beta1: float = Field(0.8, ge=0, lt=1, description="Adam's first decay.")

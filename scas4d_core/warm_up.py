@@ -8,40 +8,42 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from scas4d_core.compilation.crew import Told, compiled
-from scas4d_core.compilation.manifest import Group, groups_of_update
+from scas4d_core.compilation.compile_pool import OnProgress, wait_for_kernels
+from scas4d_core.compilation.manifest import KernelGroup, groups_of_update
 
-EVERY = tuple(Group)
+EVERY = tuple(KernelGroup)
 
-_settled: set[Group] = set()
+_settled: set[KernelGroup] = set()
 """The groups that this process has asked for."""
 
 
-def warm_up_elsewhere(wanted: Iterable[Group] = EVERY, *, then: Iterable[Group] = (), told: Told | None = None) -> None:
+def warm_up_elsewhere(
+    wanted: Iterable[KernelGroup] = EVERY, *, then: Iterable[KernelGroup] = (), on_progress: OnProgress | None = None
+) -> None:
     """Waits until the cache has the kernels of the groups ``wanted``; a process asks for each group once.
 
     Args:
-        wanted, then, told: see `compiled`.
+        wanted, then, on_progress: see `compiled`.
     """
     asked = tuple(group for group in wanted if group not in _settled)
     if asked:
         _settled.update(asked)
-        compiled(asked, then, told)
+        wait_for_kernels(asked, then, on_progress)
 
 
-def first_frame_groups(*, points: bool) -> tuple[Group, ...]:
+def first_frame_groups(*, points: bool) -> tuple[KernelGroup, ...]:
     """Returns the groups that a first frame needs; ``points``: whether it is given points to start from."""
-    return (Group.FIRST_FRAME,) if points else (Group.FIRST_FRAME, Group.STEREO)
+    return (KernelGroup.FIRST_FRAME,) if points else (KernelGroup.FIRST_FRAME, KernelGroup.STEREO)
 
 
-def update_groups(covariance: str) -> tuple[Group, ...]:
+def update_groups(covariance: str) -> tuple[KernelGroup, ...]:
     """Returns the groups that updates need; ``covariance`` as in their settings."""
     return groups_of_update(covariance)
 
 
-def warm_up(told: Told) -> None:
+def warm_up(on_progress: OnProgress) -> None:
     """Waits until the cache has the kernels of a first frame; those of updates are compiled after them."""
-    warm_up_elsewhere((Group.FIRST_FRAME,), then=groups_of_update("entangled"), told=told)
+    warm_up_elsewhere((KernelGroup.FIRST_FRAME,), then=groups_of_update("entangled"), on_progress=on_progress)
 
 
 def warm_up_more() -> None:

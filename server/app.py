@@ -23,6 +23,8 @@ from server.http.authentication import AuthMiddleware
 from server.http.middleware import AccessLog, BodyLimit, HeadAsGet, compressed
 from server.http.tickets import Tickets
 from server.hub import Hub
+from server.peers.peers import Peers
+from server.peers.proxy import ProxyMiddleware
 from server.problems import Problem
 from server.processes.placement import Placement
 from server.routes import (
@@ -53,8 +55,6 @@ from server.routes import (
 from server.scene.exports import Exports
 from server.scene.scenes import Scenes
 from server.settings import ServerSettings
-from server.siblings.passing import PassOn
-from server.siblings.siblings import Siblings
 
 
 def create_app(settings: ServerSettings | None = None, placement: Placement | None = None) -> FastAPI:
@@ -77,15 +77,15 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
         app.state.readiness = Readiness(settings, where)
         app.state.scenes = Scenes(settings, where, app.state.hub)
         await app.state.scenes.open()
-        app.state.siblings = Siblings(where.siblings, settings.secret) if where.has_siblings else None
+        app.state.peers = Peers(where.peers, settings.secret) if where.has_siblings else None
         app.state.exports = Exports(app.state.scenes, where)
         await app.state.exports.open()
         yield
         await app.state.exports.stop()
         await app.state.readiness.stop()
         await app.state.scenes.stop()
-        if app.state.siblings is not None:
-            await app.state.siblings.close()
+        if app.state.peers is not None:
+            await app.state.peers.close()
         await where.close()
 
     app = FastAPI(
@@ -107,8 +107,8 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
     app.add_middleware(HeadAsGet)
     if placement is not None and placement.has_siblings:
         app.add_middleware(
-            PassOn,
-            siblings=lambda: app.state.siblings,
+            ProxyMiddleware,
+            peers=lambda: app.state.peers,
             has=lambda id: id in app.state.scenes,
             most_bytes=int(settings.max_body_mb * 1e6),
         )

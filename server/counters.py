@@ -16,7 +16,7 @@ registry = CollectorRegistry()
 
 FRAMES = Counter(
     "scas4d_frames",
-    "Frames by what became of them: acknowledged, committed, set_aside, skipped, missing.",
+    "Frames by what became of them: acknowledged, committed, failed, skipped, missing.",
     ["state"],
     registry=registry,
 )
@@ -78,9 +78,9 @@ CONNECTIONS_REFUSED = Counter(
     ["reason"],
     registry=registry,
 )
-for state in ("acknowledged", "committed", "set_aside", "skipped", "missing"):
+for state in ("acknowledged", "committed", "failed", "skipped", "missing"):
     FRAMES.labels(state)
-for how in ("held", "in_part"):
+for how in ("rejected", "in_part"):
     DEGRADED.labels(how)
 for process in ("worker", "reader"):
     RESTARTS.labels(process)

@@ -172,7 +172,7 @@ class Publisher:
             for alarm in report.alarms:
                 counters.ALARMS.labels(alarm.what.value).inc()
             if report.outcome is not None and report.outcome.degraded:
-                counters.DEGRADED.labels("held" if report.outcome.held else "in_part").inc()
+                counters.DEGRADED.labels("rejected" if report.outcome.rejected else "in_part").inc()
         for stage, seconds in report.seconds.items():
             counters.UPDATE_SECONDS.labels(stage).observe(seconds)
         self._hub.publish(self._scene, FrameFinished(report))

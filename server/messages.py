@@ -54,7 +54,7 @@ class FrameReady:
 
 
 @dataclass(frozen=True)
-class Mend:
+class RepairFiles:
     """Asks the worker to check files of the states' folder, found damaged or gone, and to write them again if it can.
 
     `times` and `reports` of frames, as far as the service has them in memory.
@@ -66,7 +66,7 @@ class Mend:
 
 
 @dataclass(frozen=True)
-class Remake:
+class RecomputeState:
     """Asks the worker to compute a damaged state again, from its pictures and the committed frame `base`."""
 
     frame: FrameReady
@@ -145,7 +145,7 @@ class FrameCommitted:
 
 
 @dataclass(frozen=True)
-class FrameFailed:
+class UpdateFailed:
     """The frame was not committed; the state is that of the frame before. `fatal`: the scene cannot go on."""
 
     index: int
@@ -154,7 +154,7 @@ class FrameFailed:
     fatal: bool = False
 
 
-class MendOutcome(StrEnum):
+class RepairOutcome(StrEnum):
     """Outcomes for a file that was found damaged."""
 
     WHOLE = "whole"
@@ -167,7 +167,7 @@ class MendOutcome(StrEnum):
     """It is, and nothing to write it from is in memory."""
     GONE = "gone"
     """It was deleted by the rules of the scene."""
-    REMADE = "remade"
+    RECOMPUTED = "recomputed"
     """The state was made again from pictures."""
     LOST = "lost"
     """The state could not be made again."""
@@ -178,11 +178,11 @@ class MendOutcome(StrEnum):
 
 
 @dataclass(frozen=True)
-class Mended:
-    """The outcome for one file (`Mend`) or for one state (`Remake`, with its new report)."""
+class RepairResult:
+    """The outcome for one file (`RepairFiles`) or for one state (`RecomputeState`, with its new report)."""
 
     name: str
-    outcome: MendOutcome
+    outcome: RepairOutcome
     reason: str = ""
     report: dict[str, Any] = field(default_factory=dict)
 

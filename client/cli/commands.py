@@ -158,7 +158,7 @@ def budget(
             min=0, max=0.999, help="End an update once ten iterations lower its error by less than this share."
         ),
     ] = None,
-    still: Annotated[
+    skip_tolerance: Annotated[
         float | None,
         typer.Option(
             min=-1,
@@ -170,13 +170,13 @@ def budget(
     token: Token = None,
 ) -> None:
     """Prints the budget of a scene's updates; with options, sets it from the next frame on."""
-    given = (iterations, milliseconds, stop_gain, still)
+    given = (iterations, milliseconds, stop_gain, skip_tolerance)
     if as_made and any(value is not None for value in given):
         raise ValueError("--as-made stands for no other budget; leave it out, or the others")
     with Client(url, token=token, outage=0) as client:
         if as_made or any(value is not None for value in given):
             budget_now = client.set_budget(
-                scene, iterations=iterations, budget_ms=milliseconds, stop_gain=stop_gain, still=still
+                scene, iterations=iterations, budget_ms=milliseconds, stop_gain=stop_gain, skip_tolerance=skip_tolerance
             )
         else:
             budget_now = client.budget(scene)
@@ -187,7 +187,10 @@ def budget(
         else f"as many iterations as fit into {now.budget_ms:g} ms"
     )
     stops = f", or fewer: stop gain {now.stop_gain:g}" if now.stop_gain else ""
-    console.print(f"{many} a frame{stops}; still {now.still:g}; from frame {budget_now.since} on", highlight=False)
+    console.print(
+        f"{many} a frame{stops}; skip tolerance {now.skip_tolerance:g}; from frame {budget_now.since} on",
+        highlight=False,
+    )
 
 
 def begin_again(
@@ -257,7 +260,7 @@ def import_(
     console.print(f"{out}: {count} cameras; try: scas4d push {out}", highlight=False, soft_wrap=True)
 
 
-TOLD = frozenset({AlarmKind.CAMERA_LEFT_OUT, AlarmKind.FRAME_HELD, AlarmKind.FRAME_IN_PART})
+TOLD = frozenset({AlarmKind.CAMERA_LEFT_OUT, AlarmKind.FRAME_REJECTED, AlarmKind.FRAME_IN_PART})
 """Alarms that the line of a frame tells without."""
 
 

@@ -16,7 +16,7 @@ from client import pictures
 from client.exports.video.video_file import video_file
 from client.progress import Bars, console
 from scas4d_core.captures import Capture
-from scas4d_core.compact import CompactWriter, Head
+from scas4d_core.compact import CompactWriter, FileHeader
 from scas4d_core.frame_outcome import AlarmKind
 from scas4d_core.presets import preset as named
 from scas4d_core.rig_checks import check_rig, rig_warnings
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from scas4d_core.reconstruction import Reconstruction
     from scas4d_core.storage.history import History
 
-FRAME_ALARMS = (AlarmKind.FRAME_HELD, AlarmKind.FRAME_IN_PART)
+FRAME_ALARMS = (AlarmKind.FRAME_REJECTED, AlarmKind.FRAME_IN_PART)
 """Alarms whose evidence is the report's ``degraded``."""
 
 
@@ -136,7 +136,7 @@ def reconstruct(
         for reconstruction, done in reconstruct_frames(given, settings, count, history=history, progress=bars):
             index = done.index
             if writer is None:
-                head = Head(
+                head = FileHeader(
                     reconstruction.world,
                     background=history.background,
                     rig=reconstruction.calibrated,
@@ -195,4 +195,4 @@ def compile_kernels() -> None:
     from scas4d_core.warm_up import EVERY, warm_up_elsewhere
 
     with Bars() as bars:
-        warm_up_elsewhere(EVERY, told=lambda done, total: bars("compiling the kernels", done, total))
+        warm_up_elsewhere(EVERY, on_progress=lambda done, total: bars("compiling the kernels", done, total))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.sdk import Client
-from scas4d_core.compact import CompactReader, Head
+from scas4d_core.compact import CompactReader, FileHeader
 from scas4d_core.errors import InputError
 from scas4d_core.gaussians import Gaussians
 
@@ -34,7 +34,7 @@ class States(Protocol):
     """
 
     @property
-    def head(self) -> Head:
+    def head(self) -> FileHeader:
         """World, rig, rate and background."""
 
     @property
@@ -69,7 +69,7 @@ class Source:
     of: States
 
     @property
-    def head(self) -> Head:
+    def head(self) -> FileHeader:
         """World, rig, rate and background."""
         return self.of.head
 
@@ -155,7 +155,7 @@ class CompactStates:
     """
 
     files: Sequence[Path]
-    head: Head
+    head: FileHeader
     frames: Sequence[int]
     times: Sequence[float]
     damage: str | None
@@ -164,7 +164,7 @@ class CompactStates:
     @classmethod
     def of(cls, files: Sequence[Path], first: int = 0) -> CompactStates:
         """Looks at each file; frames before ``first`` are left out: they only tell the others."""
-        heads: list[Head] = []
+        heads: list[FileHeader] = []
         times: dict[int, float] = {}
         damages: list[str] = []
         for file in files:

@@ -35,7 +35,7 @@ class Budget(Model):
         description="An update ends once ten iterations lower its error on four training views by less than this "
         "share; 0: never.",
     )
-    still: float | None = Field(
+    skip_tolerance: float | None = Field(
         default=None,
         strict=True,
         ge=-1,
@@ -52,7 +52,7 @@ class BudgetFields(TypedDict, total=False):
     iterations: int | None
     budget_ms: float | None
     stop_gain: float | None
-    still: float | None
+    skip_tolerance: float | None
 
 
 class EffectiveBudget(Model):
@@ -61,7 +61,7 @@ class EffectiveBudget(Model):
     iterations: int
     budget_ms: float | None = Field(description="Milliseconds a frame; null: no limit.")
     stop_gain: float
-    still: float
+    skip_tolerance: float
 
 
 class SceneBudget(Model):

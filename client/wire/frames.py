@@ -39,12 +39,12 @@ class FrameState(StrEnum):
     QUEUED = "queued"
     UPDATING = "updating"
     COMMITTED = "committed"
-    SET_ASIDE = "set_aside"
+    FAILED = "failed"
     MISSING = "missing"
     SKIPPED = "skipped"
 
 
-FINISHED = frozenset({FrameState.COMMITTED, FrameState.SET_ASIDE, FrameState.MISSING, FrameState.SKIPPED})
+FINISHED = frozenset({FrameState.COMMITTED, FrameState.FAILED, FrameState.MISSING, FrameState.SKIPPED})
 """Nothing more happens to a frame in one of these."""
 
 
@@ -75,7 +75,7 @@ class AlarmModel(Model):
         description="camera_left_out: nothing was learnt from it. camera_misfit: it fits worse than usual beside the "
         "others. camera_colours, camera_sharpness: off against its past and the others. camera_frozen: it sends the "
         "same picture again. light: all see another light. frame_repeated: all send the same pictures again. "
-        "frame_in_part, frame_held: see `degraded`."
+        "frame_in_part, frame_rejected: see `degraded`."
     )
     camera: str | None = Field(default=None, description="Null where it is about none.")
     evidence: str = Field(description="For people, with figures.")
@@ -173,13 +173,13 @@ class FrameReportModel(Model):
     time: float | None = Field(description="Seconds; null for a frame that was declared missing.")
     state: FrameState = Field(
         description="open: cameras are still sending. queued: on disk, waits. updating: at work. committed: its state "
-        "can be read. set_aside: it was taken and could not be reconstructed; `error` says why. missing: it was "
+        "can be read. failed: it was taken and could not be reconstructed; `error` says why. missing: it was "
         "declared missing. skipped: the queue was full and the scene skips to the newest."
     )
     error: str | None = Field(default=None, description="Why the frame was set aside, skipped, or is missing.")
     identity: str | None = Field(default=None, description="As in its receipt; null where it never had one.")
     attempts: int = Field(default=0, description="How often the worker died at this frame.")
-    held: bool = Field(default=False, description="Its pictures are still in the frame log.")
+    pictures_kept: bool = Field(default=False, description="Its pictures are still in the frame log.")
     deleted: bool = Field(default=False, description="It was committed, and retention has deleted its state since.")
     received: list[str] | None = Field(default=None, description="While open: cameras whose picture is here.")
     used_cameras: list[str] = Field(default_factory=list, description="Cameras that the update saw.")
@@ -193,7 +193,7 @@ class FrameReportModel(Model):
     degraded: str | None = Field(
         default=None, description="Why the committed state is not the frame's, or only by half; null where it is."
     )
-    kept: Literal["end", "still", "warm"] | None = Field(
+    kept: Literal["end", "previous", "warm"] | None = Field(
         default=None,
         description="What was committed: the end of the update, the state before (still), or that going on as it moved "
         "(warm): whichever shows the frame best.",
@@ -205,7 +205,7 @@ class FrameReportModel(Model):
         default_factory=list, description="Of frame 0, the cameras whose pictures are grey, where others have colours."
     )
     exposure: float | None = Field(default=None, description="Times brighter than the light that the colours are in.")
-    held_gaussians: int | None = Field(default=None, description="That stayed as they were before, one by one.")
+    frozen_gaussians: int | None = Field(default=None, description="That stayed as they were before, one by one.")
     guards: dict[str, int] = Field(default_factory=dict, description="How often each guard acted.")
     effects: dict[str, EffectModel] = Field(
         default_factory=dict, description="Switches of the effects as this frame leaves them, by name."
@@ -222,7 +222,7 @@ class FrameReportModel(Model):
         default=None, description="What writing the commit before took; its own is not known when it is written."
     )
     threads: int | None = Field(default=None, description="That the update ran on.")
-    remade: bool = Field(
+    recomputed: bool = Field(
         default=False,
         description="Its state was damaged on disk and was made again from its pictures: it shows the same, and is not "
         "the same bits.",

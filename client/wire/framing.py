@@ -53,7 +53,7 @@ class FrameFile(Model):
 
 
 class FrameHead(Model):
-    """Head of a framed body: the frame's index, time and files."""
+    """FileHeader of a framed body: the frame's index, time and files."""
 
     index: int = Field(ge=0, le=MAX_INDEX)
     time: FiniteFloat | None = Field(default=None, description="Seconds; by the scene's frame rate where not given.")

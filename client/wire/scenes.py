@@ -224,11 +224,11 @@ class SceneStatus(Model):
         "mended. `error` says which.",
     )
     open_frames: list[int] = Field(description="Frames not closed yet, whose cameras send one by one.")
-    set_aside: int = Field(description="Frames that were taken and could not be reconstructed.")
+    failed: int = Field(description="Frames that were taken and could not be reconstructed.")
     missing: int = Field(description="Frames that were declared missing.")
     skipped: int = Field(description="Frames that were skipped because the queue was full.")
     worker_deaths: int = Field(description="Since the scene woke or its reconstruction began.")
-    frames_held: int = Field(description="Frames whose pictures are in the frame log.")
+    frames_kept: int = Field(description="Frames whose pictures are in the frame log.")
     frame_bytes: int = Field(description="Of the frame log on disk.")
     states_deleted: int = Field(description="Committed states that retention has deleted.")
     effects: dict[str, EffectStatus] = Field(

@@ -170,7 +170,7 @@ class FrameMessage(Model):
     report: FrameReportModel
 
 
-class Gone(Model):
+class SceneGone(Model):
     """The scene was deleted; the service closes with 4404 next."""
 
     type: Literal["gone"] = "gone"
@@ -178,18 +178,19 @@ class Gone(Model):
 
 
 ServerMessage = Annotated[
-    Hello | Subscribed | Unsubscribed | StreamProblem | SceneMessage | FrameMessage | Gone, Field(discriminator="type")
+    Hello | Subscribed | Unsubscribed | StreamProblem | SceneMessage | FrameMessage | SceneGone,
+    Field(discriminator="type"),
 ]
-SERVER_MESSAGE: TypeAdapter[Hello | Subscribed | Unsubscribed | StreamProblem | SceneMessage | FrameMessage | Gone] = (
-    TypeAdapter(ServerMessage)
-)
+SERVER_MESSAGE: TypeAdapter[
+    Hello | Subscribed | Unsubscribed | StreamProblem | SceneMessage | FrameMessage | SceneGone
+] = TypeAdapter(ServerMessage)
 
 
 # From the service, as the head of a binary message.
 
 
 class BulkHead(Model):
-    """Head of a binary message: describes the bytes after it."""
+    """FileHeader of a binary message: describes the bytes after it."""
 
     type: Literal["render", "tracks", "parts"]
     id: SubscriptionId
@@ -210,7 +211,7 @@ def pack(head: Model, body: bytes) -> bytes:
 
 
 def unpack(message: bytes) -> tuple[BulkHead, bytes]:
-    """Head and body of a binary message.
+    """FileHeader and body of a binary message.
 
     Raises:
         ValueError: not one of ours.

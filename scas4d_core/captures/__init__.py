@@ -10,7 +10,7 @@ from scas4d_core.captures.dynamic3dgs import TRAIN_META, read_dynamic3dgs
 from scas4d_core.captures.files import CaptureError
 from scas4d_core.captures.fit import Fit
 from scas4d_core.captures.frame import Frame, InitialPoints
-from scas4d_core.captures.ground_truth import GroundTruth, Part
+from scas4d_core.captures.ground_truth import GroundTruth, TruePart
 from scas4d_core.captures.images import ImageError, decode_image, decode_mask, resize_area
 from scas4d_core.captures.reader import PictureReader
 
@@ -22,8 +22,8 @@ __all__ = [
     "GroundTruth",
     "ImageError",
     "InitialPoints",
-    "Part",
     "PictureReader",
+    "TruePart",
     "decode_image",
     "decode_mask",
     "open_capture",

@@ -14,7 +14,7 @@ from scas4d_core.captures.images import Size, decode_labels
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class TruePart:
     """One part of the scene.
 
     Attributes:
@@ -59,7 +59,7 @@ class GroundTruth:
     part_id: NDArray[np.int64]
     visible: NDArray[np.bool_]
     cameras: tuple[str, ...]
-    parts: tuple[Part, ...]
+    parts: tuple[TruePart, ...]
     label_files: Mapping[str, tuple[Path, ...]]
     image_size: Mapping[str, tuple[Size, Size]]
 
@@ -154,14 +154,14 @@ def read_extent(folder: Path) -> float | None:
     return float(value)
 
 
-def _read_parts(path: Path, frame_count: int) -> tuple[Part, ...]:
+def _read_parts(path: Path, frame_count: int) -> tuple[TruePart, ...]:
     if not path.exists():
         return ()
     parts = []
     for number, entry in enumerate(read_json(path).get("parts", [])):
         try:
             pose = None if entry.get("pose") is None else np.array(entry["pose"], dtype=np.float64)
-            part = Part(
+            part = TruePart(
                 id=int(entry["id"]),
                 name=str(entry["name"]),
                 rigid=bool(entry["rigid"]),

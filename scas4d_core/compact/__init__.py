@@ -1,7 +1,7 @@
 """The compact 4D file: key frames, and the differences between them. Needs only numpy and zstandard."""
 
 from scas4d_core.compact.bounds import Bounds
-from scas4d_core.compact.head import Head
+from scas4d_core.compact.head import FileHeader
 from scas4d_core.compact.reader import CompactReader, DamagedFileError, FileError
 from scas4d_core.compact.records import FormatError, checked_records
 from scas4d_core.compact.writer import CompactWriter
@@ -12,7 +12,7 @@ __all__ = [
     "CompactWriter",
     "DamagedFileError",
     "FileError",
+    "FileHeader",
     "FormatError",
-    "Head",
     "checked_records",
 ]

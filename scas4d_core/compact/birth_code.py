@@ -1,6 +1,6 @@
 """Gaussians as bytes without a reference: those of the first frame, and those that are born later.
 
-Other frames refer to them, so thin axes keep their direction: each axis is told in parts of its own length.
+Other frames refer to them, so thin axes keep their direction: each axis is coded in parts of its own length.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from scas4d_core.compact.columns import (
 )
 from scas4d_core.compact.frame_code import completed, lost_volume
 from scas4d_core.compact.planes import Ints, PlaneError, pack, unpack
+from scas4d_core.compact.residuals import MARGIN, whole_steps
 from scas4d_core.compact.sections import (
     read_array,
     read_exact,
@@ -33,20 +34,19 @@ from scas4d_core.compact.sections import (
     write_mask,
     write_residuals,
 )
-from scas4d_core.compact.told import MARGIN, whole_steps
 
 Float = NDArray[np.float64]
 
 OCTAVE = 8
 """Steps of an axis' length in a factor of two."""
 FINER = 4
-"""Bounds of centres, axes and colours are divided by this: they are told once, and what stands keeps their errors."""
+"""Bounds of centres, axes and colours are divided by this: they are coded once, and what stands keeps their errors."""
 COARSEST = 0.02
 """Error of an axis in parts of its own length, at most."""
 SHORTEST = 1e-30
 """Metres; an axis is not shorter."""
 TINIEST, LARGEST_SIZE = 1e-18, 1e18
-"""Metres; a size outside is told exactly."""
+"""Metres; a size outside is coded exactly."""
 OPAQUE = 1e-4
 """Opacities keep this far from 0 and 1."""
 COMPONENTS = {"lengths": 3, "axes": 9, "means": 3, "rotations": 3, "colours": 3, "labels": 1, "opacities": 1}
@@ -62,19 +62,19 @@ def encode_born(state: Columns, clusters: Clusters, bounds: Bounds) -> tuple[byt
     >>> again.ids, clusters.labels, bool((again.means == decoded.means).all())
     (array([0, 1]), array([1, 1]), True)
     """
-    told: dict[str, Ints] = {}
+    coded: dict[str, Ints] = {}
     exact = np.zeros(len(state), np.bool_)
     for name, planes in _planes(state, bounds).items():
-        told[name], beyond = whole_steps(planes)
+        coded[name], beyond = whole_steps(planes)
         exact |= beyond
-    exact |= lost_volume(_columns(told, state.ids, bounds), state)
+    exact |= lost_volume(_columns(coded, state.ids, bounds), state)
     rows = np.flatnonzero(exact)
     gloss, retired = state.gloss, state.retired
     body = b"".join(
         [
             pack(np.diff(state.ids, prepend=0)),
             pack(clusters.labels),
-            *(write_residuals(planes) for planes in told.values()),
+            *(write_residuals(planes) for planes in coded.values()),
             write_exact(rows, np.concatenate([state.means[:, rows], state.factors[:, rows]])),
             write_mask(retired if retired.any() else None),
             pack(np.array([0 if gloss is None else 1 + gloss.shape[1]])),
@@ -95,13 +95,13 @@ def decode_born(body: bytes, count: int, bounds: Bounds) -> tuple[Columns, Clust
     labels, offset = unpack(body, count, offset)
     if labels.min(initial=0) < 0 or labels.max(initial=0) > MOST_CLUSTERS:
         raise PlaneError(f"clusters {labels.min(initial=0)} to {labels.max(initial=0)} cannot be")
-    told = {}
+    coded = {}
     for name, components in COMPONENTS.items():
-        told[name], offset = read_residuals(body, offset, components, count)
+        coded[name], offset = read_residuals(body, offset, components, count)
     rows, values, offset = read_exact(body, offset, count, 12)
     retired, offset = read_mask(body, offset, count)
     (with_gloss,), offset = unpack(body, 1, offset)
-    state = _columns(told, np.cumsum(steps.astype(np.int64)), bounds)
+    state = _columns(coded, np.cumsum(steps.astype(np.int64)), bounds)
     if with_gloss:
         if not 1 <= with_gloss <= count + 1:
             raise PlaneError(f"{with_gloss - 1} of {count} Gaussians cannot have gloss")
@@ -123,9 +123,9 @@ def _planes(state: Columns, bounds: Bounds) -> dict[str, Float]:
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         factors = state.factors.astype(np.float64).reshape(3, 3, -1)
         lengths = np.rint(OCTAVE * np.log2(np.maximum(np.sqrt(np.square(factors).sum(axis=0)), SHORTEST)))
-        told = np.exp2(lengths / OCTAVE)
-        axes = np.rint(factors / told / _axis_step(bounds))
-        sizes = sizes_of((axes * _axis_step(bounds) * told).reshape(9, -1)).astype(np.float64)
+        coded = np.exp2(lengths / OCTAVE)
+        axes = np.rint(factors / coded / _axis_step(bounds))
+        sizes = sizes_of((axes * _axis_step(bounds) * coded).reshape(9, -1)).astype(np.float64)
         usable = (sizes > TINIEST) & (sizes < LARGEST_SIZE)
         means = np.rint(state.means / (2 * bounds.position / FINER * MARGIN * np.where(usable, sizes, 0)))
         return {
@@ -139,16 +139,16 @@ def _planes(state: Columns, bounds: Bounds) -> dict[str, Float]:
         }
 
 
-def _columns(told: dict[str, Ints], ids: NDArray[np.int64], bounds: Bounds) -> Columns:
-    lengths = np.exp2(np.clip(told["lengths"], -1000, 1000) / OCTAVE)
+def _columns(coded: dict[str, Ints], ids: NDArray[np.int64], bounds: Bounds) -> Columns:
+    lengths = np.exp2(np.clip(coded["lengths"], -1000, 1000) / OCTAVE)
     with np.errstate(over="ignore", invalid="ignore"):
-        factors = (told["axes"].reshape(3, 3, -1) * _axis_step(bounds) * lengths).reshape(9, -1)
+        factors = (coded["axes"].reshape(3, 3, -1) * _axis_step(bounds) * lengths).reshape(9, -1)
         sizes = sizes_of(factors).astype(np.float64)
-        means = (told["means"] * (2 * bounds.position / FINER * MARGIN * sizes)).astype(np.float32)
-    colours = (of_green(told["colours"]) * (2 * bounds.colour / FINER)).astype(np.float32)
-    rotations = turns_of(told["rotations"] * bounds.rotation_step).astype(np.float32)
-    foreground = label_of(np.clip(told["labels"][0], 0, LABELS - 1))
-    opacities = np.clip(told["opacities"][0] * (2 * bounds.opacity), OPAQUE, 1 - OPAQUE).astype(np.float32)
+        means = (coded["means"] * (2 * bounds.position / FINER * MARGIN * sizes)).astype(np.float32)
+    colours = (of_green(coded["colours"]) * (2 * bounds.colour / FINER)).astype(np.float32)
+    rotations = turns_of(coded["rotations"] * bounds.rotation_step).astype(np.float32)
+    foreground = label_of(np.clip(coded["labels"][0], 0, LABELS - 1))
+    opacities = np.clip(coded["opacities"][0] * (2 * bounds.opacity), OPAQUE, 1 - OPAQUE).astype(np.float32)
     return Columns(
         means=means,
         factors=factors.astype(np.float32),

@@ -16,18 +16,18 @@ from scas4d_core.compact.bounds import Bounds
 from scas4d_core.compact.cluster_motion import ClusterMotion, Clusters
 from scas4d_core.compact.columns import Columns, turns_between, vectors_of
 from scas4d_core.compact.planes import Ints, PlaneError, pack, unpack
+from scas4d_core.compact.residuals import LARGEST, SHAPE, DecodedState, coded_shape, looks, whole_steps
 from scas4d_core.compact.sections import (
     read_array,
+    read_coded_rows,
     read_exact,
     read_mask,
-    read_told,
     scattered,
     write_array,
     write_exact,
     write_mask,
     write_residuals,
 )
-from scas4d_core.compact.told import LARGEST, SHAPE, Told, looks, told_shape, whole_steps
 
 Array = NDArray[np.float32]
 Float = NDArray[np.float64]
@@ -85,30 +85,30 @@ def encode(reference: Columns, state: Columns, clusters: Clusters, bounds: Bound
     steps = _steps(own, before, bounds)
     planes = np.rint(np.concatenate([motion.matrices.reshape(-1, 9) / steps[0], motion.shifts / steps[1]], axis=1).T)
     planes = np.clip(planes, -LARGEST, LARGEST).astype(np.int64)
-    told = Told.of(bounds, _moved(before, own, planes, steps))
+    partial = DecodedState.of(bounds, _moved(before, own, planes, steps))
     exact = np.zeros(len(true), np.bool_)
     sections = [_STEPS.pack(*steps), *(pack(plane) for plane in planes)]
     for name in SHAPE:
-        residual, beyond = whole_steps(told.residual(name, true))
+        residual, beyond = whole_steps(partial.residual(name, true))
         exact |= beyond
         sections.append(write_residuals(residual, rows, len(state)))
-        told = told.having(name, residual)
-    exact |= _beyond(told.state, true, bounds)
+        partial = partial.having(name, residual)
+    exact |= _beyond(partial.state, true, bounds)
     exactly, values = np.flatnonzero(exact), np.concatenate([true.means[:, exact], true.factors[:, exact]])
-    shaped = completed(told.state, exactly, values)
+    shaped = completed(partial.state, exactly, values)
     errors = {name: max(float(each.max(initial=0)), still.get(name, 0)) for name, each in _apart(shaped, true).items()}
-    told = replace(told, state=shaped if rows is None else reference.placed(rows, shaped))
+    partial = replace(partial, state=shaped if rows is None else reference.placed(rows, shaped))
     for name in looks(state):
-        residual, _ = whole_steps(told.residual(name, state))
+        residual, _ = whole_steps(partial.residual(name, state))
         sections.append(write_residuals(residual))
-        told = told.having(name, residual)
+        partial = partial.having(name, residual)
     sections.append(write_exact(exactly if rows is None else rows[exactly], values))
     retired, environment = state.retired, state.environment
     sections.append(write_mask(None if np.array_equal(reference.retired, retired) else retired))
     if environment is not None and reference.environment is not None:
         environment = None if np.array_equal(environment, reference.environment) else environment
     sections.append(write_array(environment))
-    decoded = completed(told.state, retired=retired, environment=environment)
+    decoded = completed(partial.state, retired=retired, environment=environment)
     return Coded(b"".join(sections), decoded, errors | _unlike(decoded, state))
 
 
@@ -150,7 +150,7 @@ class Change:
             plane[:], offset = unpack(body, clusters.count, offset)
         residuals = {}
         for name in (*SHAPE, *looks(reference)):
-            rows, planes, offset = read_told(body, offset, *told_shape(reference, name))
+            rows, planes, offset = read_coded_rows(body, offset, *coded_shape(reference, name))
             residuals[name] = rows, planes
         rows, values, offset = read_exact(body, offset, len(reference), 12)
         retired, offset = read_mask(body, offset, len(reference))
@@ -159,25 +159,27 @@ class Change:
             raise PlaneError(f"{len(body) - offset} bytes follow the state")
         return cls(steps, motion, residuals, rows, values, retired, environment)
 
-    def shaped(self, state: Columns, clusters: Clusters, bounds: Bounds, places: NDArray[np.intp] | None) -> Columns:
+    def apply_shape(
+        self, state: Columns, clusters: Clusters, bounds: Bounds, places: NDArray[np.intp] | None
+    ) -> Columns:
         """A state with the changes of centres, axes and rotations; what is glossy turns with its cluster.
 
         Args:
             places: column of ``state`` of each row; None: they are the same.
         """
-        told = Told.of(bounds, _moved(state, clusters, self.motion, self.steps))
+        partial = DecodedState.of(bounds, _moved(state, clusters, self.motion, self.steps))
         for name in SHAPE:
             rows, planes = self.residuals[name]
             own = rows if places is None else places[rows]
-            told = told.having(name, scattered(own, planes, told_shape(state, name)[1]))
-        return completed(told.state, self.rows if places is None else places[self.rows], self.values)
+            partial = partial.having(name, scattered(own, planes, coded_shape(state, name)[1]))
+        return completed(partial.state, self.rows if places is None else places[self.rows], self.values)
 
-    def lit(self, state: Columns, bounds: Bounds) -> Columns:
+    def apply_appearance(self, state: Columns, bounds: Bounds) -> Columns:
         """A state with all other changes."""
-        told = Told(bounds, state, np.zeros(0, np.float32))
+        partial = DecodedState(bounds, state, np.zeros(0, np.float32))
         for name in looks(state):
-            told = told.having(name, scattered(*self.residuals[name], told_shape(state, name)[1]))
-        return completed(told.state, retired=self.retired, environment=self.environment)
+            partial = partial.having(name, scattered(*self.residuals[name], coded_shape(state, name)[1]))
+        return completed(partial.state, retired=self.retired, environment=self.environment)
 
 
 def decode(reference: Columns, clusters: Clusters, bounds: Bounds, body: bytes) -> Columns:
@@ -196,7 +198,7 @@ def after(reference: Columns, clusters: Clusters, bounds: Bounds, changes: Seque
     """A state after several changes, one by one, of the same Gaussians; what stands all the while is not touched."""
     if _whole(reference, clusters):
         for change in changes:
-            reference = change.lit(change.shaped(reference, clusters, bounds, None), bounds)
+            reference = change.apply_appearance(change.apply_shape(reference, clusters, bounds, None), bounds)
         return reference
     chosen = clusters.labels > 0
     for change in changes:
@@ -205,10 +207,10 @@ def after(reference: Columns, clusters: Clusters, bounds: Bounds, changes: Seque
     rows, places = np.flatnonzero(chosen), np.cumsum(chosen) - 1
     state, own = reference.rows(rows), clusters.rows(rows)
     for change in changes:
-        state = change.shaped(state, own, bounds, places)
+        state = change.apply_shape(state, own, bounds, places)
     state = reference.placed(rows, state)
     for change in changes:
-        state = change.lit(state, bounds)
+        state = change.apply_appearance(state, bounds)
     return state
 
 
@@ -296,9 +298,9 @@ def _beyond(found: Columns, true: Columns, bounds: Bounds) -> NDArray[np.bool_]:
 def lost_volume(found: Columns, true: Columns) -> NDArray[np.bool_]:
     """[N] bool: the Gaussians whose decoded volume is another than the true one, where that has any."""
     with np.errstate(over="ignore", invalid="ignore"):
-        volumes, told = true.volumes(), found.volumes()
+        volumes, volumes_decoded = true.volumes(), found.volumes()
         low, high = np.minimum(FLAT * volumes, volumes / FLAT), np.maximum(FLAT * volumes, volumes / FLAT)
-        return np.asarray(~((told >= low) & (told <= high)) & (volumes != 0))
+        return np.asarray(~((volumes_decoded >= low) & (volumes_decoded <= high)) & (volumes != 0))
 
 
 def completed(

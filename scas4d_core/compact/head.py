@@ -18,7 +18,7 @@ VERSION = 1
 
 
 @dataclass(frozen=True)
-class Head:
+class FileHeader:
     """Facts that hold for a whole file.
 
     Attributes:
@@ -27,8 +27,8 @@ class Head:
         frames_per_second: nominal, None where it is not known: each frame has its own time.
         remark: about the file, JSON values.
 
-    >>> head = Head(WorldFrame(np.zeros(3)))
-    >>> Head.read(head.text(), "a file").bounds == head.bounds
+    >>> head = FileHeader(WorldFrame(np.zeros(3)))
+    >>> FileHeader.read(head.text(), "a file").bounds == head.bounds
     True
     """
 
@@ -57,7 +57,7 @@ class Head:
         return json.dumps(record, allow_nan=False).encode()
 
     @classmethod
-    def read(cls, text: bytes, name: str) -> Head:
+    def read(cls, text: bytes, name: str) -> FileHeader:
         """The head of a file of this name.
 
         Raises:

@@ -11,7 +11,7 @@ import numpy as np
 import zstandard
 
 from scas4d_core.compact.planes import deflated, inflated
-from scas4d_core.compact.records import HEAD_SIZE, Kind, Record, parse_head, read_body
+from scas4d_core.compact.records import HEAD_SIZE, Record, RecordKind, parse_head, read_body
 
 FOOTER_MAGIC = b"s4dINDEX"
 _FOOTER = struct.Struct("<Q8s")
@@ -47,7 +47,7 @@ def read_index(file: BinaryIO, name: str) -> tuple[list[Record], dict[str, Any]]
     try:
         file.seek(offset)
         record = parse_head(file.read(HEAD_SIZE), offset, name)
-        if record.kind is not Kind.INDEX or record.end + _FOOTER.size != size:
+        if record.kind is not RecordKind.INDEX or record.end + _FOOTER.size != size:
             return None
         body = read_body(file, record, name)
         return _parsed(body, offset)
@@ -65,7 +65,7 @@ def _parsed(body: bytes, end: int) -> tuple[list[Record], dict[str, Any]] | None
     if (rows["offset"] > end).any() or (rows["offset"] + rows["size"].astype(np.uint64) > end).any():
         return None
     records = [
-        Record(Kind(int(kind)), int(frame), float(time), int(offset), int(size), int(checksum))
+        Record(RecordKind(int(kind)), int(frame), float(time), int(offset), int(size), int(checksum))
         for kind, frame, time, offset, size, checksum in rows.tolist()
     ]
     about = json.loads(data[count * _ROW.itemsize :] or b"{}")

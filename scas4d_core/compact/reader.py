@@ -14,18 +14,18 @@ from numpy.typing import NDArray
 from scas4d_core.compact.birth_code import decode_born
 from scas4d_core.compact.cluster_motion import Clusters
 from scas4d_core.compact.columns import Columns
+from scas4d_core.compact.encoder_state import EncoderState
 from scas4d_core.compact.frame_code import Change, after
-from scas4d_core.compact.head import Head
+from scas4d_core.compact.head import FileHeader
 from scas4d_core.compact.index import read_index
-from scas4d_core.compact.last_told import LastTold
 from scas4d_core.compact.planes import PlaneError, unpack
 from scas4d_core.compact.records import (
     HEAD_SIZE,
     MAGIC,
     DamagedFileError,
     FileError,
-    Kind,
     Record,
+    RecordKind,
     checksum_bytes,
     read_body,
     read_note,
@@ -36,7 +36,7 @@ from scas4d_core.gaussians import Gaussians
 
 __all__ = ["CompactReader", "DamagedFileError", "FileError"]
 
-STATES = (Kind.KEY, Kind.DELTA)
+STATES = (RecordKind.KEY, RecordKind.DELTA)
 AT_ONCE = 8
 """States whose changes are held at a time."""
 MOST_PER_BYTE = 4
@@ -92,11 +92,11 @@ class CompactReader:
                     self.damage = str(error)
             else:
                 self.refresh()
-            if not self._records or self._records[0].kind is not Kind.HEAD:
+            if not self._records or self._records[0].kind is not RecordKind.HEAD:
                 raise FileError(
                     f"{self.path.name}: its head is not there{self._why()}; it was cut, or is not written yet"
                 )
-            self.head = Head.read(read_body(self._file, self._records[0], self.path.name), self.path.name)
+            self.head = FileHeader.read(read_body(self._file, self._records[0], self.path.name), self.path.name)
         except BaseException:
             self._file.close()
             raise
@@ -122,7 +122,7 @@ class CompactReader:
             for record in scan(self._file, self._end, self.path.name):
                 self._note(record)
                 self._end = record.end
-                if record.kind is Kind.INDEX:
+                if record.kind is RecordKind.INDEX:
                     self._whole = True
                     if (whole := read_index(self._file, self.path.name)) is not None:
                         self.about = whole[1]
@@ -157,7 +157,9 @@ class CompactReader:
             held = f"{self._frames[0]} to {self._frames[-1]}" if self._frames else "none"
             raise FileError(f"{self.path.name}: frame {index} is not in the file{self._why()}; it has frames: {held}")
         begin = place
-        while self._states[begin].kind is Kind.DELTA and begin > 0 and not (self._last and self._last[0] == begin):
+        while (
+            self._states[begin].kind is RecordKind.DELTA and begin > 0 and not (self._last and self._last[0] == begin)
+        ):
             begin -= 1
         state = self._last[1] if self._last is not None and self._last[0] == begin else None
         wanted = range(begin if state is None else begin + 1, place + 1)
@@ -183,11 +185,15 @@ class CompactReader:
         wanted = [place for place, index in enumerate(self._frames) if first <= index <= last]
         if not wanted:
             raise FileError(f"{self.path.name}: no frame from {first} to {last} is in the file{self._why()}")
-        begin = next(place for place in range(wanted[0], -1, -1) if self._states[place].kind is not Kind.DELTA)
+        begin = next(place for place in range(wanted[0], -1, -1) if self._states[place].kind is not RecordKind.DELTA)
         states = {self._states[place] for place in (0, *range(begin, wanted[-1] + 1))}
         end, copied = self._frames[wanted[-1]], list[int]()
         for record in self._records:
-            if record in states or record.kind is Kind.HEAD or (record.kind is Kind.BORN and record.frame <= end):
+            if (
+                record in states
+                or record.kind is RecordKind.HEAD
+                or (record.kind is RecordKind.BORN and record.frame <= end)
+            ):
                 try:
                     body = read_body(self._file, record, self.path.name)
                 except DamagedFileError:
@@ -217,17 +223,17 @@ class CompactReader:
         """True for a file that was closed: it ends with its index."""
         return self._whole
 
-    def last_told(self) -> LastTold:
+    def encoder_state(self) -> EncoderState:
         """All that a writer needs to go on after the last state; there has to be one."""
         place = len(self._states) - 1
         self.state(self._frames[place])
         told, columns = self._states[place], self._last
         assert columns is not None
         born, clusters = self._born_by(told.frame)
-        key = next(i for i in range(place, -1, -1) if i == 0 or self._states[i].kind is Kind.KEY)
+        key = next(i for i in range(place, -1, -1) if i == 0 or self._states[i].kind is RecordKind.KEY)
         behind = (told.end, *(one.end for one in self._parts if one.frame == told.frame))
         records = tuple(one for one in self._records if one.end <= max(behind))
-        return LastTold(self.head, records, told, columns[1], born, clusters, place - key)
+        return EncoderState(self.head, records, told, columns[1], born, clusters, place - key)
 
     def sizes(self) -> list[tuple[int, int, int]]:
         """Index, bytes of the file since the state before, and checksum of the state, of each frame."""
@@ -254,7 +260,7 @@ class CompactReader:
 
     def _note(self, record: Record) -> None:
         self._records.append(record)
-        if record.kind is Kind.BORN:
+        if record.kind is RecordKind.BORN:
             self._births.append(record)
             if not self._states:  # the first frame is the first born
                 self._states.append(record)
@@ -266,23 +272,23 @@ class CompactReader:
                 raise DamagedFileError(f"{self.path.name}: frame {record.frame} follows {before} at byte {place}")
             self._states.append(record)
             self._frames.append(record.frame)
-        elif record.kind is Kind.PARTS:
+        elif record.kind is RecordKind.PARTS:
             self._parts.append(record)
-        elif record.kind is Kind.NOTE:
+        elif record.kind is RecordKind.NOTE:
             self._notes[record.frame] = record
 
     def _births_by(self, place: int) -> int:
         """Times that Gaussians were born by a state; −1 for that which they are themselves."""
         state = self._states[place]
-        return -1 if state.kind is Kind.BORN else sum(birth.frame <= state.frame for birth in self._births)
+        return -1 if state.kind is RecordKind.BORN else sum(birth.frame <= state.frame for birth in self._births)
 
     def _decoded(self, places: list[int], before: Columns | None) -> Columns:
         """The last of some states of the same Gaussians, of which only the first may be a key; ``before`` them."""
         first = self._states[places[0]]
         born, clusters = self._born_by(first.frame)
-        if first.kind is Kind.BORN:
+        if first.kind is RecordKind.BORN:
             return born
-        if first.kind is Kind.KEY or before is None:
+        if first.kind is RecordKind.KEY or before is None:
             before = born
         elif len(before) < len(born):
             before = before.joined(born.after(len(before)))
@@ -296,7 +302,7 @@ class CompactReader:
         """Changes that the record of a state tells."""
         record = self._states[place]
         body = read_body(self._file, record, self.path.name)
-        if record.kind is Kind.DELTA:
+        if record.kind is RecordKind.DELTA:
             told = checksum_bytes(self._states[place - 1])
             if body[: len(told)] != told:
                 raise self._damaged(record, PlaneError("the state before it is another one"))

@@ -28,7 +28,7 @@ LONGEST = 1 << 24
 """Bytes of a note's text at most: what a damaged file asks for must not fill the memory."""
 
 
-class Kind(IntEnum):
+class RecordKind(IntEnum):
     """Kinds of records, by what their body holds."""
 
     HEAD = 1
@@ -68,7 +68,7 @@ class Record:
             bytes. checksum: CRC-32 of the body.
     """
 
-    kind: Kind
+    kind: RecordKind
     frame: int
     time: float
     offset: int
@@ -85,11 +85,11 @@ class Record:
         return replace(self, offset=offset + HEAD_SIZE)
 
 
-def record_bytes(kind: Kind, body: bytes, frame: int = -1, time: float = 0.0) -> bytes:
+def record_bytes(kind: RecordKind, body: bytes, frame: int = -1, time: float = 0.0) -> bytes:
     """A record.
 
     >>> import io
-    >>> file = io.BytesIO(record_bytes(Kind.KEY, b"abc", 7, 0.5))
+    >>> file = io.BytesIO(record_bytes(RecordKind.KEY, b"abc", 7, 0.5))
     >>> (found,) = scan(file, 0, "a file")
     >>> found.kind.name, found.frame, read_body(file, found, "a file")
     ('KEY', 7, b'abc')
@@ -156,9 +156,9 @@ def parse_head(data: bytes, offset: int, name: str) -> Record:
     if len(data) < HEAD_SIZE or head[:4] != MAGIC or _CHECKSUM.unpack_from(data, _HEAD.size)[0] != zlib.crc32(head):
         raise DamagedFileError(f"{name}: no record begins at byte {offset}; the file is damaged there")
     _, kind, frame, time, size, checksum = _HEAD.unpack(head)
-    if kind not in Kind.__members__.values():
+    if kind not in RecordKind.__members__.values():
         raise FileError(f"{name}: a record of kind {kind} is at byte {offset}; a later version of scas4d wrote it")
-    return Record(Kind(kind), frame, time, offset + HEAD_SIZE, size, checksum)
+    return Record(RecordKind(kind), frame, time, offset + HEAD_SIZE, size, checksum)
 
 
 def read_body(file: BinaryIO, record: Record, name: str) -> bytes:

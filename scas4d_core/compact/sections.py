@@ -47,7 +47,7 @@ def write_residuals(planes: Ints, rows: NDArray[np.intp] | None = None, total: i
 
 def read_residuals(body: bytes, offset: int, components: int, rows: int) -> tuple[Ints, int]:
     """[components, rows] residuals of a section, and where it ends; raises PlaneError."""
-    chosen, told, offset = read_told(body, offset, components, rows)
+    chosen, told, offset = read_coded_rows(body, offset, components, rows)
     return scattered(chosen, told, rows), offset
 
 
@@ -64,7 +64,7 @@ def scattered(rows: NDArray[np.intp], planes: Ints, total: int) -> Ints:
     return dense
 
 
-def read_told(body: bytes, offset: int, components: int, rows: int) -> tuple[NDArray[np.intp], Ints, int]:
+def read_coded_rows(body: bytes, offset: int, components: int, rows: int) -> tuple[NDArray[np.intp], Ints, int]:
     """[R] the rows that a section has residuals of, [components, R] these, and where it ends; raises PlaneError."""
     kind, offset = _read_kind(body, offset)
     if kind == NONE:

@@ -17,11 +17,19 @@ from scas4d_core.compact.birth_code import encode_born
 from scas4d_core.compact.cluster_motion import Clusters
 from scas4d_core.compact.columns import Columns
 from scas4d_core.compact.frame_code import encode, errors_of
-from scas4d_core.compact.head import Head
+from scas4d_core.compact.head import FileHeader
 from scas4d_core.compact.index import footer, index_body
 from scas4d_core.compact.planes import pack
 from scas4d_core.compact.reader import STATES, CompactReader
-from scas4d_core.compact.records import FileError, Kind, Record, checksum_bytes, note_bytes, parse_head, record_bytes
+from scas4d_core.compact.records import (
+    FileError,
+    Record,
+    RecordKind,
+    checksum_bytes,
+    note_bytes,
+    parse_head,
+    record_bytes,
+)
 from scas4d_core.gaussians import Gaussians
 
 ERRORS = "errors"
@@ -50,7 +58,7 @@ class CompactWriter:
     >>> state = Gaussians.of_points(np.random.default_rng(0).normal(size=(300, 3)), radius=0.1)
     >>> moved = state.replace(means=state.means + np.float32([0, 0, 1]))
     >>> with TemporaryDirectory() as folder:
-    ...     with CompactWriter(f"{folder}/a.s4d", Head(WorldFrame(np.zeros(3)))) as writer:
+    ...     with CompactWriter(f"{folder}/a.s4d", FileHeader(WorldFrame(np.zeros(3)))) as writer:
     ...         errors = [writer.add(index, 0.1 * index, each) for index, each in enumerate((state, moved))]
     ...     with CompactReader(f"{folder}/a.s4d") as reader:
     ...         found = reader.state(1).means - reader.state(0).means
@@ -58,7 +66,9 @@ class CompactWriter:
     np.float32(1.0)
     """
 
-    def __init__(self, path: Path | str, head: Head, key_every: int = KEY_EVERY, *, clustered: bool = True) -> None:
+    def __init__(
+        self, path: Path | str, head: FileHeader, key_every: int = KEY_EVERY, *, clustered: bool = True
+    ) -> None:
         if key_every < 1:
             raise FileError(f"key_every is {key_every}; give 1 or more")
         text = head.text()  # a head that is no JSON leaves no file
@@ -75,9 +85,9 @@ class CompactWriter:
         self._since_key = 0
         self._opacities: NDArray[np.float32] | None = None
         """Exact ones of all that are born; None where they are not known yet."""
-        self._told = Record(Kind.HEAD, -1, 0.0, 0, 0, 0)
+        self._record = Record(RecordKind.HEAD, -1, 0.0, 0, 0, 0)
         """The record of the last state."""
-        self._append(record_bytes(Kind.HEAD, text))
+        self._append(record_bytes(RecordKind.HEAD, text))
 
     @classmethod
     def resume(cls, path: Path | str, key_every: int = KEY_EVERY) -> CompactWriter:
@@ -93,11 +103,11 @@ class CompactWriter:
                 raise FileError(f"{reader.path.name}: it is whole, with its index; begin another file")
             if reader.damage is not None or not reader.frames:
                 raise FileError(f"{reader.path.name}: it cannot be gone on with ({reader.damage or 'it has no state'})")
-            last = reader.last_told()
+            last = reader.encoder_state()
             known = [reader.note(index).get(ERRORS, {}) for index in reader.frames]
         writer = cls.__new__(cls)
         writer.path, writer.head, writer.errors, writer._key_every = Path(path), last.head, {}, key_every
-        writer._records, writer._told, writer._since_key = list(last.records), last.told, last.since_key
+        writer._records, writer._record, writer._since_key = list(last.records), last.record, last.since_key
         writer._born, writer._clusters, writer._last = last.born, last.clusters, last.state
         writer._opacities = None
         for errors in known:
@@ -135,7 +145,7 @@ class CompactWriter:
         note_bytes(note or {})
         columns, before = Columns.of(state), self._last
         self._opacities = columns.opacities.copy() if self._opacities is None else self._opacities
-        records = [] if before is not None and len(state) == len(before) else [(Kind.BORN, self._bear(columns))]
+        records = [] if before is not None and len(state) == len(before) else [(RecordKind.BORN, self._bear(columns))]
         born = self._born
         assert born is not None
         if before is None:
@@ -147,14 +157,14 @@ class CompactWriter:
             key = self._since_key + 1 >= self._key_every
             self._since_key = 0 if key else self._since_key + 1
             coded = encode(born if key else before, columns, self._clusters, self.head.bounds)
-            told = b"" if key else checksum_bytes(self._told)  # a reader must not tell it by another state
-            records.append((Kind.KEY if key else Kind.DELTA, told + coded.body))
+            told = b"" if key else checksum_bytes(self._record)  # a reader must not tell it by another state
+            records.append((RecordKind.KEY if key else RecordKind.DELTA, told + coded.body))
             decoded, errors = coded.decoded, coded.errors
         if note is not None:
-            records.insert(0, (Kind.NOTE, note_bytes({**note, ERRORS: dict(errors)})))
+            records.insert(0, (RecordKind.NOTE, note_bytes({**note, ERRORS: dict(errors)})))
         for kind, body in records:
             self._append(record_bytes(kind, body, index, time))
-        self._told, self._last = self._records[-1], decoded
+        self._record, self._last = self._records[-1], decoded
         self._note_errors(errors)
         return errors
 
@@ -169,16 +179,16 @@ class CompactWriter:
         """
         values = np.asarray(labels, np.int64)
         known = 0 if self._born is None else len(self._born)
-        if index != self._told.frame or values.shape != (known,):
+        if index != self._record.frame or values.shape != (known,):
             raise FileError(
-                f"{self.path.name}: parts {values.shape} of frame {index} cannot follow frame {self._told.frame} of "
+                f"{self.path.name}: parts {values.shape} of frame {index} cannot follow frame {self._record.frame} of "
                 f"{known} Gaussians"
             )
-        self._append(record_bytes(Kind.PARTS, len(values).to_bytes(4, "little") + pack(values + 1), index))
+        self._append(record_bytes(RecordKind.PARTS, len(values).to_bytes(4, "little") + pack(values + 1), index))
 
     def _check(self, index: int, state: Gaussians) -> None:
         """Refuses a state that cannot follow those before; nothing is written then."""
-        last, name = self._told.frame, self.path.name
+        last, name = self._record.frame, self.path.name
         if index <= last:
             raise FileError(f"{name}: frame {index} cannot follow frame {last}; add frames in rising order")
         if not len(state):
@@ -207,7 +217,7 @@ class CompactWriter:
         body = index_body(self._records, json.dumps({"errors": self.errors}).encode())
         try:
             offset = self._file.tell()
-            self._file.write(record_bytes(Kind.INDEX, body) + footer(offset))
+            self._file.write(record_bytes(RecordKind.INDEX, body) + footer(offset))
         finally:
             self._file.close()
 
@@ -219,7 +229,7 @@ class CompactWriter:
     @property
     def last_frame(self) -> int:
         """Index of the last frame; −1 without one."""
-        return self._told.frame
+        return self._record.frame
 
     def sync(self) -> None:
         """Has the disk confirm all that was written."""

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 
-class Group(StrEnum):
+class KernelGroup(StrEnum):
     """Groups of kernels, by what needs them."""
 
     FIRST_FRAME = "first frame"
@@ -38,7 +38,7 @@ class Kernel:
             of two.
     """
 
-    group: Group
+    group: KernelGroup
     module: str
     name: str
     arguments: str
@@ -49,7 +49,7 @@ class Kernel:
         return f"{self.module}.{self.name}-{hashlib.sha256(self.arguments.encode()).hexdigest()[:8]}"
 
 
-def _of(group: Group, *rows: str) -> tuple[Kernel, ...]:
+def _of(group: KernelGroup, *rows: str) -> tuple[Kernel, ...]:
     split = ((*function.rsplit(".", 1), arguments) for function, arguments in (row.split(" ", 1) for row in rows))
     return tuple(Kernel(group, module, name, arguments) for module, name, arguments in split)
 
@@ -57,7 +57,7 @@ def _of(group: Group, *rows: str) -> tuple[Kernel, ...]:
 # In each group those that take longest to compile come first: the work is then shared best.
 KERNELS = (
     *_of(
-        Group.FIRST_FRAME,
+        KernelGroup.FIRST_FRAME,
         "kernels.projection.project_backward f2 f3 f2 f1 f1 f2 s1 i1 f2 i f2 f3 f1 f2 f2 i2",
         "kernels.image_loss.image_loss f3 f2 f3 f3 f3 f1 i f4 y2 f3 f3 f3",
         "kernels.projection.project f2 f3 f1 f2 f2 f1 f1 f2 s2 s1 i2",
@@ -78,13 +78,13 @@ KERNELS = (
         "kernels.tiles.share_pairs s1 i s1 i1",
     ),
     *_of(
-        Group.ENTANGLED,
+        KernelGroup.ENTANGLED,
         "kernels.deform.deform_backward i i1 i2 i2 i2 i2 f2 f2 f2 f none f4 f2 f f2 f2 f3 f2 f3 f2 f2 f1",
         "kernels.deform.deform i f2 i1 i2 i2 i2 i2 f2 f2 f2 f none f4 f3 f2 f2 f3 f2 i2",
         "kernels.deform.settle i f2 i1 i2 i2 f2 f2 f none f4 f3 f2",
     ),
     *_of(
-        Group.UPDATE,
+        KernelGroup.UPDATE,
         "kernels.neighbour_terms.neighbour_terms f2 i1 s2 f2 f2 f1 f3 f2",
         "kernels.deform.block_sums f4 f2 f3",
         "kernels.tiles.mark_blocks f2 s2 y1 i w1",
@@ -94,23 +94,23 @@ KERNELS = (
         "kernels.tiles.put_blocks f3 w1 i i*4 f3",
     ),
     *_of(
-        Group.SEPARATE,
+        KernelGroup.SEPARATE,
         "kernels.deform.deform_backward i i1 i2 i2 i2 i2 f2 f2 f2 f b f4 f2 f f2 f2 f3 f2 f3 f2 f2 f1",
         "kernels.deform.deform i f2 i1 i2 i2 i2 i2 f2 f2 f2 f b f4 f3 f2 f2 f3 f2 i2",
         "kernels.deform.settle i f2 i1 i2 i2 f2 f2 f b f4 f3 f2",
     ),
     *_of(
-        Group.STEREO,
+        KernelGroup.STEREO,
         "first_frame.points.patch_match._sweep f2 b2 d2 d2 d3 d2 d1 f3 i2 d3 d2 d d i i i i",
     ),
 )
 
 
-def kernels_of(groups: Iterable[Group]) -> list[Kernel]:
+def kernels_of(groups: Iterable[KernelGroup]) -> list[Kernel]:
     """Returns the kernels of some groups, group after group as they are asked for."""
     return [kernel for group in groups for kernel in KERNELS if kernel.group == group]
 
 
-def groups_of_update(covariance: str) -> tuple[Group, ...]:
+def groups_of_update(covariance: str) -> tuple[KernelGroup, ...]:
     """Returns the groups that updates need; ``covariance`` as in the settings of updates."""
-    return (Group.SEPARATE if covariance == "separate" else Group.ENTANGLED), Group.UPDATE
+    return (KernelGroup.SEPARATE if covariance == "separate" else KernelGroup.ENTANGLED), KernelGroup.UPDATE

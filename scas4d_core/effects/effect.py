@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 from scas4d_core.effect_names import EFFECTS
 
 if TYPE_CHECKING:
-    from scas4d_core.effects.evidence import Evidence, Seen
+    from scas4d_core.effects.evidence import Evidence, FrameObservation
     from scas4d_core.settings import Settings
     from scas4d_core.update.parts import Arrays, PlanBuilder
     from scas4d_core.update.result import UpdateResult
 
 
-class Group(StrEnum):
+class EffectGroup(StrEnum):
     """The kinds of effects."""
 
     MOTION = "motion"
@@ -47,7 +47,7 @@ class Effect:
     """
 
     name: str
-    group: Group
+    group: EffectGroup
     says: str
     gauge: str
     cost: str
@@ -57,27 +57,27 @@ class Effect:
     without_masks: bool = True
     kept: tuple[str, ...] = ()
 
-    def refused(self, settings: Settings) -> tuple[str, str] | None:
+    def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Fault and remedy where it cannot be on under these settings; None: it can."""
         return None
 
-    def began(self, seen: Seen) -> Arrays | None:
+    def began(self, seen: FrameObservation) -> Arrays | None:
         """Arrays of frame 0 that evidence or part look back to; None: none. Not asked where it is pinned off."""
         return None
 
-    def needed(self, settings: Settings) -> tuple[str, str] | None:
+    def requirement(self, settings: Settings) -> tuple[str, str] | None:
         """Fault and remedy where these settings pin it off and nothing else does its work; None: it can be off."""
         return None
 
-    def on_at_first(self, seen: Seen) -> bool:
+    def on_at_first(self, seen: FrameObservation) -> bool:
         """True where it is on after the first frame until it is idle; it keeps arrays of that frame."""
         return False
 
-    def evidence(self, seen: Seen) -> Evidence | None:
+    def evidence(self, seen: FrameObservation) -> Evidence | None:
         """The evidence of a frame that calls for it; None: the frame says nothing, and the switch stays."""
         return None
 
-    def noted(self, seen: Seen, on: bool) -> Arrays | None:
+    def record(self, seen: FrameObservation, on: bool) -> Arrays | None:
         """Its arrays for the frames after, beside what its part leaves; None: those that it has stay.
 
         Called after each frame that was learnt, before evidence is taken, and also where it is off and not pinned so.
@@ -87,13 +87,13 @@ class Effect:
         """
         return None
 
-    def populated(self, seen: Seen) -> UpdateResult:
+    def add_and_retire_gaussians(self, seen: FrameObservation) -> UpdateResult:
         """The result of a frame with the Gaussians that are born, retired or revived in it.
 
         Called where it is on, after each frame that was learnt and before its commit; nowhere else may rows change.
-        Rows stay where they are: ``replace(seen.result, gaussians=..., joins=..., carried=...)``, the Gaussians made
-        by ``Gaussians.joined``, ``retire`` and ``revive``. ``joins`` has those of effects before, too. Arrays in
-        ``carried`` with a row for each Gaussian are lengthened afterwards: the born have the rows of their founders,
+        Rows stay where they are: ``replace(seen.result, gaussians=..., parents=..., carried=...)``, the Gaussians made
+        by ``Gaussians.joined``, ``retire`` and ``revive``. ``parents`` has those of effects before, too. Arrays in
+        ``carried`` with a row for each Gaussian are lengthened afterwards: the born have the rows of their parents,
         or zeros.
         """
         return seen.result
@@ -107,7 +107,7 @@ Refusal = tuple[str, str]
 """Fault and remedy."""
 
 
-def refused_at_zero(settings: Settings, key: str) -> Refusal | None:
+def refusal_at_zero(settings: Settings, key: str) -> Refusal | None:
     """Fault and remedy where a rate or weight of the update is 0.
 
     Args:
@@ -126,7 +126,7 @@ def effect(name: str) -> Effect:
         KeyError: there is none.
 
     >>> effect("floor").group
-    <Group.COHERENCE: 'coherence'>
+    <EffectGroup.COHERENCE: 'coherence'>
     """
     instance: Effect = import_module(EFFECTS[name]).EFFECT
     return instance

@@ -43,7 +43,7 @@ class FitTime:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class FrameObservation:
     """A frame as the evidence for effects is taken from it, once its state is committed.
 
     Attributes:

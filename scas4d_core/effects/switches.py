@@ -17,7 +17,7 @@ from scas4d_core.errors import InputError
 from scas4d_core.settings import Settings
 
 if TYPE_CHECKING:
-    from scas4d_core.effects.evidence import Evidence, Seen
+    from scas4d_core.effects.evidence import Evidence, FrameObservation
     from scas4d_core.update.parts import Arrays, PlanBuilder
 
 IDLE = 8
@@ -50,9 +50,9 @@ NONE_FOUND: Mapping[str, Evidence] = MappingProxyType({})
 def contradictions(settings: Settings) -> Iterator[tuple[str, Mode, str, str]]:
     """Name, mode, fault and remedy of each effect whose pin the settings contradict."""
     for name, mode in settings.effects.items():
-        if mode == "on" and (refusal := effect(name).refused(settings)) is not None:
+        if mode == "on" and (refusal := effect(name).refusal(settings)) is not None:
             yield name, mode, f"effects.{name} cannot be 'on': {refusal[0]}", f"{refusal[1]}, or leave it 'auto'"
-        if mode == "off" and (refusal := effect(name).needed(settings)) is not None:
+        if mode == "off" and (refusal := effect(name).requirement(settings)) is not None:
             yield name, mode, f"effects.{name} cannot be 'off': {refusal[0]}", refusal[1]
 
 
@@ -77,7 +77,7 @@ def first_switches(
     switches = {}
     for name in EFFECTS:
         mode, one = settings.effects.get(name, "auto"), effect(name)
-        refused = one.refused(settings)
+        refused = one.refusal(settings)
         allowed = mode == "auto" and refused is None
         on = mode == "on" or (allowed and not one.auto)
         evidence = found.get(name)
@@ -104,7 +104,7 @@ def switches_of(record: Mapping[str, Mapping[str, Any]]) -> dict[str, Switch]:
     return {name: Switch(**values) for name, values in record.items()}
 
 
-def decided(switches: Switches, settings: Settings, seen: Seen) -> dict[str, Switch]:
+def decided(switches: Switches, settings: Settings, seen: FrameObservation) -> dict[str, Switch]:
     """The switches for the frame after one that was committed.
 
     Args:
@@ -113,9 +113,9 @@ def decided(switches: Switches, settings: Settings, seen: Seen) -> dict[str, Swi
     return {name: _decided(name, switch, settings, seen) for name, switch in switches.items()}
 
 
-def _decided(name: str, switch: Switch, settings: Settings, seen: Seen) -> Switch:
+def _decided(name: str, switch: Switch, settings: Settings, seen: FrameObservation) -> Switch:
     one = effect(name)
-    if switch.pinned or not one.auto or one.refused(settings) is not None:
+    if switch.pinned or not one.auto or one.refusal(settings) is not None:
         return switch
     evidence = one.evidence(seen)
     if evidence is None:
@@ -127,19 +127,19 @@ def _decided(name: str, switch: Switch, settings: Settings, seen: Seen) -> Switc
     return replace(switch, on=False, since=seen.index, idle=0) if idle >= IDLE else replace(switch, idle=idle)
 
 
-def began(switches: Switches, settings: Settings, seen: Seen) -> dict[str, Arrays]:
+def began(switches: Switches, settings: Settings, seen: FrameObservation) -> dict[str, Arrays]:
     """Arrays that the effects keep of the first frame, by effect."""
     by_effect = {}
     for name, switch in switches.items():
         one = effect(name)
-        if (switch.on or not switch.pinned) and effect(name).refused(settings) is None:
+        if (switch.on or not switch.pinned) and effect(name).refusal(settings) is None:
             arrays = one.began(seen)
             if arrays is not None:
                 by_effect[name] = arrays
     return by_effect
 
 
-def noted(switches: Switches, settings: Settings, seen: Seen) -> Seen:
+def record_arrays(switches: Switches, settings: Settings, seen: FrameObservation) -> FrameObservation:
     """A frame that was learnt, with the arrays that effects note of it.
 
     Args:
@@ -148,9 +148,9 @@ def noted(switches: Switches, settings: Settings, seen: Seen) -> Seen:
     by_effect = {}
     for name, switch in switches.items():
         one = effect(name)
-        asked = type(one).noted is not Effect.noted and (switch.on or not switch.pinned)
-        if asked and effect(name).refused(settings) is None:
-            arrays = one.noted(seen, switch.on)
+        asked = type(one).record is not Effect.record and (switch.on or not switch.pinned)
+        if asked and effect(name).refusal(settings) is None:
+            arrays = one.record(seen, switch.on)
             if arrays is not None:
                 by_effect[name] = arrays
     if not by_effect:
@@ -164,7 +164,7 @@ def kept_of(carried: Mapping[str, Arrays]) -> dict[str, Arrays]:
     return {name: own for name, own in kept.items() if own}
 
 
-def switched_by(found: Mapping[str, Arrays], switches: Switches, seen: Seen) -> dict[str, Switch]:
+def switched_by(found: Mapping[str, Arrays], switches: Switches, seen: FrameObservation) -> dict[str, Switch]:
     """The switches after the first frame.
 
     Args:
@@ -181,7 +181,7 @@ def names_on(switches: Switches) -> tuple[str, ...]:
     return tuple(name for name in EFFECTS if name in switches and switches[name].on)
 
 
-def joined(builder: PlanBuilder, effects: Sequence[str] | None = None) -> PlanBuilder:
+def register_effects(builder: PlanBuilder, effects: Sequence[str] | None = None) -> PlanBuilder:
     """The builder once the effects have joined it.
 
     Args:

@@ -93,7 +93,7 @@ class AttemptStart:
     Attributes:
         layers: Adam's rates (r, t in metres, c and s) of each layer, coarse to fine.
         position, rotation, scale: rates of Δp (metres), ΔR, Δs.
-        colour, colour_standing: rates of RGB of moving and of static Gaussians.
+        colour, static_colour: rates of RGB of moving and of static Gaussians.
         beta1, beta2: Adam's decays.
         samples: of entries of the hierarchy's order, [S] int64 each; ``StepScalars.sample`` picks one.
         gains: [cameras, 3] the gains that the cameras start with, in the plan's order; None: not followed.
@@ -106,7 +106,7 @@ class AttemptStart:
     rotation: float
     scale: float
     colour: float
-    colour_standing: float
+    static_colour: float
     beta1: float
     beta2: float
     samples: Sequence[NDArray[np.int64]]
@@ -157,7 +157,7 @@ class Thinned(NamedTuple):
         return cls(every, np.concatenate([features[:, ::every, ::every], rest[None, ::every, ::every]]))
 
 
-class Rendered(NamedTuple):
+class ViewRecord(NamedTuple):
     """One rendering of a training view, as the log has it.
 
     Attributes:
@@ -181,7 +181,7 @@ class IterationLog:
     """
 
     losses: list[float] = field(default_factory=list)
-    rendered: list[Rendered] = field(default_factory=list)
+    rendered: list[ViewRecord] = field(default_factory=list)
     pictures: dict[int, Thinned] = field(default_factory=dict)
     guards: dict[str, int] = field(default_factory=dict)
 

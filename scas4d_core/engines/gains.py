@@ -13,7 +13,7 @@ from scas4d_core.engines.views import TrainingView
 Array = NDArray[np.float32]
 
 
-class CameraGains:
+class GainEstimator:
     """The gains of an attempt; the views have them as their exposure.
 
     Args:

@@ -9,7 +9,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from scas4d_core.cameras import Rig, WorldFrame
-from scas4d_core.compact import CompactWriter, FileError, Head
+from scas4d_core.compact import CompactWriter, FileError, FileHeader
 from scas4d_core.errors import InputError
 from scas4d_core.exports.part_motion import part_labels
 from scas4d_core.exports.whole_files import whole_file, writing
@@ -56,7 +56,7 @@ class CompactSequence:
         self._latest = -1
         self._count = 0
         self._stack = ExitStack()
-        head = Head(world, background=background, rig=rig, frames_per_second=frames_per_second)
+        head = FileHeader(world, background=background, rig=rig, frames_per_second=frames_per_second)
         try:
             beside = self._stack.enter_context(whole_file(self.path))
             self._writer = self._stack.enter_context(CompactWriter(beside, head))

@@ -29,7 +29,7 @@ from scas4d_core.errors import InputError
 from scas4d_core.exports.cloud import Cloud, cloud_of, linear_light
 from scas4d_core.exports.part_motion import PartMotion, part_labels, quaternion_of
 from scas4d_core.exports.usd_values import (
-    Channel,
+    AnimatedValues,
     floats_of,
     points_of,
     quaternions_of,
@@ -102,7 +102,7 @@ class UsdSequence:
                 self._layer = self._sdf.Layer.CreateNew(str(self._folder / f"{self.path.stem}.usdc"))
                 self._stage = self._usd.Stage.Open(self._layer)
             self._motion: PartMotion | None = None
-            self._channels: dict[str, Channel] = {}
+            self._channels: dict[str, AnimatedValues] = {}
             self._poses: dict[int, tuple[Any, Any, Any]] = {}
             self._tracked, self._width = np.zeros(0, np.intp), 0.0
             self._begin = self._latest = 0.0
@@ -213,12 +213,12 @@ class UsdSequence:
         primvar.SetElementSize(cloud.harmonics.shape[1])
         primvar.SetInterpolation(self._geometry.Tokens.vertex)
         self._channels = {
-            "positions": Channel(gaussians.CreatePositionsAttr(), points_of),
-            "orientations": Channel(gaussians.CreateOrientationsAttr(), quaternions_of),
-            "scales": Channel(gaussians.CreateScalesAttr(), points_of),
-            "opacities": Channel(gaussians.CreateOpacitiesAttr(), floats_of, unborn=0),
-            "harmonics": Channel(harmonics, points_of),
-            "extent": Channel(gaussians.CreateExtentAttr(), points_of),
+            "positions": AnimatedValues(gaussians.CreatePositionsAttr(), points_of),
+            "orientations": AnimatedValues(gaussians.CreateOrientationsAttr(), quaternions_of),
+            "scales": AnimatedValues(gaussians.CreateScalesAttr(), points_of),
+            "opacities": AnimatedValues(gaussians.CreateOpacitiesAttr(), floats_of, unborn=0),
+            "harmonics": AnimatedValues(harmonics, points_of),
+            "extent": AnimatedValues(gaussians.CreateExtentAttr(), points_of),
         }
         moving = np.flatnonzero(first.moving)
         even = np.linspace(0, len(moving) - 1, min(MOST_TRACKS, len(moving))).round().astype(np.intp)
@@ -232,9 +232,9 @@ class UsdSequence:
             colours = tracks.CreateDisplayColorPrimvar(self._geometry.Tokens.vertex)
             colours.Set(points_of(linear_light(cloud.splats.colours[self._tracked])))  # displayColor is linear
             tracks.SetWidthsInterpolation(self._geometry.Tokens.vertex)
-            self._channels["tracks"] = Channel(tracks.CreatePointsAttr(), points_of)
-            self._channels["widths"] = Channel(tracks.CreateWidthsAttr(), floats_of)
-            self._channels["track extent"] = Channel(tracks.CreateExtentAttr(), points_of)
+            self._channels["tracks"] = AnimatedValues(tracks.CreatePointsAttr(), points_of)
+            self._channels["widths"] = AnimatedValues(tracks.CreateWidthsAttr(), floats_of)
+            self._channels["track extent"] = AnimatedValues(tracks.CreateExtentAttr(), points_of)
         if self._labels is not None:
             self._motion = PartMotion(self._labels, first, self._world)
             self._geometry.Scope.Define(self._stage, "/World/Parts")

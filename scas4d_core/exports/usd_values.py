@@ -23,7 +23,7 @@ NEAREST, FARTHEST = 0.01, 1000.0
 """Clipping range of cameras, metres."""
 
 
-class Channel:
+class AnimatedValues:
     """Samples of one attribute with a value a Gaussian; a sample is written only where it tells something new.
 
     USD interpolates between samples, so before a change the value of the frame before is written as well. Gaussians

@@ -18,7 +18,7 @@ from scas4d_core.effect_names import Mode
 from scas4d_core.effects.effect import effect
 from scas4d_core.effects.evidence import Evidence
 from scas4d_core.engines.choose import fit_engine_of
-from scas4d_core.engines.cpu.gloss import GLOSS, Shading
+from scas4d_core.engines.cpu.gloss import GLOSS, GlossShading
 from scas4d_core.engines.fit import COLOUR, COLUMNS, MEAN, FitLoss, FitScalars
 from scas4d_core.first_frame.fit_schedule import FitProgress
 from scas4d_core.first_frame.normals import surface_normals
@@ -109,13 +109,13 @@ class GlossTrial:
             self.untried = not few
             return False
         gloss, means = gloss_seen(self._trainer, None)
-        without, seen = self._left(None), self._left(Shading.fresh(gloss, means))
+        without, seen = self._left(None), self._left(GlossShading.fresh(gloss, means))
         share = max(0.0, 1 - seen / max(without, 1e-12))
         self.evidence = Evidence(share, f"explains {100 * share:.0f} % of the residual of frame 0")
         self.on = self._mode == "on" or share >= effect("direction").on_above
         return self.on
 
-    def _left(self, gloss: Shading | None) -> float:
+    def _left(self, gloss: GlossShading | None) -> float:
         """Mean squared error of the pictures after a few rounds in which colours, and a gloss, learn alone."""
         trainer, rates = self._trainer, np.zeros(COLUMNS, np.float32)
         rates[COLOUR] = RATE
@@ -141,7 +141,7 @@ class GlossTrial:
                 before = trainer.fit.table.gloss
                 environment = None if before is None else before.environment
                 gloss, means = gloss_seen(trainer, environment)
-                trainer.fit.set_gloss(Shading.fresh(gloss, means, environment))
+                trainer.fit.set_gloss(GlossShading.fresh(gloss, means, environment))
             return now
 
         def end(now: FitStep, last: FitLoss) -> bool:
@@ -167,7 +167,7 @@ class GlossyFit:
         gloss, means = gloss_seen(before, environment)
         self._strengths = np.linalg.norm(gloss, axis=1, keepdims=True)
         self._tree, self._normals = cKDTree(means), gloss / np.maximum(self._strengths, 1e-9)
-        trainer.fit.set_gloss(Shading.fresh(self._placed(None), means, environment))
+        trainer.fit.set_gloss(GlossShading.fresh(self._placed(None), means, environment))
 
     def _placed(self, gloss: Array | None) -> Array:
         """[N, 3] gloss with the normals of the first surface; strengths as they are, at first those of it, too."""
@@ -184,7 +184,7 @@ class GlossyFit:
 
     def _after(self, now: FitStep) -> bool:
         shading, share = self._trainer.fit.table.gloss, now.ended / self._trainer.settings.iterations
-        assert isinstance(shading, Shading)
+        assert isinstance(shading, GlossShading)
         if share <= SETTLED and now.passes(100):
             shading.gloss[:] = self._placed(shading.gloss)
             shading.changed_from[:] = shading.gloss

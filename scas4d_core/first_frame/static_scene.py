@@ -91,7 +91,7 @@ class StaticTrainer:
         self._masked = any(len(view.target) > 3 for view in views)
         self.random = np.random.default_rng(settings.seed)
         self.exposures = Exposures(views, settings.exposure is not False, RATE_EXPOSURE, BETA1, BETA2)
-        renderer = renderer_of(device, scene.behind, scene_limits(scene.near, self.radius))
+        renderer = renderer_of(device, scene.background_rgb, scene_limits(scene.near, self.radius))
         engine = fit_engine_of(renderer, WEIGHT_MASK)
         self.fit = GaussianFit(engine, views, parameters, exposures=self.exposures, statistics=True)
         self._last = float(settings.iterations)

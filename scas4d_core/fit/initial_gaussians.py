@@ -25,7 +25,7 @@ def budget(views: list[TrainingView], scene: SceneSettings, settings: StaticSett
     """Largest number of Gaussians of the scene, by the setting or by the size and content of the pictures."""
     if settings.max_gaussians is not None:
         return settings.max_gaussians
-    background = np.array(scene.behind, np.float32)[:, None, None]
+    background = np.array(scene.background_rgb, np.float32)[:, None, None]
     pixels = float(np.mean([view.camera.width * view.camera.height for view in views]))
     covered = float(np.mean([(np.abs(view.target[:3] - background).max(axis=0) > PLAIN).mean() for view in views]))
     whole = min(LARGEST_BUDGET, pixels * (PER_PIXEL + PER_COVERED_PIXEL * covered))

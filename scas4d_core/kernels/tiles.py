@@ -195,7 +195,7 @@ def cover_tiles(
 
 @kernel
 def mark_blocks(splats, rects, chosen, tiles_x, marks):
-    """Marks the blocks that the supports of Gaussians meet.
+    """CompiledMarkers the blocks that the supports of Gaussians meet.
 
     Args:
         splats, rects: of ``projection.project``. chosen: [N] uint8, 0 for Gaussians that mark nothing.

@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from scas4d_core.errors import InputError
 from scas4d_core.gaussians import Gaussians, moving_extent, quaternion_products, quaternions_to_matrices
-from scas4d_core.storage.births import FOUNDERLESS
+from scas4d_core.storage.births import NO_PARENT
 from scas4d_core.storage.history import History
 
 Features = NDArray[np.float32]
@@ -162,7 +162,7 @@ def match_labels(labels: NDArray[Any], previous: NDArray[Any], weights: NDArray[
 def motion(history: History, rows: NDArray[np.intp], frames: int) -> tuple[NDArray[Any], NDArray[Any]]:
     """Positions [T, M, 3] and material rotations [T, M, 4] of some Gaussians at up to ``frames`` even frames.
 
-    Before its birth a Gaussian moves as if it had been there: with its founder, or not at all.
+    Before its birth a Gaussian moves as if it had been there: with its parent, or not at all.
     """
     indices = np.array(history.indices)
     even = np.unique(np.linspace(0, len(indices) - 1, min(frames, len(indices))).round().astype(np.intp))
@@ -179,9 +179,9 @@ def motion(history: History, rows: NDArray[np.intp], frames: int) -> tuple[NDArr
 
 def _before_birth(history: History, rows: NDArray[np.intp], indices: list[int]) -> tuple[NDArray[Any], NDArray[Any]]:
     """Positions [T, M, 3] and rotations [T, M, 4] of Gaussians that are led by what they descend from."""
-    roots, founders, ancestors = history.roots(), history.founders, rows.copy()
-    while (up := founders[ancestors] != FOUNDERLESS).any():
-        ancestors = np.where(up, founders[ancestors], ancestors)
+    roots, parents, ancestors = history.roots(), history.parents, rows.copy()
+    while (up := parents[ancestors] != NO_PARENT).any():
+        ancestors = np.where(up, parents[ancestors], ancestors)
     leads, turned = history.stacked("means", indices, ancestors), history.stacked("rotations", indices, ancestors)
     positions = np.broadcast_to(roots.means[rows], leads.shape).copy()
     rotations = np.broadcast_to(roots.rotations[rows], turned.shape).copy()

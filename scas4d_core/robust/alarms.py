@@ -98,7 +98,7 @@ def alarms_of(
     """
     count = len(sharp)
     found = _of_frame(outcome, reason, exposure, same, count)
-    if outcome.held or not offsets:
+    if outcome.rejected or not offsets:
         return found, after  # nothing that a camera could be held against
     watch, raised = dict(after.watch), dict[AlarmKind, dict[str, Alarm]]()
     beside, told = _beside(colours), {name: Watch.of(past, name) for name in sharp}
@@ -266,7 +266,7 @@ def _of_frame(outcome: FrameOutcome, reason: str, exposure: float, same: Collect
     """Alarms of no camera."""
     text = degraded_text(outcome, reason)
     if text is not None:
-        return [Alarm(AlarmKind.FRAME_HELD if outcome.held else AlarmKind.FRAME_IN_PART, None, text)]
+        return [Alarm(AlarmKind.FRAME_REJECTED if outcome.rejected else AlarmKind.FRAME_IN_PART, None, text)]
     if count and len(same) == count:
         return [Alarm(AlarmKind.FRAME_REPEATED, None, f"all {count} cameras send the same pictures again, bit by bit")]
     if exposure != 1.0:

@@ -108,7 +108,7 @@ def step_of(past: Past, bright: Mapping[str, float]) -> float:
     return float(np.median(ratios)) if len(ratios) >= ENOUGH else 1.0
 
 
-def goes_on(past: Past, bright: Mapping[str, float]) -> bool:
+def light_continues(past: Past, bright: Mapping[str, float]) -> bool:
     """True where a frame's light goes on as it went to the frame before, faster than is told from noise.
 
     The scene's own light does so, and is followed at once. A flicker comes back, and a jump has no step before it.
@@ -124,15 +124,15 @@ def noted(past: Past, bright: Mapping[str, float]) -> Past:
     return replace(past, last={**past.last, **bright}, step=step_of(past, bright))
 
 
-def lit(past: Past, light: float) -> Past:
+def with_light(past: Past, light: float) -> Past:
     """The past with the light of a frame: for how many frames it has been brighter, or darker; darkness is none."""
     if light == 1.0 or not BLIND <= light <= 1 / BLIND:
-        return replace(past, light=1.0, lit=0)
-    same = past.lit > 0 and (light > 1) == (past.light > 1)
-    return replace(past, light=light, lit=past.lit + 1 if same else 1)
+        return replace(past, light=1.0, light_frames=0)
+    same = past.light_frames > 0 and (light > 1) == (past.light > 1)
+    return replace(past, light=light, light_frames=past.light_frames + 1 if same else 1)
 
 
-def evened(
+def compensate_exposure(
     factory: ViewFactory,
     renderer: Renderer,
     state: Gaussians,
@@ -243,14 +243,14 @@ def validated(
     count = int(bad.sum())
     if count > max(1, FEW * len(rows)):
         fault = f"{count} of {len(rows)} Gaussians are not finite, or moved or grew too far"
-        return replace(result, gaussians=before, held=count), fault
+        return replace(result, gaussians=before, frozen=count), fault
     bounded = 0
     if first is not None:
         after, bounded = _bounded(after, rows, squares, first)
     if count:
         arrays = {name: np.where(_like(bad, now), then, now) for name, then, now in _pairs(before, after)}
         after = after.replace(**arrays)
-    return replace(result, gaussians=after, held=count, bounded=bounded), None
+    return replace(result, gaussians=after, frozen=count, bounded=bounded), None
 
 
 def _bounded(after: Gaussians, rows: NDArray[np.int64], squares: Array, first: Array) -> tuple[Gaussians, int]:

@@ -17,14 +17,14 @@ from scas4d_core.frame_outcome import OTHER_ORDERS, Candidate
 from scas4d_core.update.result import UpdateResult
 
 FASTER = (1.0, 2.0, 2.0)
-"""Times the rates of the layers (``UpdateSettings.cold_start``) in each order; so many orders are tried at most."""
+"""Factors on the rates of the layers (``UpdateSettings.cold_start_rates``), one for each order that may be tried."""
 AGREE = 0.04
 """Two orders whose errors lie within this share of each other ended in the same basin: no third one is tried."""
 ANOTHER_ORDER = 1_000_003
 """Added to the seed of an update for each order after the first."""
 
 
-class Ended(NamedTuple):
+class OrderResult(NamedTuple):
     """The end of one order.
 
     Attributes:
@@ -37,7 +37,7 @@ class Ended(NamedTuple):
     fits: Mapping[str, float]
 
 
-def best_order(run: Callable[[int, float], Ended], seed: int) -> tuple[Ended, int]:
+def best_order(run: Callable[[int, float], OrderResult], seed: int) -> tuple[OrderResult, int]:
     """Runs an update in two orders of its views, or three; returns the best end, and how many ran.
 
     An update that needed no iteration is not tried again.
@@ -45,7 +45,7 @@ def best_order(run: Callable[[int, float], Ended], seed: int) -> tuple[Ended, in
     Args:
         run: the update, with a seed and a factor on the rates of the layers. seed: of the first order.
     """
-    ends: list[Ended] = []
+    ends: list[OrderResult] = []
     while len(ends) < len(FASTER) and not _agree(errors_of(ends)):
         ends.append(run(seed + len(ends) * ANOTHER_ORDER, FASTER[len(ends)]))
         if not ends[0].result.trace.losses:
@@ -56,7 +56,7 @@ def best_order(run: Callable[[int, float], Ended], seed: int) -> tuple[Ended, in
     return best._replace(result=replace(best.result, trace=trace)), len(ends)
 
 
-def errors_of(ends: Sequence[Ended]) -> list[float]:
+def errors_of(ends: Sequence[OrderResult]) -> list[float]:
     """Root mean square error, 0…1, of each end: the mean over the cameras that all orders believed.
 
     Infinite where a state is not plausible, or no better than not moving.
@@ -65,8 +65,8 @@ def errors_of(ends: Sequence[Ended]) -> list[float]:
     return [_error(end, sorted(names)) for end in ends]
 
 
-def _error(end: Ended, names: Sequence[str]) -> float:
-    if end.fault is not None or end.result.trace.kept is Candidate.STILL or not names:
+def _error(end: OrderResult, names: Sequence[str]) -> float:
+    if end.fault is not None or end.result.trace.kept is Candidate.PREVIOUS or not names:
         return np.inf
     error = float(np.mean([10 ** (-end.fits[name] / 20) for name in names]))
     return error if np.isfinite(error) else np.inf

@@ -68,11 +68,11 @@ class Past:
         brightness: by camera, mean of its picture, 0…1, in the exposure of frame 0; NaN where not known.
         out: by camera, frames in a row that it has been left out, 0 when it is believed.
         level: dB at the end of an update, see ``level_of``; NaN where not known.
-        updates: that went into it. held: frames in a row that were held although their pictures say something. fitted:
-            seconds, time of the last frame that was learnt from. behind: frames since some were held or not moved, 0
-            once they are met as usual again.
+        updates: that went into it. rejected: consecutive frames that were rejected with usable pictures.
+            fitted: seconds, time of the last frame that was learnt from. behind: frames since some were rejected or
+            skipped, 0 once the PSNR is as usual again.
         iterations: of the last update. error: usual at the end of an update, by probe view.
-        light: times that the last frame was brighter, see ``checks.check_brightness``. lit: frames in a row
+        light: times that the last frame was brighter, see ``checks.check_brightness``. light_frames: frames in a row
             that were brighter, or that were darker.
         last: by camera, mean of its picture in the last frame, in whatever light. step: times that the last frame was
             brighter than the one before it.
@@ -85,13 +85,13 @@ class Past:
     out: Mapping[str, int] = field(default_factory=dict)
     level: float = nan
     updates: int = 0
-    held: int = 0
+    rejected: int = 0
     fitted: float = nan
     behind: int = 0
     iterations: int = 0
     error: Mapping[str, float] = field(default_factory=dict)
     light: float = 1.0
-    lit: int = 0
+    light_frames: int = 0
     last: Mapping[str, float] = field(default_factory=dict)
     step: float = 1.0
     watch: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
@@ -108,7 +108,16 @@ class Past:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """As arrays, for a checkpoint."""
         rows = [(place, self.brightness[name], self.out[name]) for name, place in self.places.items()]
-        scene = [self.level, self.updates, self.held, self.fitted, self.behind, self.iterations, self.light, self.lit]
+        scene = [
+            self.level,
+            self.updates,
+            self.rejected,
+            self.fitted,
+            self.behind,
+            self.iterations,
+            self.light,
+            self.light_frames,
+        ]
         scene.append(self.step)
         return {
             "names": np.array(list(self.places), np.str_),
@@ -135,14 +144,14 @@ class Past:
         places = {name: place for name, (place, _, _) in rows}
         bright = {name: value for name, (_, value, _) in rows}
         outs = {name: int(out) for name, (_, _, out) in rows}
-        level, updates, held, fitted, behind, iterations, light, lit, step = arrays["scene"].tolist()
+        level, updates, rejected, fitted, behind, iterations, light, light_frames, step = arrays["scene"].tolist()
         error = dict(zip(arrays["witnesses"].tolist(), arrays["error"].tolist(), strict=True))
         last = dict(zip(arrays["shown"].tolist(), arrays["last"].tolist(), strict=True))
         watch, timing = _rows(arrays, "watched", "watch"), _rows(arrays, "timed", "timing")
         return cls(
             places, bright, outs, level,
-            int(updates), int(held), fitted, int(behind), int(iterations), error, light, int(lit), last, step,
-            watch, timing,
+            int(updates), int(rejected), fitted, int(behind), int(iterations), error, light, int(light_frames),
+            last, step, watch, timing,
         )  # fmt: skip
 
     def place(self, name: str) -> float:
@@ -163,7 +172,7 @@ def relit(past: Past, gain: float) -> Past:
     """The past once another light is the usual one: in a brighter light, errors are brighter, too."""
     brightness = {name: gain * value for name, value in past.brightness.items()}
     level = past.level - max(0.0, 20 * log10(gain))
-    return replace(past, brightness=brightness, level=level, error={}, light=1.0, lit=0)
+    return replace(past, brightness=brightness, level=level, error={}, light=1.0, light_frames=0)
 
 
 def offsets(past: Past, psnr: Mapping[str, float]) -> dict[str, float]:
@@ -219,7 +228,7 @@ def unmet(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | N
 
 def behind(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | None:
     """Why an update after frames that were held or not moved should be sought longer, or None. See ``unmet``."""
-    if not (past.held or past.behind) or not psnr or past.level != past.level:
+    if not (past.rejected or past.behind) or not psnr or past.level != past.level:
         return None
     off = past.level - level_of(past, psnr)
     return f"{off:.1f} dB less than before" if off > BEHIND_DB + _shorter(past, iterations) else None
@@ -292,7 +301,7 @@ def settle(
         out=outs,
         level=past.level + follows * (level - past.level) if known else level,
         updates=past.updates + moved,
-        held=0,
+        rejected=0,
         behind=later,
         iterations=iterations or past.iterations,
     )

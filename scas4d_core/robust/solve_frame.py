@@ -20,8 +20,8 @@ from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust import outliers, timing
 from scas4d_core.robust.alarms import alarms_of, colours_by_camera
-from scas4d_core.robust.checks import EXPOSURE, evened, gain_of, relit, validated
-from scas4d_core.robust.first_motion import Ended, best_order
+from scas4d_core.robust.checks import EXPOSURE, compensate_exposure, gain_of, relit, validated
+from scas4d_core.robust.first_motion import OrderResult, best_order
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.relocation import find_jump, shifted
 from scas4d_core.robust.update_input import UpdateInput
@@ -78,7 +78,7 @@ class FrameSolver:
 
     def _alarmed(self, given: UpdateInput, result: UpdateResult, past: Past) -> Solved:
         """With the health of the cameras, the alarms, and when the pictures were taken."""
-        if self._settings.judge:
+        if self._settings.reject_outliers:
             past = timing.noted(past, given.state, result, self._renderer, given.seconds, given.step, given.seed)
         means = {view.name: view.mean for view in result.views or given.views}
         alarms, past = alarms_of(
@@ -87,32 +87,38 @@ class FrameSolver:
             left_out={*given.left_out, *result.trace.left_out},
         )  # fmt: skip
         fits = {name: outliers.health(given.past, off) for name, off in result.offsets.items()}
-        alarms = alarms if self._settings.judge else []
+        alarms = alarms if self._settings.reject_outliers else []
         return replace(result, health=fits, alarms=alarms, timing=timing.timings(past)), past
 
     def _solved(self, given: UpdateInput) -> Solved:
-        if self._settings.still > -1 and given.unusable is None and (why := self._rests(given)) is not None:
-            return _standing(given, UpdateTrace(kept=Candidate.STILL), given.exposure, why)
-        stays = given.light_moves or given.past.lit >= self._settings.patience
-        if stays and (solved := self._relit(given)) is not None:
+        if (
+            self._settings.skip_tolerance > -1
+            and given.unusable is None
+            and (why := self._scene_is_static(given)) is not None
+        ):
+            return _standing(given, UpdateTrace(kept=Candidate.PREVIOUS), given.exposure, why)
+        stays = given.light_moves or given.past.light_frames >= self._settings.max_rejected_frames
+        if stays and (solved := self._retry_with_light_gain(given)) is not None:
             return solved
         if given.unusable is not None:  # nothing is tried, and no patience is lost with it
             past = replace(given.past, behind=max(1, given.past.behind))
-            nothing = UpdateTrace(kept=Candidate.STILL)
-            return self._held(given, FrameOutcome.HELD_UNUSABLE, nothing, past, [], given.unusable, given.exposure)
+            nothing = UpdateTrace(kept=Candidate.PREVIOUS)
+            return self._held(given, FrameOutcome.REJECTED_UNUSABLE, nothing, past, [], given.unusable, given.exposure)
         settings, attempts = self._settings, list[str]()
         exposure = 1.0
         if given.exposure != 1.0:
-            exposure, views, suspects = evened(self._factory, self._renderer, given.state, given.views, given.suspects)
+            exposure, views, suspects = compensate_exposure(
+                self._factory, self._renderer, given.state, given.views, given.suspects
+            )
             given = replace(given, views=views, suspects=suspects)
         result, fault = self._attempt(given, AS_SET, attempts)
         for options in LADDER:
             if fault is None:
                 break
             result, fault = self._attempt(given, options, attempts)
-        lost = replace(given.past, held=given.past.held + 1)  # patience ends
+        lost = replace(given.past, rejected=given.past.rejected + 1)  # patience ends
         if fault is not None:
-            outcome = FrameOutcome.HELD_IMPLAUSIBLE
+            outcome = FrameOutcome.REJECTED_IMPLAUSIBLE
             return self._held(given, outcome, result.trace, lost, attempts, fault, exposure)
         if not result.trace.losses:
             return _standing(given, result.trace, exposure, "not moved")
@@ -125,11 +131,11 @@ class FrameSolver:
             again = self._search(given, result, attempts)
             if again is not None:
                 result, outcome, reason = again, FrameOutcome.RELOCATED, f"{why}; {attempts[-1]}"
-            elif lost.held < settings.patience:
-                outcome = FrameOutcome.HELD_UNMET
+            elif lost.rejected < settings.max_rejected_frames:
+                outcome = FrameOutcome.REJECTED_MISFIT
                 return self._held(given, outcome, result.trace, lost, attempts, why, exposure)
             else:
-                reason = f"{why}, for {settings.patience} frames: taken as it is from here on"
+                reason = f"{why}, for {settings.max_rejected_frames} frames: taken as it is from here on"
                 outcome = FrameOutcome.ACCEPTED
                 given = replace(given, past=replace(given.past, level=nan, updates=0))
         elif outcome is FrameOutcome.UPDATED and (why := self._behind(given, result)) is not None:
@@ -138,7 +144,7 @@ class FrameSolver:
         result = replace(result, outcome=outcome, reason=reason, attempts=attempts, exposure=exposure)
         return self._committed(given, result)
 
-    def _rests(self, given: UpdateInput) -> str | None:
+    def _scene_is_static(self, given: UpdateInput) -> str | None:
         """Why nothing has to be updated, as the pictures alone say, or None."""
         if given.same and len(given.same) == len(given.brightness):
             return "the same pictures again"
@@ -151,7 +157,7 @@ class FrameSolver:
             return None
         return "nothing is seen to move" if level > given.past.level - outliers.RESTS_DB else None
 
-    def _relit(self, given: UpdateInput) -> Solved | None:
+    def _retry_with_light_gain(self, given: UpdateInput) -> Solved | None:
         """A frame in a light that stays or moves: the colours take it on; None where the cameras tell of no other.
 
         Where the scene is shown as bright as it was, something new makes the pictures brighter: no reason to hold them.
@@ -164,9 +170,9 @@ class FrameSolver:
         state, past = relit(given.state, gain), outliers.relit(given.past, gain)
         in_light = replace(given, state=state, past=past, exposure=1.0, light_moves=False, unusable=None)
         result, past = self._solved(in_light)
-        if not result.outcome.held:
+        if not result.outcome.rejected:
             return replace(result, attempts=[f"{light}, for good", *result.attempts]), past
-        lost = replace(given.past, held=given.past.held + 1)
+        lost = replace(given.past, rejected=given.past.rejected + 1)
         why = f"in {light} {result.reason}"
         return self._held(given, result.outcome, result.trace, lost, result.attempts, why, given.exposure)
 
@@ -187,16 +193,18 @@ class FrameSolver:
 
         A scene that goes on without its carry-over knows no camera; what was held was sought for longer already.
         """
-        first = given.motion is None and given.past.updates == 0 and len(given.past.places) > 0 and not given.past.held
-        return template is AS_SET and first and given.end is None and self._settings.cold_longer > 1
+        first = (
+            given.motion is None and given.past.updates == 0 and len(given.past.places) > 0 and not given.past.rejected
+        )
+        return template is AS_SET and first and given.end is None and self._settings.cold_start_iterations > 1
 
-    def _first(self, given: UpdateInput, seed: int, faster: float) -> Ended:
+    def _first(self, given: UpdateInput, seed: int, faster: float) -> OrderResult:
         options = replace(self._options(given, AS_SET), several=True, faster=faster)
         result = self._run(replace(given, seed=seed), given.state, None, options)
         result, fault = self._validated(given, given.state, result)
         with self._timed():
             views = [view for view in result.views or given.views if view.name not in result.trace.left_out]
-            return Ended(result, fault, self._measured(views, result.gaussians) if result.trace.losses else {})
+            return OrderResult(result, fault, self._measured(views, result.gaussians) if result.trace.losses else {})
 
     def _run(self, given: UpdateInput, start: Gaussians, motion: Motion | None, how: AttemptOptions) -> UpdateResult:
         return self._updater.run(start, given.views, motion, given.seconds, given.seed, how, given.carried)
@@ -214,18 +222,18 @@ class FrameSolver:
     def _options(self, given: UpdateInput, template: AttemptOptions) -> AttemptOptions:
         """The options of an attempt at a frame, in the manner of a template."""
         settings, past = self._settings, given.past
-        longer = max(template.longer, settings.cold_longer if given.motion is None else 1.0)
+        longer = max(template.longer, settings.cold_start_iterations if given.motion is None else 1.0)
         most, end = round(longer * settings.iterations), None
         if given.end is not None:
             most, end = MOST_TIMED, self._until(given, template, given.end)
         stopping = Stopping(most, end=end, each=given.each, gain=settings.stop_gain, first=all_begun(settings))
-        enough = {name: (1 + settings.still) * error for name, error in past.error.items()}
+        enough = {name: (1 + settings.skip_tolerance) * error for name, error in past.error.items()}
         return replace(
             template,
             stopping=stopping,
-            gate=(lambda first: outliers.misfits(past, first, outliers.FIRST_DB)) if settings.judge else None,
-            compare=settings.judge or settings.stop_gain > 0,
-            enough=enough if settings.still > -1 and template is AS_SET else None,
+            gate=(lambda first: outliers.misfits(past, first, outliers.FIRST_DB)) if settings.reject_outliers else None,
+            compare=settings.reject_outliers or settings.stop_gain > 0,
+            enough=enough if settings.skip_tolerance > -1 and template is AS_SET else None,
             confirm=lambda: within(self._in_whole(given.views, given.state), enough),
             usual=past.error,
             step=given.step if given.step < given.seconds else None,
@@ -234,16 +242,16 @@ class FrameSolver:
     def _until(self, given: UpdateInput, template: AttemptOptions, end: float) -> float:
         """The moment by which an attempt has to be over: after held frames half is kept for a search."""
         now = perf_counter()
-        return (now + end) / 2 if given.past.held and template is AS_SET and now < end else end
+        return (now + end) / 2 if given.past.rejected and template is AS_SET and now < end else end
 
     def _unmet(self, given: UpdateInput, result: UpdateResult) -> str | None:
-        if not self._settings.judge:
+        if not self._settings.reject_outliers:
             return None
         with self._timed():
             return outliers.unmet(given.past, result.trace.met, len(result.trace.losses))
 
     def _behind(self, given: UpdateInput, result: UpdateResult) -> str | None:
-        if not self._settings.judge or self._spent(given):
+        if not self._settings.reject_outliers or self._spent(given):
             return None
         return outliers.behind(given.past, result.trace.met, len(result.trace.losses))
 
@@ -301,7 +309,7 @@ class FrameSolver:
     ) -> Solved:
         """A frame that is not believed: state and motion stay."""
         result = UpdateResult(
-            given.state, given.motion, replace(trace, kept=Candidate.STILL), outcome=outcome, reason=reason,
+            given.state, given.motion, replace(trace, kept=Candidate.PREVIOUS), outcome=outcome, reason=reason,
             attempts=attempts, exposure=exposure, offsets=outliers.offsets(past, trace.fits), carried=given.carried,
         )  # fmt: skip
         return result, past
@@ -313,11 +321,11 @@ class FrameSolver:
             off = outliers.misfits(given.past, psnr, outliers.LAST_DB)
             again = [view for view in result.views or given.views if view.name in off]
             psnr |= self._measured([*again, *given.suspects], result.gaussians)
-        moved = trace.kept is not Candidate.STILL or given.past.updates > 0
+        moved = trace.kept is not Candidate.PREVIOUS or given.past.updates > 0
         past = outliers.settle(given.past, psnr, given.brightness, result.exposure, len(trace.losses), moved)
         if trace.errors.get(Candidate.END):
             errors = by_size(trace.errors[trace.kept], trace.whole)
-            if self._settings.still > -1 and slow(trace.errors, trace.kept):
+            if self._settings.skip_tolerance > -1 and slow(trace.errors, trace.kept):
                 errors |= self._in_whole(result.views or given.views, result.gaussians)
             past = replace(past, error=outliers.usual_errors(given.past.error, errors))
         motion = result.motion if result.motion is not None and result.motion.finite else None
@@ -339,8 +347,10 @@ def _as_coloured(state: Gaussians, before: Gaussians) -> Gaussians:
 
 def _standing(given: UpdateInput, trace: UpdateTrace, exposure: float, said: str) -> Solved:
     """Θ_{t−1} shows the frame: nothing was rendered that says how any camera fits, so the usual figures stay."""
-    past = replace(given.past, held=0, behind=max(1, given.past.behind))  # it may go on from here, or from further away
-    outcome = FrameOutcome.STOOD
+    past = replace(
+        given.past, rejected=0, behind=max(1, given.past.behind)
+    )  # it may go on from here, or from further away
+    outcome = FrameOutcome.UNCHANGED
     result = UpdateResult(
         given.state, given.motion, trace, outcome=outcome, attempts=[said], exposure=exposure, carried=given.carried
     )

@@ -130,7 +130,7 @@ def noted(
     """
     trace, after = result.trace, result.gaussians
     plain = result.outcome is FrameOutcome.UPDATED and len(result.attempts) == 1 and result.exposure == 1.0
-    if not plain or past.updates < 2 or trace.kept is Candidate.STILL or not trace.shown:
+    if not plain or past.updates < 2 or trace.kept is Candidate.PREVIOUS or not trace.shown:
         return past
     looks = {name: Looks(*row) for name, row in past.timing.items()}
     views = [one for one in result.views if one.name in trace.shown and one.name not in trace.left_out]

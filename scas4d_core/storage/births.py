@@ -21,8 +21,8 @@ Int = NDArray[np.int64]
 COLUMNS = 4
 """Of the log: frame, kind, first id, last id."""
 NO_EVENTS: Int = np.zeros((0, COLUMNS), np.int64)
-FOUNDERLESS = -1
-"""Founder of a Gaussian that starts a structure of its own."""
+NO_PARENT = -1
+"""Parent of a Gaussian that starts a structure of its own."""
 
 
 class Event(IntEnum):
@@ -130,23 +130,23 @@ def lives_of(events: Int, wanted: Iterable[int], first: int) -> list[Life]:
     return lives
 
 
-def grown_roots(roots: Gaussians, state: Gaussians, joins: Int | None) -> Gaussians:
+def grown_roots(roots: Gaussians, state: Gaussians, parents: Int | None) -> Gaussians:
     """The roots of a state: Θ_0 with each Gaussian born since at the place that it would have had there.
 
-    Clusters and neighbours are made of them. A born Gaussian goes back as its founder has come, rigidly; one without
-    a founder has its place where it was born.
+    Clusters and neighbours are made of them. A born Gaussian goes back as its parent has come, rigidly; one without
+    a parent has its place where it was born.
 
     Args:
-        roots: before this frame, [N]. state: after it, [N + B]. joins: [B] founders; None: none has one.
+        roots: before this frame, [N]. state: after it, [N + B]. parents: [B] parents; None: none has one.
     """
     count, born = len(roots), state.rows(np.arange(len(roots), len(state)))
     if len(born):
-        founders = np.full(len(born), FOUNDERLESS, np.int64) if joins is None else joins
+        parent_rows = np.full(len(born), NO_PARENT, np.int64) if parents is None else parents
         means, factors, rotations = (
             getattr(born, name).astype(np.float64) for name in ("means", "factors", "rotations")
         )
-        which = np.flatnonzero(founders != FOUNDERLESS)
-        rows = founders[which]
+        which = np.flatnonzero(parent_rows != NO_PARENT)
+        rows = parent_rows[which]
         back = quaternion_products(
             roots.rotations[rows].astype(np.float64), _inverse(state.rotations[rows].astype(np.float64))
         )

@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
-from scas4d_core.compact import CompactWriter, FileError, Head
+from scas4d_core.compact import CompactWriter, FileError, FileHeader
 from scas4d_core.storage.chunks import chunk_file, note_of
 from scas4d_core.storage.frame_files import frame_of
 from scas4d_core.storage.history import NEWEST_KEPT, History
@@ -44,14 +44,14 @@ class Compaction:
     ...     history = History(folder)
     ...     for index in range(6):
     ...         history.append(index, index / 30, state)
-    ...     compaction = Compaction(history, lambda: Head(WorldFrame(np.zeros(3))), exact=2)
+    ...     compaction = Compaction(history, lambda: FileHeader(WorldFrame(np.zeros(3))), exact=2)
     ...     moved = [compaction.step() for _ in range(4)]
     ...     compaction.close()
     ...     moved, sorted(path.name for path in history.directory.glob("[fs]*_00000[1-5].*"))
     ([1, 2, 3, None], ['frame_000004.npz', 'frame_000005.npz', 'states_000001.s4d'])
     """
 
-    def __init__(self, history: History, head: Callable[[], Head], exact: int) -> None:
+    def __init__(self, history: History, head: Callable[[], FileHeader], exact: int) -> None:
         assert history.files is not None
         self.exact = max(exact, NEWEST_KEPT)
         self._history, self._files, self._head = history, history.files, head

@@ -166,7 +166,7 @@ class FramesReader:
 
     @property
     def files(self) -> FrameFiles | None:
-        """The files on disk, to mend them (``scas4d_core.remake``); None in memory."""
+        """The files on disk, to mend them (``scas4d_core.recompute``); None in memory."""
         return self._files
 
     def time(self, index: int) -> float:

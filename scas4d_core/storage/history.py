@@ -20,15 +20,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.gaussians import FIXED, PER_FRAME, UNBORN, WHOLES, Gaussians
-from scas4d_core.storage.births import FOUNDERLESS, Event, Int, births_in, events_of, retired_after
+from scas4d_core.storage.births import NO_PARENT, Event, Int, births_in, events_of, retired_after
 from scas4d_core.storage.faults import DamagedFrameError, HistoryError, UnreadableFrameError
 from scas4d_core.storage.frame_arrays import Arrays, EffectArrays, as_written, packed
-from scas4d_core.storage.frame_aside import IN_MEMORY, ScratchFile
 from scas4d_core.storage.frame_files import FrameFiles
 from scas4d_core.storage.frames_reader import FRAMES_KEPT
 from scas4d_core.storage.history_reader import ROOT, ROOTS, HistoryReader
 from scas4d_core.storage.npz import clear_parts
 from scas4d_core.storage.retention import surplus
+from scas4d_core.storage.scratch_frames import IN_MEMORY, ScratchFile
 
 __all__ = [
     "FIXED", "FRAMES_KEPT", "NEWEST_KEPT", "PER_FRAME", "DamagedFrameError", "History", "HistoryError",
@@ -111,7 +111,7 @@ class History(HistoryReader):
         gaussians: Gaussians,
         report: Mapping[str, Any] | None = None,
         *,
-        joins: Int | None = None,
+        parents: Int | None = None,
         roots: Gaussians | None = None,
         effects: EffectArrays = MappingProxyType({}),
     ) -> None:
@@ -123,7 +123,7 @@ class History(HistoryReader):
             gaussians: the state; same ids and opacities as in the frame before. Rows after those are born in this one:
                 they have no ids yet, and get theirs here. The arrays are copied.
             report: made of JSON values (finite numbers, strings, lists, mappings).
-            joins: [B] rows of the founders of the born; None: none has one.
+            parents: [B] rows of the parents of the born; None: none has one.
             roots: of all Gaussians (``births.grown_roots``); None: the born have theirs where they are.
             effects: arrays that a cold start needs, by effect.
 
@@ -158,7 +158,7 @@ class History(HistoryReader):
         births: dict[int, Arrays] = {}
         ids = fixed["ids"]
         if rows > count:
-            births[index] = self._birth(index, gaussians.rows(np.arange(count, rows)), joins, roots)
+            births[index] = self._birth(index, gaussians.rows(np.arange(count, rows)), parents, roots)
             ids = np.concatenate([ids, births[index]["ids"]])
         retired = np.zeros(rows, np.bool_)
         retired[:count] = retired_after(before, fixed["ids"])
@@ -173,7 +173,7 @@ class History(HistoryReader):
         log = log if len(log) > len(before) else before
         self._write(index, time, frame, text, log, births, self._fixed or fixed, packed(effects))
 
-    def _birth(self, index: int, born: Gaussians, joins: Int | None, roots: Gaussians | None) -> Arrays:
+    def _birth(self, index: int, born: Gaussians, parents: Int | None, roots: Gaussians | None) -> Arrays:
         """All that is kept of a birth.
 
         A birth that a frame had before it was taken back, and has again, is the same one, with the same ids. Any other
@@ -181,10 +181,10 @@ class History(HistoryReader):
         """
         count = len(born)
         origin = born if roots is None else roots.rows(np.arange(len(roots) - count, len(roots)))
-        founders = np.full(count, FOUNDERLESS, np.int64) if joins is None else np.array(joins, np.int64)
+        parent_rows = np.full(count, NO_PARENT, np.int64) if parents is None else np.array(parents, np.int64)
         arrays = {name: np.array(getattr(born, name)) for name in PER_FRAME}
         arrays |= {name: np.array(born.arrays()[name]) for name in FIXED}
-        arrays |= {"joins": founders, **{ROOT + name: np.array(getattr(origin, name)) for name in ROOTS}}
+        arrays |= {"parents": parent_rows, **{ROOT + name: np.array(getattr(origin, name)) for name in ROOTS}}
         spent = self._births.get(index)
         if self._files is not None:
             spent = None
@@ -295,7 +295,7 @@ class History(HistoryReader):
             self._files.sync()
         return known
 
-    def mend_fixed(self) -> dict[str, str]:
+    def repair_fixed(self) -> dict[str, str]:
         """Writes the files that every frame needs, and their copies, anew where they are damaged.
 
         Returns:

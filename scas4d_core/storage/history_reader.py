@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scas4d_core.errors import InputError
 from scas4d_core.gaussians import FIXED, PER_FRAME, WHOLES, Gaussians
 from scas4d_core.storage.births import (
-    FOUNDERLESS,
+    NO_PARENT,
     Int,
     Life,
     births_in,
@@ -130,10 +130,10 @@ class HistoryReader(FramesReader):
         return np.concatenate([first, *later])
 
     @property
-    def founders(self) -> Int:
-        """[count] row of the founder that each Gaussian, by row, joined at its birth; −1 for one without."""
-        none = np.full(len(self._fixed.get("ids", ())), FOUNDERLESS, np.int64)
-        return np.concatenate([none, *(self._born(birth)["joins"] for birth in births_in(self._events()))])
+    def parents(self) -> Int:
+        """[count] row of the parent that each Gaussian, by row, joined at its birth; −1 for one without."""
+        none = np.full(len(self._fixed.get("ids", ())), NO_PARENT, np.int64)
+        return np.concatenate([none, *(self._born(birth)["parents"] for birth in births_in(self._events()))])
 
     @property
     def highest_id(self) -> int:

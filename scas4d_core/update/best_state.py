@@ -121,10 +121,10 @@ class ProbeViews:
 def slow(errors: Mapping[Candidate, Mapping[str, float]], kept: Candidate) -> bool:
     """True where Θ_{t−1} shows a frame nearly (``SLOW``) as well as what was kept; ``errors`` by probe view.
 
-    >>> slow({Candidate.STILL: {"a": 1.4}, Candidate.END: {"a": 1.0}}, Candidate.END)
+    >>> slow({Candidate.PREVIOUS: {"a": 1.4}, Candidate.END: {"a": 1.0}}, Candidate.END)
     True
     """
-    still, ended = errors.get(Candidate.STILL, {}), errors.get(kept, {})
+    still, ended = errors.get(Candidate.PREVIOUS, {}), errors.get(kept, {})
     return mean_error(still, list(ended)) <= (1 + SLOW) * mean_error(ended, list(ended))
 
 
@@ -176,13 +176,13 @@ class BestState:
                 as long as since the motion was measured.
         """
         motion = self._motion
-        self._note(Candidate.STILL, self._probes.errors(moved=False, learnt=False))
+        self._note(Candidate.PREVIOUS, self._probes.errors(moved=False, learnt=False))
         tables = self._set(motion)
         if motion is not None and self.errors:
             self._note(Candidate.WARM, self._probes.errors(moved=True, learnt=False))
             if step is not None:
                 tables = self._try_after_rest(motion, step)
-            if self._mean(Candidate.STILL) < self._mean(Candidate.WARM):
+            if self._mean(Candidate.PREVIOUS) < self._mean(Candidate.WARM):
                 tables = self._set(None)
         return tables
 
@@ -202,11 +202,11 @@ class BestState:
 
         None: never, and without being asked.
         """
-        still = self.errors.get(Candidate.STILL)
+        still = self.errors.get(Candidate.PREVIOUS)
         if (
             enough is None
             or still is None
-            or self._mean(Candidate.STILL) > self._mean(Candidate.WARM, otherwise=np.inf)
+            or self._mean(Candidate.PREVIOUS) > self._mean(Candidate.WARM, otherwise=np.inf)
         ):
             return False
         return within(by_size(still, self.whole), enough) and (confirm is None or confirm())
@@ -218,7 +218,7 @@ class BestState:
 
         What stands is met no better by any motion; ``usual``, errors ``by_size`` of updates at their end, takes it out.
         """
-        still, warm = (self.errors.get(candidate) for candidate in (Candidate.STILL, Candidate.WARM))
+        still, warm = (self.errors.get(candidate) for candidate in (Candidate.PREVIOUS, Candidate.WARM))
         if still is None or warm is None or not usual:
             return 1.0
         names = sorted(by_size(still, self.whole).keys() & usual.keys())
@@ -243,7 +243,7 @@ class BestState:
             return Candidate.END
         if iterations:
             self._note(Candidate.END, self._probes.errors(moved=True, learnt=True))
-        names = [name for name in self.errors[Candidate.STILL] if name not in left_out]
+        names = [name for name in self.errors[Candidate.PREVIOUS] if name not in left_out]
         compared = [candidate for candidate in Candidate if candidate in self.errors]  # of equal ones the first
         best = min(compared, key=lambda candidate: _or_last(mean_error(self.errors[candidate], names)))
         if best is not Candidate.END and iterations and not self.whole:

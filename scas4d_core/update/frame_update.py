@@ -139,7 +139,7 @@ class FrameUpdate:
     def _finish(self, attempt: Attempt) -> Gaussians:
         """The state of the candidate that was chosen, after each effect has changed it."""
         state = attempt.previous
-        if attempt.kept is not Candidate.STILL:
+        if attempt.kept is not Candidate.PREVIOUS:
             state = self._engine.state(learnt=attempt.kept is Candidate.END)
         attempt.views = self._exposed(attempt.views)
         for part in self._parts:
@@ -150,7 +150,7 @@ class FrameUpdate:
         """The rates of an attempt: as set, and by how near the motion before leads."""
         rates = self._rates.tried(options.rates, options.rigid, options.hold_colours)
         if motion is None:
-            return rates.cold(options.faster * self.settings.cold_start, options.several)
+            return rates.cold(options.faster * self.settings.cold_start_rates, options.several)
         return rates.warm(best.unexplained(options.usual))
 
     def _start(
@@ -159,7 +159,7 @@ class FrameUpdate:
         moving, standing = rates.of_colours(self.plan.colours)
         return AttemptStart(
             layers=rates.layers, position=rates.position, rotation=rates.rotation, scale=rates.scale,
-            colour=moving, colour_standing=standing, beta1=rates.beta1, beta2=rates.beta2,
+            colour=moving, static_colour=standing, beta1=rates.beta1, beta2=rates.beta2,
             samples=samples, gains=gains, curve=self.curve, lap=watch.lap,
         )  # fmt: skip
 

@@ -33,7 +33,7 @@ Arrays = dict[str, NDArray[Any]]
 NOTHING: Mapping[str, Arrays] = MappingProxyType({})
 """Arrays of no effect."""
 
-P = TypeVar("P", bound="Part")
+P = TypeVar("P", bound="UpdatePart")
 
 
 @dataclass(eq=False)
@@ -61,7 +61,7 @@ class Attempt:
     kept: Candidate = Candidate.END
 
 
-class Part:
+class UpdatePart:
     """The work of one effect before and after the iterations; each method does nothing unless a part overrides it."""
 
     def begin(self, attempt: Attempt) -> None:
@@ -88,12 +88,12 @@ class PlanBuilder:
     hierarchy: Hierarchy
     first: Gaussians
     plan: UpdatePlan = field(init=False)
-    parts: list[Part] = field(default_factory=list)
+    parts: list[UpdatePart] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.plan = UpdatePlan(
             cameras=self.factory.rig.names,
-            background=self.scene.behind,
+            background=self.scene.background_rgb,
             limits=scene_limits(self.scene.near, self.factory.rig.radius),
             cluster_map=self.update.cluster_map,
             covariance=self.update.covariance,

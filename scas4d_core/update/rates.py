@@ -70,7 +70,7 @@ class Rates:
 
     Attributes:
         layers: (rotation r, translation t in metres, scaling c and s), one a layer, coarse to fine.
-        position, rotation, scale, colour: of Δp in metres, ΔR, Δs, RGB of moving. colour_standing: RGB of the rest.
+        position, rotation, scale, colour: of Δp in metres, ΔR, Δs, RGB of moving. static_colour: RGB of the rest.
         end: rates fall to this fraction in the last iteration before what they are of rests, or the update ends, along
             half a cosine; 1 keeps them.
         beta1, beta2: Adam's decays.
@@ -84,7 +84,7 @@ class Rates:
     rotation: float
     scale: float
     colour: float
-    colour_standing: float = 0.0
+    static_colour: float = 0.0
     end: float = 1.0
     beta1: float = 0.9
     beta2: float = 0.999
@@ -140,7 +140,7 @@ class Rates:
         """Rates of the colours of moving and of static Gaussians, as a plan frees them."""
         if plan is None:
             return 0.0, 0.0
-        moving, standing = self.colour, self.colour_standing
+        moving, standing = self.colour, self.static_colour
         if plan.changing_light:
             standing = FASTER_IN_CHANGING_LIGHT * standing
             moving = max(moving, standing)
@@ -179,7 +179,7 @@ class Rates:
             rotation=own * self.rotation,
             scale=own * self.scale,
             colour=0.0 if hold_colours else factor * self.colour,
-            colour_standing=0.0 if hold_colours else factor * self.colour_standing,
+            static_colour=0.0 if hold_colours else factor * self.static_colour,
         )
 
     @classmethod
@@ -193,13 +193,13 @@ class Rates:
             rotation=settings.rate_rotation,
             scale=settings.rate_scale,
             colour=settings.rate_colour,
-            colour_standing=settings.rate_colour_standing,
-            end=settings.rate_end,
+            static_colour=settings.rate_static_colour,
+            end=settings.final_rate,
             beta1=settings.beta1,
             beta2=settings.beta2,
             starts=starts,
             rests=_of_layers(LAYER_RESTS, starts),
-            start=settings.own_start,
+            start=settings.deltas_start,
         )
 
 
@@ -211,4 +211,4 @@ def _of_layers(rests: tuple[float, ...], starts: tuple[float, ...]) -> tuple[flo
 
 def all_begun(settings: UpdateSettings) -> float:
     """Share of the iterations after which every layer and the Gaussians' own deltas learn."""
-    return max(settings.own_start, *LAYER_STARTS)
+    return max(settings.deltas_start, *LAYER_STARTS)

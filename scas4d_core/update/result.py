@@ -181,8 +181,8 @@ class UpdateResult:
     Attributes:
         gaussians: Θ_t. motion: for the next warm start; None: that starts cold. trace: how it went; of a frame that is
             held, of the last attempt before any search.
-        held: Gaussians held one by one as they were before. bounded: axes set to the shortest or longest length that
-            they may have.
+        frozen: number of Gaussians that keep their previous state. bounded: number of axes set to the shortest or
+            longest permitted length.
         outcome: of the frame. reason: in words, where the outcome is a degraded one.
         attempts: each attempt at the frame, with what came of it.
         exposure: times that the frame is brighter than usual.
@@ -190,14 +190,14 @@ class UpdateResult:
         health: 0…1 by camera of ``offsets``. alarms: but for the cameras that were left out (``robust/alarms.py``).
         timing: by camera, when its pictures seem to be taken (``robust/timing.py``).
         carried: arrays for the next update, by effect. views: that were learnt from, with the exposures of the end.
-        joins: [B] int64 of the Gaussians born in this frame, which are the last rows: the row of the founder that each
-            joins in the hierarchy and the graph, or −1 where it starts a structure of its own. None: none is born.
+        parents: [B] int64 of the Gaussians born in this frame, which are the last rows: the row of the parent that each
+            parents in the hierarchy and the graph, or −1 where it starts a structure of its own. None: none is born.
     """
 
     gaussians: Gaussians
     motion: Motion | None
     trace: UpdateTrace
-    held: int = 0
+    frozen: int = 0
     bounded: int = 0
     outcome: FrameOutcome = FrameOutcome.UPDATED
     reason: str = ""
@@ -209,7 +209,7 @@ class UpdateResult:
     timing: Mapping[str, CameraTiming] = field(default_factory=dict)
     carried: Mapping[str, Arrays] = field(default_factory=dict)
     views: Sequence[TrainingView] = ()
-    joins: NDArray[np.int64] | None = None
+    parents: NDArray[np.int64] | None = None
 
     def joined(self, first: UpdateResult) -> UpdateResult:
         """An update that went on from where another ended: its motion is that of both."""

@@ -18,7 +18,7 @@ from typing import Any
 
 from server.cluster.marks import is_marked
 from server.health.oom import oom_kills
-from server.processes.placement import AnyProcess, Ended, Entry, Placement
+from server.processes.placement import AnyProcess, Entry, Placement, ProcessExit
 
 
 @dataclass(frozen=True)
@@ -31,15 +31,15 @@ class Started:
 
 
 @dataclass(frozen=True)
-class Gone:
-    """The process ended without being asked to, with this exit code; `starved`: see `Ended`."""
+class NodeGone:
+    """The process ended without being asked to, with this exit code; `starved`: see `ProcessExit`."""
 
     exit_code: int | None
     starved: bool = False
 
 
 @dataclass(frozen=True)
-class Manner:
+class ProcessPriority:
     """Sets how processes run: as on the machine of the service; Ray starts its own otherwise.
 
     Attributes:
@@ -51,7 +51,7 @@ class Manner:
     nice: int = 0
 
     @classmethod
-    def here(cls) -> Manner:
+    def here(cls) -> ProcessPriority:
         """Of this process."""
         return cls(os.environ.get("OMP_NUM_THREADS"), os.getpriority(os.PRIO_PROCESS, 0))
 
@@ -88,11 +88,13 @@ class Host:
 
     Args:
         prepare: see `Placement`. data: folder of the service, which this node has to see. word: of the service's mark
-            in it. manner: of the service; None: of this process.
+            in it. priority: of the service; None: of this process.
     """
 
-    def __init__(self, prepare: Callable[[], None] | None, data: Path, word: str, manner: Manner | None = None) -> None:
-        self._manner = manner
+    def __init__(
+        self, prepare: Callable[[], None] | None, data: Path, word: str, priority: ProcessPriority | None = None
+    ) -> None:
+        self._manner = priority
         self._placement = Placement(prepare)
         self._data, self._word = data, word
         self._said: asyncio.Queue[Any] = asyncio.Queue()
@@ -127,7 +129,7 @@ class Host:
             self._next += 1
 
     async def take(self) -> list[Any]:
-        """The next messages of the process, one at least; `Gone` is the last."""
+        """The next messages of the process, one at least; `NodeGone` is the last."""
         messages = [await self._said.get()]
         while not self._said.empty():
             messages.append(self._said.get_nowait())
@@ -139,6 +141,6 @@ class Host:
             process, self._process = self._process, None
             await process.stop(seconds)
 
-    def _ended(self, why: Ended) -> None:
+    def _ended(self, why: ProcessExit) -> None:
         self._process = None
-        self._said.put_nowait(Gone(why.exit_code, oom_kills() > self._oom_kills))
+        self._said.put_nowait(NodeGone(why.exit_code, oom_kills() > self._oom_kills))

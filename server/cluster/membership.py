@@ -1,4 +1,4 @@
-"""The service's membership of a Ray cluster: it joins by the node of its machine, and again once that is lost."""
+"""The service's membership of a Ray cluster: it parents by the node of its machine, and again once that is lost."""
 
 from __future__ import annotations
 

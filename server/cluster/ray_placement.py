@@ -18,7 +18,7 @@ from ray.exceptions import RayActorError, RayError
 from client.wire import Cluster
 from server.cluster.calls import Calls
 from server.cluster.folder import check_folder
-from server.cluster.host import Gone, Host, Manner, Started
+from server.cluster.host import Host, NodeGone, ProcessPriority, Started
 from server.cluster.marks import mark
 from server.cluster.membership import Membership
 from server.cluster.needs import Needs, needs_of
@@ -27,7 +27,7 @@ from server.cluster.services import announced, others
 from server.cluster.watch import NodeWatch
 from server.messages import WaitsForNode
 from server.processes import worker
-from server.processes.placement import STOP_SECONDS, AnyProcess, Ended, Entry, Placement
+from server.processes.placement import STOP_SECONDS, AnyProcess, Entry, Placement, ProcessExit
 from server.settings import ServerSettings
 
 WAIT_S = 3.0
@@ -134,7 +134,7 @@ class RayPlacement(Placement):
         if self._listens is not None:
             self._announced = await self.asked(announced, self._token, *self._listens)
 
-    async def siblings(self) -> Sequence[str]:
+    async def peers(self) -> Sequence[str]:
         """See `Placement`; what was known before where the head does not answer."""
         self._siblings = await self.asked(others, self._token, self._siblings)
         return list(self._siblings.values())
@@ -152,7 +152,7 @@ class RayPlacement(Placement):
         await asyncio.to_thread(self._membership.leave)
 
     def start(
-        self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[Ended], None]
+        self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[ProcessExit], None]
     ) -> AnyProcess:
         """Starts a process on the node that has room; see `Placement`."""
         needs = needs_of(entry, spec, self._server)
@@ -170,7 +170,7 @@ class RayPlacement(Placement):
         """An actor for a process. Blocking: the head registers its name."""
         made: Any = ray.remote(Host)
         return made.options(name=name, **needs.options()).remote(
-            self.prepare, self._server.data.resolve(), self._token, Manner.here()
+            self.prepare, self._server.data.resolve(), self._token, ProcessPriority.here()
         )
 
 
@@ -184,7 +184,7 @@ class RayProcess:
         needs: Needs,
         runs: tuple[Entry, Any],
         on_message: Callable[[Any], None],
-        on_end: Callable[[Ended], None],
+        on_end: Callable[[ProcessExit], None],
     ) -> None:
         self._placement = placement
         self._name = name
@@ -248,8 +248,8 @@ class RayProcess:
             await self._begin(entry, spec)
             while not self._over:
                 for message in await self._answer(self._actor.take.remote()):
-                    if isinstance(message, Gone):
-                        self._end(Ended(message.exit_code, starved=message.starved))
+                    if isinstance(message, NodeGone):
+                        self._end(ProcessExit(message.exit_code, starved=message.starved))
                     elif not self._over:
                         self._tell(message)
         except RayActorError as error:
@@ -319,9 +319,9 @@ class RayProcess:
             self._give_up(f"a message did not reach its {self._needs.role}: {_first_line(error)}")
 
     def _give_up(self, why: str, *, lost: bool = False) -> None:
-        self._end(Ended(None, why, lost=lost, starved=False))
+        self._end(ProcessExit(None, why, lost=lost, starved=False))
 
-    def _end(self, why: Ended) -> None:
+    def _end(self, why: ProcessExit) -> None:
         if not self._over:
             self._over = True
             self._placement.places.pop(self._name, None)

@@ -12,7 +12,7 @@ from client.wire import Cluster, SceneState, SceneStatus
 from server.settings import ServerSettings
 
 
-class State:
+class ServiceState:
     """Gauges of a service: scenes, queues, subscribers, disk, and the cluster if it has one."""
 
     def __init__(

@@ -9,16 +9,16 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from scas4d_core.compact import CompactWriter, FileError, Head
+from scas4d_core.compact import CompactWriter, FileError, FileHeader
 from scas4d_core.first_frame.calibration.record import in_use
 from scas4d_core.storage.history import History
 from server.messages import SceneSpec
 from server.processes.part_labels import fitted
 
 
-def compact_head(spec: SceneSpec, history: History) -> Head:
+def compact_head(spec: SceneSpec, history: History) -> FileHeader:
     """Returns what holds for all states of a scene: its world, the rig in use, its background and its rate."""
-    return Head(
+    return FileHeader(
         spec.rig.world_frame(spec.settings.scene.metres_per_unit),
         background=history.background,
         rig=in_use(spec.rig, history.first_report),
@@ -27,7 +27,9 @@ def compact_head(spec: SceneSpec, history: History) -> Head:
     )
 
 
-def write_compact(file: Path, history: History, asked: Sequence[int], head: Head, labels: NDArray[Any] | None) -> int:
+def write_compact(
+    file: Path, history: History, asked: Sequence[int], head: FileHeader, labels: NDArray[Any] | None
+) -> int:
     """Writes committed frames, each read when it is its turn; those that retention has deleted since are left out.
 
     What the scene keeps in a compact file already is copied with its bits; a file that begins so may have frames before

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from client.wire import IngestSettings
-from scas4d_core.compact import Bounds, Head
+from scas4d_core.compact import Bounds, FileHeader
 from scas4d_core.storage.compaction import Compaction
 from scas4d_core.storage.history import History
 from server.messages import SceneSpec
@@ -62,6 +62,6 @@ class Compacting:
             log.exception("scene %s: no state is compacted until its worker starts again", self._spec.folder.name)
             self._failed = True
 
-    def _head(self, history: History) -> Head:
+    def _head(self, history: History) -> FileHeader:
         bounds = Bounds(**self._rules.state_bounds.model_dump())
         return replace(compact_head(self._spec, history), bounds=bounds)

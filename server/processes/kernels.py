@@ -48,10 +48,10 @@ def _waited(groups: tuple[Any, ...], connection: Connection[Any, Any] | None, **
 
     began = time.perf_counter()
 
-    def told(done: int, total: int) -> None:
+    def report_progress(done: int, total: int) -> None:
         log.info("compiling kernels: %d of %d", done, total)
         if connection is not None:
             connection.send(Progressed(STAGE, done, total, {}))
 
-    warm_up_elsewhere(groups, told=told, **more)
+    warm_up_elsewhere(groups, on_progress=report_progress, **more)
     return time.perf_counter() - began

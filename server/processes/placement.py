@@ -32,7 +32,7 @@ PARENT_EVERY_S = 0.5
 _context = multiprocessing.get_context("spawn")
 
 
-class Ended(str):
+class ProcessExit(str):
     """The sentence that says why a process is gone.
 
     Attributes:
@@ -45,7 +45,9 @@ class Ended(str):
     lost: bool
     starved: bool | None
 
-    def __new__(cls, exit_code: int | None, why: str = "", *, lost: bool = False, starved: bool | None = None) -> Ended:
+    def __new__(
+        cls, exit_code: int | None, why: str = "", *, lost: bool = False, starved: bool | None = None
+    ) -> ProcessExit:
         """Makes the sentence for an exit code, or takes another."""
         self = super().__new__(cls, why or f"its process ended by itself (exit code {exit_code})")
         self.exit_code, self.lost, self.starved = exit_code, lost, starved
@@ -116,7 +118,7 @@ class Process:
         entry: Entry,
         spec: Any,
         on_message: Callable[[Any], None],
-        on_end: Callable[[Ended], None],
+        on_end: Callable[[ProcessExit], None],
         prepare: Callable[[], None] | None = None,
     ) -> None:
         self._loop = asyncio.get_running_loop()
@@ -182,7 +184,7 @@ class Process:
             self._process.join()
             code = self._process.exitcode
         self._outbox.put(None)  # stop may never be called: the other thread ends with the process
-        self._call(self._on_end, Ended(code))
+        self._call(self._on_end, ProcessExit(code))
 
     def _call(self, function: Callable[[Any], None], argument: Any) -> None:
         with contextlib.suppress(RuntimeError):  # the event loop has closed
@@ -216,7 +218,7 @@ class Placement:
         self.prepare = prepare
 
     def start(
-        self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[Ended], None]
+        self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[ProcessExit], None]
     ) -> AnyProcess:
         """Starts a process.
 
@@ -235,7 +237,7 @@ class Placement:
     async def announce(self, host: str, port: int) -> None:
         """Tells other services of the cluster where this one listens."""
 
-    async def siblings(self) -> Sequence[str]:
+    async def peers(self) -> Sequence[str]:
         """Addresses of the other services of the cluster, as `http://10.0.0.2:8000`."""
         return ()
 

@@ -15,7 +15,7 @@ from functools import partial
 from server import counters
 from server.messages import Damaged, SceneSpec
 from server.problems import Problem, counted
-from server.processes.placement import AnyProcess, Ended, Entry, Placement
+from server.processes.placement import AnyProcess, Entry, Placement, ProcessExit
 from server.processes.queries import Answer, AskedQuery, Query, Refused
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
@@ -183,7 +183,7 @@ class QueryQueue:
         self.process = self._at_work = self._life = None
         self._next()
 
-    def _process_ended(self, life: object, reason: Ended) -> None:
+    def _process_ended(self, life: object, reason: ProcessExit) -> None:
         if life is not self._life or self._closed:
             return
         counters.RESTARTS.labels("reader").inc()

@@ -26,17 +26,17 @@ from scas4d_core.storage.npz import read_npz
 from server.messages import (
     Broken,
     FrameCommitted,
-    FrameFailed,
     FrameReady,
     KeepStates,
-    Mend,
     Progressed,
     Ready,
-    Remake,
+    RecomputeState,
+    RepairFiles,
     SceneSpec,
     Stalled,
     StatesRetained,
     Stop,
+    UpdateFailed,
 )
 from server.processes.compacting import Compacting
 from server.processes.kernels import wait_for_first, wait_for_updates
@@ -73,10 +73,10 @@ def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
                         worker.take(message)
                     case KeepStates():
                         worker.keep(message)
-                    case Mend():
+                    case RepairFiles():
                         worker.mend(message)
-                    case Remake():
-                        worker.remake(message)
+                    case RecomputeState():
+                        worker.recompute(message)
     except (EOFError, OSError) as error:
         if no_room(error):
             raise
@@ -94,7 +94,7 @@ class _Stopped(Exception):
 
 
 class Worker:
-    """Updates one scene. Every frame ends as `FrameCommitted` or `FrameFailed`, or with the process."""
+    """Updates one scene. Every frame ends as `FrameCommitted` or `UpdateFailed`, or with the process."""
 
     def __init__(self, spec: SceneSpec, connection: Connection[Any, Any]) -> None:
         self.spec = spec
@@ -173,7 +173,7 @@ class Worker:
                 raise _Stopped
             self._later.append(message)
 
-    def finish(self, message: FrameReady) -> FrameCommitted | FrameFailed:
+    def finish(self, message: FrameReady) -> FrameCommitted | UpdateFailed:
         """Commits a frame, or returns the reason to set it aside.
 
         Raises:
@@ -186,17 +186,17 @@ class Worker:
             least = self.spec.minimum_cameras
             if len(frame.images) < least:
                 reason = f"{len(frame.images)} cameras' pictures are left, the scene's minimum is {least}"
-                return FrameFailed(message.index, reason, dropped)
+                return UpdateFailed(message.index, reason, dropped)
             return self.reconstruct(frame, dropped, message.budget, began)
         except FrameDamage as error:
-            return FrameFailed(message.index, f"its record in the frame log is damaged: {error}", dropped)
+            return UpdateFailed(message.index, f"its record in the frame log is damaged: {error}", dropped)
         except Exception as error:  # whatever the core raises, the service goes on and says so
             if no_room(error):
                 raise
             log.exception("scene %s, frame %d", self.spec.folder.name, message.index)
             # Without a first frame there is nothing to go on from.
             first = self.reconstruction is None
-            return FrameFailed(message.index, f"{type(error).__name__}: {message_of(error)}", dropped, fatal=first)
+            return UpdateFailed(message.index, f"{type(error).__name__}: {message_of(error)}", dropped, fatal=first)
 
     def keep(self, message: KeepStates) -> None:
         """Keeps states by other rules, and reports which that deletes."""
@@ -204,13 +204,13 @@ class Worker:
         self._compacting.keep(message.rules)
         self.connection.send(StatesRetained(tuple(self.retain())))
 
-    def mend(self, message: Mend) -> None:
+    def mend(self, message: RepairFiles) -> None:
         """Checks files that were found damaged, and reports the outcome of each."""
         assert self.states is not None
         for mended in repairs.mend(self.states, self.reconstruction, message):
             self.connection.send(mended)
 
-    def remake(self, message: Remake) -> None:
+    def recompute(self, message: RecomputeState) -> None:
         """Computes a damaged state again from its pictures, and reports the outcome."""
         assert self.states is not None
         frame = message.frame
@@ -218,7 +218,7 @@ class Worker:
         def pictures() -> tuple[Frame, dict[str, str]]:
             return decode(self.spec.rig, frame, read(self._pictures, frame))
 
-        for mended in repairs.remake(self.spec, self.states, message, pictures):
+        for mended in repairs.recompute(self.spec, self.states, message, pictures):
             self.connection.send(mended)
 
     def reconstruct(self, frame: Frame, dropped: dict[str, str], budget: Budget, began: float) -> FrameCommitted:

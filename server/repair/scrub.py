@@ -30,7 +30,7 @@ from scas4d_core.storage.frame_files import (
 from scas4d_core.storage.history import FRAMES_KEPT
 from scas4d_core.storage.npz import verified
 from server import counters
-from server.repair.mending import DamageKind, DamageLog, Mending
+from server.repair.repair_queue import DamageKind, DamageLog, RepairQueue
 from server.storage.definition import Definition, check_definition, write_definition
 from server.storage.frame_store import checked
 from server.storage.journal import checked_journal
@@ -64,7 +64,7 @@ class Scrub:
         folder: SceneFolder,
         log: SceneLog,
         damage: DamageLog,
-        mending: Mending,
+        mending: RepairQueue,
         *,
         mb_per_second: float,
         pause_seconds: float,
@@ -74,7 +74,7 @@ class Scrub:
         self._ledger = log.ledger
         self._journal = log.journal
         self._damage = damage
-        self._mending = mending
+        self._repair_queue = mending
         self._bytes_per_second = 1e6 * mb_per_second
         self._pause = pause_seconds
 
@@ -142,7 +142,7 @@ class Scrub:
             await self._state(folder / name, lambda: False)
         newest = checkpoint_file(ledger.committed[-1])
         if listed and not self._ledger.updating and not await asyncio.to_thread((folder / newest).exists):
-            self._mending.noticed({newest: f"{newest} is gone"})
+            self._repair_queue.noticed({newest: f"{newest} is gone"})
         await asyncio.to_thread(files.chunks.look)
         for index in reversed(committed):
             if index in files.chunks and not files.path(index).exists():
@@ -160,7 +160,7 @@ class Scrub:
         for index in chunk.times:
             fault = await asyncio.to_thread(files.chunks.fault, index)
             if fault is not None and index in self._ledger.committed and not files.path(index).exists():
-                self._mending.noticed({files.path(index).name: fault})
+                self._repair_queue.noticed({files.path(index).name: fault})
 
     def _expected(self, files: FrameFiles, index: int) -> bool:
         """True for a committed frame that has not gone to a chunk since it was listed."""
@@ -173,9 +173,9 @@ class Scrub:
         """Scrubs one file; `expected`: returns whether a missing file is damage."""
         fault = await self._read(verified(path))
         if fault == GONE and await asyncio.to_thread(expected):
-            self._mending.noticed({path.name: f"{path.name} is gone"})
+            self._repair_queue.noticed({path.name: f"{path.name} is gone"})
         elif fault is not None and fault != GONE:
-            self._mending.noticed({path.name: fault})
+            self._repair_queue.noticed({path.name: fault})
 
     async def _scrub_points(self) -> None:
         path = self._folder.points
@@ -186,7 +186,7 @@ class Scrub:
         self._damage.say(DamageKind.POINTS, f"{fault}; {used}", lasting=True)
 
     async def _scrub_frames(self) -> None:
-        names = [(entry.index, name) for entry in self._ledger.frames.held() for name in entry.files]
+        names = [(entry.index, name) for entry in self._ledger.frames.with_pictures() for name in entry.files]
         for index, name in names:
             fault = await self._read(checked(self._folder.frames, name))
             await asyncio.to_thread(_forget, self._folder.frames / name)

@@ -9,12 +9,12 @@ from fastapi import APIRouter, Request, Response
 
 from client.wire import Cluster, Node, RigModel
 from server.health.estimate import estimate, machine_mb
+from server.peers.clusters import together
+from server.peers.peers import PASSED, Peers
 from server.processes.placement import Placement
 from server.routes.access import AllScenes, TheSettings
 from server.scene.scenes import Scenes
 from server.settings import ServerSettings
-from server.siblings.clusters import together
-from server.siblings.siblings import PASSED, Siblings
 
 router = APIRouter(prefix="/v1/cluster", tags=["service"])
 
@@ -26,10 +26,10 @@ async def get(request: Request, response: Response, scenes: AllScenes, server: T
     On a cluster with several services it is that of all their scenes; X-Unreachable names those that do not answer.
     """
     placement: Placement = request.app.state.placement
-    siblings: Siblings | None = request.app.state.siblings
+    peers: Peers | None = request.app.state.peers
     cluster_status = await placement.cluster() or _alone(scenes, server)
-    if siblings is not None and PASSED not in request.headers:
-        others, silent = await siblings.clusters()
+    if peers is not None and PASSED not in request.headers:
+        others, silent = await peers.clusters()
         cluster_status = together(cluster_status, others)
         if silent:
             response.headers["X-Unreachable"] = ", ".join(silent)

@@ -8,7 +8,7 @@ from prometheus_client import CollectorRegistry
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4, generate_latest
 
 from server.counters import registry
-from server.health.metrics import State
+from server.health.metrics import ServiceState
 from server.health.readiness import Readiness
 from server.routes.access import AllScenes, TheSettings
 
@@ -22,7 +22,9 @@ async def metrics(request: Request, scenes: AllScenes, settings: TheSettings) ->
     gauges = CollectorRegistry()
     state, guard = request.app.state, request.app.state.guard
     cluster = await scenes.placement.cluster()
-    service_state = State(settings, scenes.statuses(), state.hub.count(), readiness.after, guard.counts(), cluster)
+    service_state = ServiceState(
+        settings, scenes.statuses(), state.hub.count(), readiness.after, guard.counts(), cluster
+    )
     gauges.register(service_state)
     text = generate_latest(registry) + generate_latest(gauges)
     return Response(text, media_type=CONTENT_TYPE_PLAIN_0_0_4)

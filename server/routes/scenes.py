@@ -15,11 +15,11 @@ from scas4d_core.settings import Settings
 from server.health import estimate
 from server.http import validation
 from server.http.permissions import ALL, PERMISSION, Permission
+from server.peers.peers import PASSED, Peers
 from server.problems import Problem, of_rig
 from server.processes.placement import Placement
 from server.routes.access import AllExports, AllScenes, SceneId, TheRecord, TheScene, TheSettings
 from server.settings import ServerSettings
-from server.siblings.siblings import PASSED, Siblings
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
@@ -105,9 +105,9 @@ async def listed(scenes: AllScenes, request: Request, response: Response) -> Sce
     scenes.recovering.check()
     permission: Permission = request.scope.get(PERMISSION, ALL)
     summaries = scenes.statuses()
-    siblings: Siblings | None = request.app.state.siblings
-    if siblings is not None and PASSED not in request.headers:
-        others, silent = await siblings.scenes(permission)
+    peers: Peers | None = request.app.state.peers
+    if peers is not None and PASSED not in request.headers:
+        others, silent = await peers.scenes(permission)
         summaries = sorted([*summaries, *others], key=lambda status: status.created)
         if silent:
             response.headers["X-Unreachable"] = ", ".join(silent)

@@ -9,9 +9,9 @@ from fastapi import APIRouter, Request
 
 from client.wire import Share, ShareRequest
 from server.http.sharing import Sharing
+from server.peers.peers import Peers
 from server.problems import Problem
 from server.routes.access import AllScenes, TheSettings
-from server.siblings.siblings import Siblings
 
 router = APIRouter(prefix="/v1/shares", tags=["service"])
 
@@ -31,8 +31,8 @@ async def share(request: ShareRequest, scenes: AllScenes, settings: TheSettings,
             remedy="start it with SCAS4D_TOKEN; then others need a token, or a link",
         )
     if request.scene is not None:
-        siblings: Siblings | None = asked.app.state.siblings
-        if request.scene in scenes or siblings is None or await siblings.owner(request.scene) is None:
+        peers: Peers | None = asked.app.state.peers
+        if request.scene in scenes or peers is None or await peers.owner(request.scene) is None:
             scenes.status(request.scene)  # 404 where there is none
     end = int(time.time() + request.seconds)
     token = Sharing(secret).issue(request.scene, end)

@@ -126,7 +126,7 @@ class Beginning:
         fault = f"frame {index} is {entry.state}"
         if _is_sent(entry):
             fault = f"the pictures of frame {index} are deleted"
-        held = next((other.index for other in frames.held() if _is_sent(other)), None)
+        held = next((other.index for other in frames.with_pictures() if _is_sent(other)), None)
         remedy = f"begin with the next frame that comes, {ledger.next_frame}"
         if held is not None:
             remedy = f"begin with frame {held}, the first whose pictures are held, or with the next that comes, "

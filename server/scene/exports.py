@@ -23,7 +23,7 @@ from scas4d_core.errors import message_of
 from server.messages import Damaged, ExportEnded, ExportProgressed, ExportSpec
 from server.problems import Problem, counted
 from server.processes import exporter
-from server.processes.placement import Ended, Placement
+from server.processes.placement import Placement, ProcessExit
 from server.scene.scene import Scene
 from server.scene.scenes import Scenes
 from server.storage.disk import free_bytes
@@ -233,7 +233,7 @@ class Exports:
             if not ended.done():
                 ended.set_result(fault)
 
-        def gone(reason: Ended) -> None:
+        def gone(reason: ProcessExit) -> None:
             end(f"the export is gone: {reason}")
 
         process = self._placement.start(exporter.main, export.spec, partial(self._receive, export, end), gone)
@@ -249,7 +249,7 @@ class Exports:
             case Damaged():
                 scene = self._scenes.by_id.get(export.scene)
                 if scene is not None and scene.has_place:  # of one that sleeps the next pass over it finds them
-                    scene.mending.noticed(message.files)
+                    scene.repair_queue.noticed(message.files)
             case ExportEnded():
                 end(message.fault)
 

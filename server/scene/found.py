@@ -46,7 +46,7 @@ class FoundScene:
         """True where something is to be done without anybody's asking."""
         ledger = self.content.ledger
         waits = ledger.unfinished > 0 and not ledger.paused and ledger.fatal is None
-        return waits or bool(self.content.events or self.content.remake or ledger.open)
+        return waits or bool(self.content.events or self.content.recompute or ledger.open)
 
     def facts(self, queue_limit: int) -> SceneFacts:
         """Returns the facts for its status while it is asleep. `queue_limit`: of the service, in frames."""

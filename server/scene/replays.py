@@ -11,7 +11,7 @@ from server.background import Background
 from server.messages import Damaged, FrameReady, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated, SceneSpec
 from server.problems import Problem, counted
 from server.processes import replayer
-from server.processes.placement import AnyProcess, Ended, Placement
+from server.processes.placement import AnyProcess, Placement, ProcessExit
 from server.scene.status import effective_budget
 from server.storage.ledger import Ledger
 
@@ -173,7 +173,7 @@ class Replays:
             case ReplayEnded():
                 self._over(message.fault)
 
-    def _ended(self, life: object, reason: Ended) -> None:
+    def _ended(self, life: object, reason: ProcessExit) -> None:
         if life is self._life:
             self._process = None
             self._over(f"the replay is gone: {reason}")

@@ -21,7 +21,7 @@ from server.messages import SceneSpec
 from server.problems import Problem, counted, of_rig
 from server.processes.placement import STOP_SECONDS, Placement
 from server.processes.readers import Readers
-from server.repair.mending import DamageKind, DamageLog, Mending
+from server.repair.repair_queue import DamageKind, DamageLog, RepairQueue
 from server.repair.scrub import Scrub
 from server.scene.found import FoundScene
 from server.scene.replays import Replays
@@ -104,14 +104,16 @@ class Scene:
 
         # Updates. Readers report damaged files to `mending`, which asks the worker to write them again.
         worker = WorkerProcess(self.spec, placement)
-        self.mending = Mending(self.log, self._damage, self._background, to_worker=worker.send, remake=content.remake)
-        self.readers = Readers(self.spec, placement, self.mending.noticed)
-        self._reports = FrameReports(self.ledger, folder.states, self.mending.noticed)
+        self.repair_queue = RepairQueue(
+            self.log, self._damage, self._background, to_worker=worker.send, recompute=content.recompute
+        )
+        self.readers = Readers(self.spec, placement, self.repair_queue.noticed)
+        self._reports = FrameReports(self.ledger, folder.states, self.repair_queue.noticed)
         self.updates = Updates(
             self.log,
             self._damage,
             worker,
-            self.mending,
+            self.repair_queue,
             self.readers,
             self._reports,
             self._trouble,
@@ -125,7 +127,7 @@ class Scene:
         self.ingest = Ingest(self.log, self.rules, self.updates, self._publisher, can_begin=self._check_start)
         self.open_frames = OpenFrames(self.ingest, self._background)
         self.updates.when_room_is_made(self.open_frames.close_due)
-        self.replays = Replays(self.spec, self.ledger, placement, self.mending.noticed, self._background)
+        self.replays = Replays(self.spec, self.ledger, placement, self.repair_queue.noticed, self._background)
 
         if content.events:
             self._background.run(self.log.write(*content.events))
@@ -134,7 +136,7 @@ class Scene:
             folder,
             self.log,
             self._damage,
-            self.mending,
+            self.repair_queue,
             mb_per_second=server.scrub_mb_per_second,
             pause_seconds=server.scrub_pause_seconds,
         )
@@ -176,7 +178,7 @@ class Scene:
             first=updates.first,
             damage=self._damage.sentences,
             warnings=self.warnings,
-            trouble=self._trouble.sentence or self.mending.trouble,
+            trouble=self._trouble.sentence or self.repair_queue.trouble,
             at_work=updates.at_work,
             progress=updates.progress,
             worker_deaths=updates.worker.deaths.count,
@@ -275,7 +277,7 @@ class Scene:
                 self.ingest.refuse_if_failed()
                 if self.ledger.budgets[-1][1] == budget:
                     return
-                with self.updates.held():
+                with self.updates.paused():
                     await self.log.append(BudgetChanged(index=self.ledger.begins_next(), budget=budget))
 
         await uncancelled(change())

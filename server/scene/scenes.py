@@ -20,11 +20,11 @@ from server.problems import Problem
 from server.processes.placement import Placement
 from server.scene import sleep
 from server.scene.beginning import Beginning, begins_anew, journal_beginning
-from server.scene.card import write_card
 from server.scene.found import find, make
 from server.scene.recovering import Recovering
 from server.scene.scene import Scene
 from server.scene.sleep import SleepingScene, Turns
+from server.scene.status_cache import write_card
 from server.settings import ServerSettings
 from server.storage.definition import Definition, DefinitionError
 from server.storage.disk import FolderLock, full_disk, lock_data, no_room

@@ -14,8 +14,8 @@ from typing import Any
 
 from client.wire import SceneStatus
 from server.problems import Problem, counted
-from server.scene.card import read_card
 from server.scene.scene import Scene
+from server.scene.status_cache import read_card
 from server.settings import ServerSettings
 from server.storage.layout import SceneFolder
 

@@ -67,10 +67,10 @@ class FramesSkipped(_Event):
     by: int
 
 
-class FrameSetAside(_Event):
+class FrameFailed(_Event):
     """A frame could not be reconstructed. `fatal`: the scene cannot go on without it."""
 
-    fact: Literal["set_aside"] = "set_aside"
+    fact: Literal["failed"] = "failed"
     index: int
     reason: str
     dropped: dict[str, str] = Field(default_factory=dict)
@@ -202,7 +202,7 @@ JournalEvent = Annotated[
     | PartAccepted
     | FrameMissing
     | FramesSkipped
-    | FrameSetAside
+    | FrameFailed
     | WorkerDied
     | PicturesDeleted
     | StatesDeleted

@@ -20,7 +20,16 @@ from pathlib import Path
 from client.wire import FileKind, FrameHead
 from scas4d_core.storage.npz import sync_folder
 from server.storage.events import Hashes
-from server.storage.record_log import BY_FILE, CHECKSUM, Kind, Record, checksum, opening, read_at, streamed_record
+from server.storage.record_log import (
+    BY_FILE,
+    CHECKSUM,
+    LogRecord,
+    LogRecordKind,
+    checksum,
+    opening,
+    read_at,
+    streamed_record,
+)
 
 FILE = re.compile(r"(\d{10})-[0-9a-f]{12}\.frame")
 DIRECT = getattr(os, "O_DIRECT", 0)
@@ -66,7 +75,7 @@ class Upload:
         files = [file.model_dump(mode="json") for file in head.files]
         fields = {"time": seconds, "part": head.part, "files": files}
         length = sum(file.size for file in head.files)
-        self._opening = opening(Kind.PICTURES, head.index, fields, length, BY_FILE)
+        self._opening = opening(LogRecordKind.PICTURES, head.index, fields, length, BY_FILE)
         self._over = self._opening
         self.begin = len(self._opening)
         """Offset in the file at which the pictures begin."""
@@ -151,8 +160,8 @@ def read_pictures(folder: Path, name: str) -> StoredPictures:
     except OSError as error:
         raise FrameDamage(f"{name}: {error.strerror}") from None
     record, end = read_at(memoryview(data), 0)
-    if not isinstance(record, Record) or record.kind != Kind.PICTURES or end != len(data):
-        raise FrameDamage(f"{name}: {'not one record of pictures' if isinstance(record, Record) else record.reason}")
+    if not isinstance(record, LogRecord) or record.kind != LogRecordKind.PICTURES or end != len(data):
+        raise FrameDamage(f"{name}: {'not one record of pictures' if isinstance(record, LogRecord) else record.reason}")
     images: dict[str, memoryview] = {}
     masks: dict[str, memoryview] = {}
     hashes: Hashes = {}

@@ -75,14 +75,14 @@ class FrameTable:
         """Grows to `count` frames; nothing is known of the new ones."""
         new = count - len(self)
         if new > 0:
-            self._states.extend(bytes([CODES[FrameState.SET_ASIDE]]) * new)
+            self._states.extend(bytes([CODES[FrameState.FAILED]]) * new)
             self._flags.extend(bytes(new))
             self._times.frombytes(bytes(8 * new))
             self._identities.extend(bytes(IDENTITY * new))
             self._skipped_by.frombytes(bytes(self._skipped_by.itemsize * new))
-            self.counts[FrameState.SET_ASIDE] += new
+            self.counts[FrameState.FAILED] += new
 
-    def held(self) -> Iterator[FrameEntry]:
+    def with_pictures(self) -> Iterator[FrameEntry]:
         """Yields the frames that have records in the frame log, rising."""
         return (FrameEntry(self, index) for index in sorted(self._files))
 
@@ -119,7 +119,7 @@ class FrameTable:
     def move(self, index: int, state: FrameState) -> None:
         """Puts the frame in another state."""
         if index < self.first and state in (FrameState.QUEUED, FrameState.COMMITTED):
-            state = FrameState.SET_ASIDE
+            state = FrameState.FAILED
         before = STATES[self._states[index]]
         self.counts[before] -= 1
         self.counts[state] += 1
@@ -134,7 +134,7 @@ class FrameTable:
         """
         states = self.states()
         stay = (states == CODES[FrameState.MISSING]) | (states == CODES[FrameState.SKIPPED])
-        states[~stay] = CODES[FrameState.SET_ASIDE]
+        states[~stay] = CODES[FrameState.FAILED]
         states[[i for i in self._files if i >= first and not stay[i]]] = CODES[FrameState.QUEUED]
         self.first, self._states = first, bytearray(states.tobytes())
         self._flags = bytearray(flags & (TIME | RECEIPT) if flags & RECEIPT else 0 for flags in self._flags)
@@ -145,7 +145,7 @@ class FrameTable:
         for index, note in notes.items():
             if stay[index] or note.parts is not None:
                 self._notes[index] = Note(note.error if stay[index] else None, parts=note.parts)
-        bare = (states == CODES[FrameState.SET_ASIDE]) & self.flagged(RECEIPT)
+        bare = (states == CODES[FrameState.FAILED]) & self.flagged(RECEIPT)
         for index in (np.flatnonzero(bare[first:]) + first).tolist():
             self.note(index).error = BARE
 
@@ -319,13 +319,13 @@ class FrameEntry:
             return error
         if self.state == FrameState.SKIPPED:
             return f"skipped: frame {self.skipped_by} came and the queue was full"
-        if self.state == FrameState.SET_ASIDE and self.index < self._table.first:
+        if self.state == FrameState.FAILED and self.index < self._table.first:
             return f"the reconstruction begins with frame {self._table.first}"
-        return LOST if self.state == FrameState.SET_ASIDE else None
+        return LOST if self.state == FrameState.FAILED else None
 
     @property
     def record(self) -> Mapping[str, Any] | None:
-        """Record of its commit, where that is in memory."""
+        """LogRecord of its commit, where that is in memory."""
         return self._table._records.get(self.index)
 
     @property
@@ -344,7 +344,7 @@ class FrameEntry:
             error=self.error,
             identity=self.identity,
             attempts=note.own_deaths + note.other_deaths,
-            held=bool(self.files),
+            pictures_kept=bool(self.files),
             deleted=self.deleted,
             **({"dropped_cameras": dict(note.dropped)} if record is None else committed_fields(record)),
         )

@@ -20,7 +20,7 @@ from scas4d_core.storage.npz import sync_folder, written_whole
 from server.problems import Problem
 from server.storage.disk import no_room
 from server.storage.events import JournalEvent, SceneCreated, WorkerDied, parse_event, why_no_event
-from server.storage.record_log import Damage, Kind, encoded, streamed
+from server.storage.record_log import Damage, LogRecordKind, encoded, streamed
 
 PIECE = 1 << 16
 """Bytes that are compared at a time."""
@@ -97,7 +97,7 @@ def replay(path: Path, take: Callable[[JournalEvent], object]) -> JournalReading
 
 def bytes_of(events: Iterable[JournalEvent]) -> bytes:
     """Encodes events as records, one after the other."""
-    return b"".join(encoded(Kind.EVENT, _index(event), event.model_dump(mode="json")) for event in events)
+    return b"".join(encoded(LogRecordKind.EVENT, _index(event), event.model_dump(mode="json")) for event in events)
 
 
 def write_journal(path: Path, events: Iterator[JournalEvent]) -> int:

@@ -145,7 +145,7 @@ class SceneFolder:
 
     @property
     def card(self) -> Path:
-        """Status of a scene that is asleep (`server.scene.card`); nothing is lost with it."""
+        """Status of a scene that is asleep (`server.scene.status_cache`); nothing is lost with it."""
         return self.path / "asleep.json"
 
     @property

@@ -20,8 +20,8 @@ from server.storage.disk import full_disk, no_room
 from server.storage.events import (
     BudgetChanged,
     FrameAccepted,
+    FrameFailed,
     FrameMissing,
-    FrameSetAside,
     FramesSkipped,
     Hashes,
     JournalEvent,
@@ -120,13 +120,13 @@ class Ledger:
                 for index in event.frames:
                     self._have(index)
                     self.frames.skip(index, event.by)
-            case FrameSetAside():
+            case FrameFailed():
                 self._have(event.index)
                 note = self.frames.note(event.index)
                 note.error, note.dropped = event.reason, dict(event.dropped)
                 if event.fatal:
                     self.fatal, self.failed_at = event.reason, event.index
-                self.move(event.index, FrameState.SET_ASIDE)
+                self.move(event.index, FrameState.FAILED)
             case WorkerDied():
                 self._have(event.index)
                 note = self.frames.note(event.index)
@@ -172,13 +172,13 @@ class Ledger:
         self.frames.move(index, state)
 
     def reconcile(
-        self, indices: Sequence[int], damaged: Mapping[int, str], remake: Collection[int] = ()
+        self, indices: Sequence[int], damaged: Mapping[int, str], recompute: Collection[int] = ()
     ) -> list[JournalEvent]:
         """Brings the frames in line with the committed states that exist, and returns what the journal lacks.
 
         Args:
             indices: of the states that can be read, rising. damaged: states that cannot, with the reason.
-            remake: of those that are damaged or gone, states that will be made again: no event is made of them.
+            recompute: of those that are damaged or gone, states that will be made again: no event is made of them.
 
         Returns:
             Events, already applied, that have to be appended: states that are gone, frames that have to be done again
@@ -197,16 +197,16 @@ class Ledger:
             self.states_deleted -= frames.restore_state(int(index))
             if not frames[int(index)].files:
                 events.append(
-                    FrameSetAside(index=int(index), reason="its state is damaged, and its pictures are deleted")
+                    FrameFailed(index=int(index), reason="its state is damaged, and its pictures are deleted")
                 )
         frames.commit_up_to(last)
-        lost = readable & (codes == CODES[FrameState.SET_ASIDE]) & ~frames.flagged(RECEIPT)
+        lost = readable & (codes == CODES[FrameState.FAILED]) & ~frames.flagged(RECEIPT)
         for index in np.flatnonzero(lost):  # its event is lost, its state is not
             frames.note(int(index)).error = None
             frames.move(int(index), FrameState.COMMITTED)
         unreadable = (frames.states() == CODES[FrameState.COMMITTED]) & ~frames.flagged(DELETED) & ~readable
-        gone = tuple(index for index in np.flatnonzero(unreadable).tolist() if index not in remake)
-        for again in remake:
+        gone = tuple(index for index in np.flatnonzero(unreadable).tolist() if index not in recompute)
+        for again in recompute:
             if again < count and unreadable[again]:
                 frames.set_unreadable(again, True)
         if gone:
@@ -235,17 +235,17 @@ class Ledger:
                 indices.append(index)
         return indices[::-1]
 
-    def hopeless(self) -> list[FrameSetAside]:
+    def hopeless(self) -> list[FrameFailed]:
         """Returns events, not applied, that set aside the frames waiting behind a failed first one."""
         if self.fatal is None:
             return []
-        return [FrameSetAside(index=index, reason=f"{HOPELESS}: {self.fatal}") for index in self.waiting()]
+        return [FrameFailed(index=index, reason=f"{HOPELESS}: {self.fatal}") for index in self.waiting()]
 
     def last_tried(self) -> int | None:
         """Returns the newest frame that the worker has finished, committed or set aside."""
         states = self.frames.states()
         states[: self.frames.first] = CODES[FrameState.SKIPPED]  # not tried: the reconstruction begins behind them
-        tried = np.flatnonzero((states == CODES[FrameState.COMMITTED]) | (states == CODES[FrameState.SET_ASIDE]))
+        tried = np.flatnonzero((states == CODES[FrameState.COMMITTED]) | (states == CODES[FrameState.FAILED]))
         return int(tried[-1]) if len(tried) else None
 
     def last_time(self) -> float | None:

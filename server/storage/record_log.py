@@ -5,7 +5,7 @@ A record is a header, a head (JSON) and a body (raw bytes), and a checksum behin
     bytes  what
     4      magic S4DR
     1      version of the format, 1 or 2: which checksum is behind the body
-    1      kind, `Kind`
+    1      kind, `LogRecordKind`
     2      nought
     4      length of the head
     8      index of the frame that it belongs to
@@ -44,7 +44,7 @@ CHECKSUM = 16
 MAX_HEAD = 1 << 22
 
 
-class Kind(IntEnum):
+class LogRecordKind(IntEnum):
     """Kinds of record."""
 
     EVENT = 1
@@ -54,7 +54,7 @@ class Kind(IntEnum):
 
 
 @dataclass(frozen=True, eq=False)
-class Record:
+class LogRecord:
     """One record as read; views into the bytes read. `files` and `digests`, the BLAKE3 of each, only of version 2."""
 
     kind: int
@@ -65,8 +65,8 @@ class Record:
     digests: tuple[bytes, ...] = ()
 
 
-class Head(NamedTuple):
-    """Head of a record without a body: its JSON, not parsed, and the size of the whole record in bytes."""
+class RecordHeader(NamedTuple):
+    """RecordHeader of a record without a body: its JSON, not parsed, and the size of the whole record in bytes."""
 
     kind: int
     frame: int
@@ -111,7 +111,7 @@ def encoded(kind: int, index: int, head: Any, body: bytes = b"") -> bytes:
     return start + body + checksum(start, body)
 
 
-def read_at(data: memoryview, at: int) -> tuple[Record | Damage, int]:
+def read_at(data: memoryview, at: int) -> tuple[LogRecord | Damage, int]:
     """Reads the record that begins at a byte.
 
     Returns:
@@ -143,7 +143,7 @@ def read_at(data: memoryview, at: int) -> tuple[Record | Damage, int]:
     digests = tuple(blake3(file).digest() for file in files)
     if version == BY_FILE and checksum(start, *digests) != found:
         return Damage(at, end, "the record fails its checksum", index, kind), end
-    return Record(kind, index, head, body, files, digests), end
+    return LogRecord(kind, index, head, body, files, digests), end
 
 
 def _files(head: Any, body: memoryview) -> tuple[memoryview, ...]:
@@ -161,7 +161,7 @@ def _files(head: Any, body: memoryview) -> tuple[memoryview, ...]:
     return tuple(files)
 
 
-def records(data: bytes | memoryview) -> Iterator[Record | Damage]:
+def records(data: bytes | memoryview) -> Iterator[LogRecord | Damage]:
     """Yields every whole record of a log, and the damage between them, in order."""
     view = memoryview(data)
     at = 0
@@ -183,7 +183,7 @@ class Readable(Protocol):
         """Reads at most so many bytes; none at the end."""
 
 
-def streamed(file: Readable) -> Iterator[Head | Damage]:
+def streamed(file: Readable) -> Iterator[RecordHeader | Damage]:
     """Yields the heads of a log of small records, and the damage between them; the log need not fit in memory."""
     data, start, at, ended = b"", 0, 0, False
     while True:
@@ -205,7 +205,7 @@ def streamed(file: Readable) -> Iterator[Head | Damage]:
         at = after
 
 
-def _whole(data: bytes, at: int) -> Head | None:
+def _whole(data: bytes, at: int) -> RecordHeader | None:
     """Returns the record that begins at a byte, if it is whole and of version 1."""
     if len(data) - at < PREFIX:
         return None
@@ -219,7 +219,7 @@ def _whole(data: bytes, at: int) -> Head | None:
         return None
     if blake3(data[at : end - CHECKSUM]).digest(CHECKSUM) != data[end - CHECKSUM : end]:
         return None
-    return Head(kind, index, text, end - at)
+    return RecordHeader(kind, index, text, end - at)
 
 
 def _damage(data: bytes, at: int) -> tuple[Damage | None, int]:

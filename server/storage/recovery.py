@@ -17,7 +17,7 @@ from server.storage.definition import DefinitionError, begun_of
 from server.storage.disk import no_room
 from server.storage.events import (
     FrameAccepted,
-    FrameSetAside,
+    FrameFailed,
     Hashes,
     JournalEvent,
     PartAccepted,
@@ -33,7 +33,7 @@ from server.storage.layout import SceneFolder
 from server.storage.ledger import Ledger, frame_identity
 from server.storage.snapshot import events_of
 
-OF_STATES = (FrameSetAside, StateFound, StatesDeleted, WorkerDied)
+OF_STATES = (FrameFailed, StateFound, StatesDeleted, WorkerDied)
 """Events of one reconstruction: another one tries the frame again, and has other states."""
 NO_STATE = "the journal was lost, and there is no committed state of this frame"
 
@@ -46,7 +46,7 @@ class Recovered:
         folder: with the names of the reconstruction that was begun last.
         good: bytes of the journal that are whole. events: those that the journal lacks, applied already.
         sizes: bytes of each record of the frame log. damage: a sentence for each thing that was dropped.
-        remake: frames whose states are damaged or gone, with the reason, and whose pictures are held.
+        recompute: frames whose states are damaged or gone, with the reason, and whose pictures are held.
         first_report: of the first committed frame that can be read; empty where there is none.
     """
 
@@ -56,7 +56,7 @@ class Recovered:
     events: list[JournalEvent]
     sizes: dict[str, int]
     damage: list[str]
-    remake: dict[int, str] = field(default_factory=dict)
+    recompute: dict[int, str] = field(default_factory=dict)
     first_report: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -122,15 +122,15 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
     elif debris:
         remove(frames, debris)
     sizes = {name: size for name, size in sizes.items() if name not in debris}
-    remake = _remade(ledger, states, broken, _deletes_states(definition or {}, ledger))
-    damage.extend(f"frame {index}: {reason}" for index, reason in remake.items() if index not in states.damaged)
-    events += ledger.reconcile(states.indices, states.damaged, remake)
+    recompute = _remade(ledger, states, broken, _deletes_states(definition or {}, ledger))
+    damage.extend(f"frame {index}: {reason}" for index, reason in recompute.items() if index not in states.damaged)
+    events += ledger.reconcile(states.indices, states.damaged, recompute)
     if states.newest:
         ledger.frames.set_record(states.last, states.newest)
     for event in ledger.hopeless():  # its scene failed, and the service ended before it could say so of this one
         ledger.apply(event)
         events.append(event)
-    for entry in list(ledger.frames.held()):
+    for entry in list(ledger.frames.with_pictures()):
         lost = [name for name in entry.files if name not in sizes]
         if lost:
             ledger.frames.set_files(entry.index, tuple(name for name in entry.files if name in sizes))
@@ -138,7 +138,7 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
                 damage.append(f"frame {entry.index}: its record is gone from the frame log: {', '.join(lost)}")
         if entry.state == FrameState.QUEUED and (reason := _unusable(frames, entry.files, lost)):
             damage.append(f"frame {entry.index}: {reason}")
-            gone = FrameSetAside(index=entry.index, reason=reason)
+            gone = FrameFailed(index=entry.index, reason=reason)
             ledger.apply(gone)
             events.append(gone)
     good = reading.good
@@ -151,12 +151,12 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
         except OSError as error:
             if not no_room(error):
                 raise
-    return Recovered(folder, ledger, good, events, sizes, damage, remake, states.first)
+    return Recovered(folder, ledger, good, events, sizes, damage, recompute, states.first)
 
 
 def _unnamed(ledger: Ledger, sizes: dict[str, int]) -> set[str]:
     """Returns the records that no event names."""
-    named = {name for entry in ledger.frames.held() for name in entry.files}
+    named = {name for entry in ledger.frames.with_pictures() for name in entry.files}
     named |= {name for frame in ledger.open.values() for name in frame.files}
     return set(sizes) - named
 
@@ -179,7 +179,7 @@ def _remade(ledger: Ledger, states: _States, broken: bool, deletes: bool) -> dic
     oldest = min(sorted(states.times)[1:], default=0) if deletes else 0
     return {
         entry.index: states.damaged.get(entry.index, "its state is gone from the disk")
-        for entry in ledger.frames.held()
+        for entry in ledger.frames.with_pictures()
         if entry.state in (FrameState.QUEUED, FrameState.COMMITTED)
         and entry.index < states.last
         and entry.index not in states.times
@@ -209,7 +209,7 @@ def _found(folder: Path, names: list[str], ledger: Ledger, states: _States, brok
     for index, records in by_frame.items():
         entry = ledger.frames.get(index)
         without = entry is not None and entry.receipt is None
-        known = entry is not None and not (without and entry.state in (FrameState.SET_ASIDE, FrameState.COMMITTED))
+        known = entry is not None and not (without and entry.state in (FrameState.FAILED, FrameState.COMMITTED))
         if known or (entry is None and index != ledger.next_frame and not broken):
             continue
         for event in _events_of(folder, index, records, ledger, states):
@@ -236,7 +236,7 @@ def _events_of(folder: Path, index: int, names: list[str], ledger: Ledger, state
         return []
     known = index in states.times or index in states.damaged
     if ledger.frames.first <= index < states.last and not known:
-        return [accepted, FrameSetAside(index=index, reason=NO_STATE)]
+        return [accepted, FrameFailed(index=index, reason=NO_STATE)]
     return [accepted]
 
 

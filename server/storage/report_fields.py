@@ -7,7 +7,7 @@ from typing import Any
 
 from client.wire import FrameReportModel
 
-WIRE_NAMES = {"used": "used_cameras", "dropped": "dropped_cameras", "attempts": "tries", "held": "held_gaussians"}
+WIRE_NAMES = {"used": "used_cameras", "dropped": "dropped_cameras", "attempts": "tries", "frozen": "frozen_gaussians"}
 """Fields of a commit's record with another name on the wire; all others have the same (a test checks that)."""
 NOT_SENT = frozenset({"index", "time", "publish_seconds", "resumed"})
 """Fields of a commit's record that are not sent: the table has the first two, the third is added to ``seconds``."""

@@ -8,8 +8,8 @@ from client.wire import Budget, FrameState
 from server.storage.events import (
     BudgetChanged,
     FrameAccepted,
+    FrameFailed,
     FrameMissing,
-    FrameSetAside,
     FramesSkipped,
     JournalEvent,
     OpenFrame,
@@ -26,7 +26,7 @@ from server.storage.ledger import Ledger
 
 TOGETHER = 10_000
 """An event names at most so many frames: the head of a record is bounded."""
-OWN_ERROR = (FrameState.SET_ASIDE, FrameState.MISSING)
+OWN_ERROR = (FrameState.FAILED, FrameState.MISSING)
 """The error noted of a frame in such a state explains the state; of another frame, why its committed state is gone."""
 BEFORE = "before the journal was written anew"
 
@@ -78,8 +78,8 @@ def _of_frame(entry: FrameEntry, *, fatal: bool) -> Iterator[JournalEvent]:
     for own in [True] * note.own_deaths + [False] * note.other_deaths:
         yield WorkerDied(index=index, reason=BEFORE, own=own)
     match entry.state:
-        case FrameState.SET_ASIDE if note.error is not None:
-            yield FrameSetAside(index=index, reason=note.error, dropped=note.dropped, fatal=fatal)
+        case FrameState.FAILED if note.error is not None:
+            yield FrameFailed(index=index, reason=note.error, dropped=note.dropped, fatal=fatal)
         case FrameState.MISSING:
             yield FrameMissing(index=index, reason=note.error or "")
         case FrameState.SKIPPED:

@@ -17,8 +17,8 @@ from client.wire.stream import (
     SCENE_GONE,
     SCENE_RESTARTS,
     STREAM_PROTOCOL,
-    Gone,
     Hello,
+    SceneGone,
     StreamLimits,
     StreamProblem,
     Subscribe,
@@ -121,7 +121,7 @@ class Subscriber:
 
     def on_close(self, reason: str) -> None:
         """The scene is no more."""
-        self.outbox.close_with(Gone(reason=reason))
+        self.outbox.close_with(SceneGone(reason=reason))
 
     def on_restart(self) -> None:
         """The scene is another one from here on: the client connects anew, as after a restart of the service."""

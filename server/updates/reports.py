@@ -48,7 +48,7 @@ class FrameReports:
                 time=parts.time,
                 state=FrameState.OPEN,
                 received=parts.cameras,
-                held=True,
+                pictures_kept=True,
             )
         if entry.state != FrameState.COMMITTED or entry.deleted or entry.record is not None:
             return entry.report

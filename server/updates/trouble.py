@@ -26,10 +26,10 @@ class Trouble:
 
 def trouble_of(report: FrameReportModel) -> str | None:
     """Says why a scene is degraded whose newest finished frame has this report; None: it is not."""
-    if report.state == FrameState.SET_ASIDE:
+    if report.state == FrameState.FAILED:
         return f"frame {report.index} was set aside: {report.error}"
     if report.outcome is not None and report.outcome.degraded:
-        verb = "" if report.outcome.held else "committed in part: "
+        verb = "" if report.outcome.rejected else "committed in part: "
         return f"frame {report.index} was {verb}{report.degraded}"
     if report.dropped_cameras:
         left_out = "; ".join(f"{name}: {reason}" for name, reason in report.dropped_cameras.items())

@@ -16,21 +16,21 @@ from server.hub import Publisher
 from server.messages import (
     Broken,
     FrameCommitted,
-    FrameFailed,
     FrameReady,
     KeepStates,
-    Mended,
     Progressed,
     Ready,
+    RepairResult,
     Stalled,
     StatesRetained,
+    UpdateFailed,
     WaitsForNode,
 )
 from server.processes.kernels import STAGE
-from server.processes.placement import Ended
+from server.processes.placement import ProcessExit
 from server.processes.readers import Readers
-from server.repair.mending import DamageKind, DamageLog, Mending
-from server.storage.events import FrameSetAside, PicturesDeleted, StatesDeleted, WorkerDied
+from server.repair.repair_queue import DamageKind, DamageLog, RepairQueue
+from server.storage.events import FrameFailed, PicturesDeleted, StatesDeleted, WorkerDied
 from server.storage.ledger import SceneLog
 from server.updates.reports import FrameReports, of_first_report
 from server.updates.trouble import Trouble, last_trouble, trouble_of
@@ -44,7 +44,8 @@ class Updates:
     """The updates of one scene, and the worker that runs them.
 
     A frame that was acknowledged waits in the ledger. `begin` sends it to the worker as `FrameReady`. The worker
-    answers with `FrameCommitted` or `FrameFailed`, or it dies; `_commit`, `_set_aside` and `_after_death` record that.
+    answers with `FrameCommitted` or `UpdateFailed`, or it dies.
+    `_commit`, `_record_failure` and `_after_death` record that.
 
     Args:
         scene_log, damage, worker, mending, readers, reports, trouble, publisher, background: of the scene.
@@ -62,7 +63,7 @@ class Updates:
         scene_log: SceneLog,
         damage: DamageLog,
         worker: WorkerProcess,
-        mending: Mending,
+        mending: RepairQueue,
         readers: Readers,
         reports: FrameReports,
         trouble: Trouble,
@@ -75,7 +76,7 @@ class Updates:
         self._log = scene_log
         self._ledger = scene_log.ledger
         self._damage = damage
-        self._mending = mending
+        self._repair_queue = mending
         self._readers = readers
         self._reports = reports
         self._trouble = trouble
@@ -93,7 +94,7 @@ class Updates:
         self._rule: IngestSettings | None = None
         """The retention rule of states that the worker has not confirmed yet."""
         self._rule_sent = False
-        self._mending_again: asyncio.TimerHandle | None = None
+        self._repair_timer: asyncio.TimerHandle | None = None
         """Begins again where mending waits for room on the disk."""
         worker.listen(self._from_worker, self._worker_ended)
 
@@ -109,7 +110,7 @@ class Updates:
     @property
     def has_work(self) -> bool:
         """True while a frame is at work or waits, or something is mended or will be."""
-        mending = self._mending.at_work is not None or self._mending.trouble is not None
+        mending = self._repair_queue.at_work is not None or self._repair_queue.trouble is not None
         waits = bool(self._holding or self._waiting()) or self._rule is not None or self.worker.starts_again
         return self._index is not None or waits or mending
 
@@ -123,17 +124,17 @@ class Updates:
             return
         self._publisher.changed()
         ledger = self._ledger
-        if self._index is not None or self._holding or self._mending.at_work is not None:
+        if self._index is not None or self._holding or self._repair_queue.at_work is not None:
             return
         waiting = self._waiting()
         if not self.worker.ready:
-            if waiting or self._mending.trouble is not None or self._rule is not None:
+            if waiting or self._repair_queue.trouble is not None or self._rule is not None:
                 self.worker.start()
             return
         if self._rule is not None and not self._rule_sent:
             self._rule_sent = self.worker.send(KeepStates(self._rule))
         if not waiting:
-            if self._mending.waiting and (seconds := self._mending.begin()) > 0:
+            if self._repair_queue.waiting and (seconds := self._repair_queue.begin()) > 0:
                 self._begin_in(seconds)
             return
         index = waiting[0]
@@ -147,12 +148,12 @@ class Updates:
         self._publisher.changed()
 
     def _begin_in(self, seconds: float) -> None:
-        if self._mending_again is not None:
-            self._mending_again.cancel()
-        self._mending_again = asyncio.get_running_loop().call_later(seconds, self.begin)
+        if self._repair_timer is not None:
+            self._repair_timer.cancel()
+        self._repair_timer = asyncio.get_running_loop().call_later(seconds, self.begin)
 
     @contextmanager
-    def held(self) -> Iterator[None]:
+    def paused(self) -> Iterator[None]:
         """Gives the worker no frame inside; the one at work goes on."""
         self._holding += 1
         try:
@@ -177,13 +178,13 @@ class Updates:
             case StatesRetained():
                 self._rule = None
                 self._background.run(self._states_deleted(message.deleted))
-            case FrameFailed():
-                event = FrameSetAside(
+            case UpdateFailed():
+                event = FrameFailed(
                     index=message.index, reason=message.reason, dropped=message.dropped, fatal=message.fatal
                 )
-                self._background.run(self._set_aside(event))
-            case Mended():
-                frames = self._mending.mended(message)
+                self._background.run(self._record_failure(event))
+            case RepairResult():
+                frames = self._repair_queue.handle_result(message)
                 if frames:
                     self._readers.refresh(frames)
                 self.begin()
@@ -203,7 +204,7 @@ class Updates:
         """Brings the ledger in line with the committed states that a new worker has loaded, and goes on."""
         ledger = self._ledger
         newest = ledger.committed[-1] if ledger.committed else -1
-        again = self._mending.waiting.keys() | {i for i in ready.damaged if i < max(ready.indices, default=-1)}
+        again = self._repair_queue.waiting.keys() | {i for i in ready.damaged if i < max(ready.indices, default=-1)}
         events = ledger.reconcile(ready.indices, ready.damaged, again)
         for fault in ready.faults:
             log.warning("scene %s: %s", ledger.scene, fault)
@@ -219,7 +220,7 @@ class Updates:
             return
         self._trouble.sentence = last_trouble(self._ledger)
         self.worker.ready = True
-        self._mending.taken_up(ready.damaged)
+        self._repair_queue.taken_up(ready.damaged)
         self.begin()
         self._background.run(self.worker.sweep(), endless=True)
 
@@ -244,14 +245,14 @@ class Updates:
 
     async def _states_deleted(self, frames: tuple[int, ...]) -> None:
         if frames:
-            self._mending.retired(frames)
+            self._repair_queue.retired(frames)
             self._readers.refresh(frames)
             deleted = StatesDeleted(frames=frames)
             self._ledger.apply(deleted)
             self._publisher.changed()
             await self._log.write(deleted)
 
-    async def _set_aside(self, event: FrameSetAside) -> None:
+    async def _record_failure(self, event: FrameFailed) -> None:
         await self._log.write(event)
         self._ledger.apply(event)
         self.clock.end(committed=False)
@@ -285,7 +286,7 @@ class Updates:
 
     async def retain(self) -> None:
         """Deletes pictures from the frame log by the scene's rule, except those needed to make states again."""
-        gone = [i for i in self._log.deletable(self._keep_frames) if i not in self._mending.waiting]
+        gone = [i for i in self._log.deletable(self._keep_frames) if i not in self._repair_queue.waiting]
         if not gone:
             return
         names = [name for index in gone for name in self._ledger.frames[index].files]
@@ -307,7 +308,7 @@ class Updates:
 
     # The worker's life.
 
-    def _worker_ended(self, reason: Ended) -> None:
+    def _worker_ended(self, reason: ProcessExit) -> None:
         self.progress, self._rule_sent = None, False
         self.clock.end(committed=False)
         if self._ledger.fatal is not None:
@@ -318,7 +319,7 @@ class Updates:
         log.error("scene %s: %s", self._ledger.scene, self._trouble.sentence)
         self._background.run(self._after_death(reason, own, delay))
 
-    async def _after_death(self, reason: Ended, own: bool, delay: float) -> None:
+    async def _after_death(self, reason: ProcessExit, own: bool, delay: float) -> None:
         index, self._index = self._index, None
         if index is not None and self._ledger.frames[index].state == FrameState.UPDATING:
             self._ledger.move(index, FrameState.QUEUED)
@@ -329,7 +330,7 @@ class Updates:
                 # The worker may have died after its commit and before its message: then the next worker tells of it.
                 event = given_up(self._ledger.frames[index], death)
                 if event is not None and not await self._reports.is_committed(index):
-                    await self._set_aside(event)
+                    await self._record_failure(event)
         self._publisher.changed()
         self.worker.start_in(delay)
 
@@ -337,6 +338,6 @@ class Updates:
         """Starts no worker, gives no frame and tries no mending any more."""
         self._stopped = True
         self.worker.close()
-        self._mending.stop()
-        if self._mending_again is not None:
-            self._mending_again.cancel()
+        self._repair_queue.stop()
+        if self._repair_timer is not None:
+            self._repair_timer.cancel()

@@ -16,8 +16,8 @@ from scas4d_core.errors import message_of
 from server.health.oom import oom_kills
 from server.messages import SceneSpec
 from server.processes import worker
-from server.processes.placement import AnyProcess, Ended, Placement
-from server.storage.events import FrameSetAside, WorkerDied
+from server.processes.placement import AnyProcess, Placement, ProcessExit
+from server.storage.events import FrameFailed, WorkerDied
 from server.storage.fencing import FencingError, begin_epoch, sweep
 from server.storage.frame_table import FrameEntry
 
@@ -57,7 +57,7 @@ class WorkerDeaths:
         """Notes that the worker works: it has committed a frame."""
         self._in_a_row = self._lost_in_a_row = 0
 
-    def died(self, why: Ended) -> tuple[bool, float]:
+    def died(self, why: ProcessExit) -> tuple[bool, float]:
         """Notes that the worker is gone; where it is with its machine, another one is waited for less.
 
         Returns:
@@ -76,7 +76,7 @@ class WorkerDeaths:
         return own, delay
 
 
-def given_up(entry: FrameEntry, death: WorkerDied) -> FrameSetAside | None:
+def given_up(entry: FrameEntry, death: WorkerDied) -> FrameFailed | None:
     """Returns the event that sets the frame aside for this death, which is counted already; None: it is tried again."""
     own, other = entry.note.own_deaths, entry.note.other_deaths
     if own >= OWN_DEATHS:
@@ -85,7 +85,7 @@ def given_up(entry: FrameEntry, death: WorkerDied) -> FrameSetAside | None:
         reason = f"the worker was killed {other} times while it reconstructed this frame: {death.reason}"
     else:
         return None
-    return FrameSetAside(index=death.index, reason=reason)
+    return FrameFailed(index=death.index, reason=reason)
 
 
 class WorkerProcess:
@@ -108,7 +108,7 @@ class WorkerProcess:
         self.deaths = WorkerDeaths()
         self._placement = placement
         self._received: Callable[[Any], None]
-        self._ended: Callable[[Ended], None]
+        self._ended: Callable[[ProcessExit], None]
         self._process: AnyProcess | None = None
         self._next: asyncio.TimerHandle | None = None
         self._closed = False
@@ -118,7 +118,7 @@ class WorkerProcess:
         self._fencing: asyncio.Task[None] | None = None
         """Begins an epoch for the next process."""
 
-    def listen(self, received: Callable[[Any], None], ended: Callable[[Ended], None]) -> None:
+    def listen(self, received: Callable[[Any], None], ended: Callable[[ProcessExit], None]) -> None:
         """Sets the receiver of messages; to be called once, before the first start.
 
         Args:
@@ -151,7 +151,7 @@ class WorkerProcess:
         except Exception as error:  # whatever it is, the scene must not stand still
             if not isinstance(error, OSError | FencingError):
                 log.exception("scene %s", folder.name)
-            self._gone(Ended(None, f"the committed states cannot be taken over: {message_of(error)}"))
+            self._gone(ProcessExit(None, f"the committed states cannot be taken over: {message_of(error)}"))
         finally:
             self._fencing = None
 
@@ -200,7 +200,7 @@ class WorkerProcess:
         self._next = None
         self.start()
 
-    def _gone(self, reason: Ended) -> None:
+    def _gone(self, reason: ProcessExit) -> None:
         self.ready, self.life, self._process = False, None, None
         if not self._closed:
             self._ends = True

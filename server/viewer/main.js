@@ -19,7 +19,7 @@ import { Beside } from "./view/beside.js";
 import { LiveView } from "./view/live.js";
 
 const SLEEP_TRIES = 10;
-const FINISHED = ["committed", "set_aside", "missing", "skipped"];
+const FINISHED = ["committed", "failed", "missing", "skipped"];
 
 const view = new LiveView($("picture"), $("overlay"), {
   pick: (...at) => tracks.pick(...at),

@@ -29,7 +29,7 @@ def cluster(
     from client.cli.changes import parse_changes
     from client.cli.extras import need_server
     from client.importers.open_source import open_source
-    from studies.cluster.cost import measure, told
+    from studies.cluster.cost import measure, summarize
     from studies.cluster.nodes import Nodes
     from studies.running.study import Study, encoded_frames
 
@@ -38,7 +38,7 @@ def cluster(
     study = Study(work.resolve(), opened, encoded_frames(opened, frames), parse_changes(changes), {})
     with Nodes(count=3, cpus=3) as nodes:
         figures = measure(study, nodes.address, scenes=scenes, turns=turns, views=views, echo=typer.echo)
-    text = told(figures, scenes)
+    text = summarize(figures, scenes)
     typer.echo(text)
     write_page(out, text)
 
@@ -51,8 +51,8 @@ def head(
 
     Example: scripts/bench head --times 20
     """
-    from studies.cluster.silence import silences, told
+    from studies.cluster.silence import silences, summarize
 
-    text = told(silences(times, typer.echo))
+    text = summarize(silences(times, typer.echo))
     typer.echo(text)
     write_page(out, text)

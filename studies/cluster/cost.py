@@ -72,7 +72,7 @@ def measure(
     return figures
 
 
-def told(found: dict[str, CostFigures], scenes: int) -> str:
+def summarize(found: dict[str, CostFigures], scenes: int) -> str:
     """The figures as Markdown."""
     local, ray = found["local"], found["ray"]
     ratios = [there / here for here, there in zip(local.updates, ray.updates, strict=True)]

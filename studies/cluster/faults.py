@@ -37,7 +37,7 @@ SWEPT_S = 180.0
 def killed_nodes(
     study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, count: int, seed: int, echo: Echo
 ) -> ScenarioResult:
-    """`kill -9` of the node on which the scene's worker runs, `count` times, at random moments; a new one joins."""
+    """`kill -9` of the node on which the scene's worker runs, `count` times, at random moments; a new one parents."""
     random_ = random.Random(seed)
     moments = [random_.randrange(1, len(study.frames)) for _ in range(count)]
     pauses: list[float] = []

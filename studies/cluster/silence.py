@@ -124,7 +124,7 @@ def silences(count: int, echo: Callable[[str], None]) -> list[float]:
     return gaps
 
 
-def told(found: Sequence[float]) -> str:
+def summarize(found: Sequence[float]) -> str:
     """A sentence."""
     ordered = sorted(found)
     return (

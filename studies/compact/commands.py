@@ -27,11 +27,11 @@ def compact(
 
     Example: scas4d reconstruct captures/robot --out out/robot; scripts/bench compact captures/robot out/robot/states
     """
-    from studies.compact.compact import measure, told
+    from studies.compact.compact import measure, summarize
 
     changed = dict(one.split("=", 1) for one in bounds or ())
     figures = measure(capture, states, frames, {name: float(value) for name, value in changed.items()}, key_every)
-    text = told(figures)
+    text = summarize(figures)
     print(text)
     write_page(page, text)
 

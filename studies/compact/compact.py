@@ -16,8 +16,8 @@ from client.rig.sequence import there_and_back
 from scas4d_core import metrics
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.captures import Capture
-from scas4d_core.compact import Bounds, CompactReader, CompactWriter, Head
-from scas4d_core.compact.records import Kind, scan
+from scas4d_core.compact import Bounds, CompactReader, CompactWriter, FileHeader
+from scas4d_core.compact.records import RecordKind, scan
 from scas4d_core.compact.writer import KEY_EVERY
 from scas4d_core.engines.limits import DEFAULT, Limits, rig_limits
 from scas4d_core.errors import InputError
@@ -83,7 +83,7 @@ def measure(
     capture = open_source(folder)
     history = History.load(states)
     world = capture.full_rig.world_frame(Settings().scene.metres_per_unit)
-    head = Head(world, Bounds(**bounds), background=history.background)
+    head = FileHeader(world, Bounds(**bounds), background=history.background)
     if frames < len(history):
         raise InputError(f"frames is {frames}", f"give {len(history)} at least: every state is compared")
     grows = history.count > len(history.gaussians(history.indices[0]))
@@ -96,7 +96,7 @@ def measure(
             records = list(scan(opened, 0, file.name))
         kinds = {
             kind.name.lower(): float(np.mean(sizes))
-            for kind in Kind
+            for kind in RecordKind
             if (sizes := [record.size for record in records if record.kind is kind])
         }
         opening = _seconds(lambda: CompactReader(file).close())
@@ -130,7 +130,7 @@ def measure(
         )
 
 
-def told(found: CompactFigures) -> str:
+def summarize(found: CompactFigures) -> str:
     """The figures as Markdown."""
     kinds = ", ".join(f"{name} {size / 1e3:.1f}" for name, size in found.sizes.items())
     errors = ", ".join(f"{name} {value:.4f}" for name, value in found.errors.items())
@@ -150,7 +150,7 @@ def told(found: CompactFigures) -> str:
     )
 
 
-def _write(file: Path, head: Head, states: Iterator[Gaussians], key_every: int) -> list[float]:
+def _write(file: Path, head: FileHeader, states: Iterator[Gaussians], key_every: int) -> list[float]:
     """Seconds of the processor for each frame after the first."""
     seconds = []
     with CompactWriter(file, head, key_every) as writer:

@@ -130,7 +130,7 @@ def measure_adaptive(
         turns = Turns(("scas4d", name))
         for seed in range(tries):
             fixed, spare = (changed(settings_of(key), seed=seed) for key in turns.names)
-            turns.take(capture, (changed(fixed, still=-1.0), spare), frames(), out)
+            turns.take(capture, (changed(fixed, skip_tolerance=-1.0), spare), frames(), out)
         answer = {"sequence": what, **turns.row()}
         answers.append(answer)
         difference = answer["psnr"][name] - answer["psnr"]["scas4d"]

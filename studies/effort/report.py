@@ -40,7 +40,7 @@ def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report
     from scas4d_core.update.frame_update import FrameUpdate
 
     capture = open_source(folder)
-    settings = changed(settings_of("scas4d"), still=-1.0)
+    settings = changed(settings_of("scas4d"), skip_tolerance=-1.0)
     shares: list[float] = []
     stages: list[dict[str, float]] = []
     cpu: dict[bool, list[float]] = {True: [], False: []}

@@ -25,12 +25,12 @@ def exports(
     With ground truth, the moving parts of the whole capture's `glb-parts` are compared with the truth's poses.
     Needs the extras `exports` and `dev`. Example: scripts/bench exports captures/robot out/robot/states
     """
-    from studies.exports.exports import measure, told
+    from studies.exports.exports import measure, summarize
     from studies.exports.exports import sheet as sheet_of
     from studies.exports.part_truth import measure_asset, told_asset
 
     figures = measure(capture, states)
-    text = told(figures)
+    text = summarize(figures)
     if asset := measure_asset(capture, states):
         text += f"\n\nArticulated asset against the truth's poses:\n\n{told_asset(asset)}"
     print(text)

@@ -106,7 +106,7 @@ def measure(folder: Path, states: Path) -> list[ExportFigures]:
     return figures
 
 
-def told(figures: list[ExportFigures]) -> str:
+def summarize(figures: list[ExportFigures]) -> str:
     """The figures as Markdown."""
     rows = [f"| `{one.format}` | {one.size / 1e6:.2f} MB | {one.psnr:.1f} | {one.reader} |" for one in figures]
     return "\n".join(["| format | file | dB against the state | read by |", "|---|---|---|---|", *rows])

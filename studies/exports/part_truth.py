@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from client.importers.open_source import open_source
-from scas4d_core.captures.ground_truth import Part
+from scas4d_core.captures.ground_truth import TruePart
 from scas4d_core.exports.sequence import export_sequence
 from scas4d_core.query.parts import parts
 from scas4d_core.settings import Settings
@@ -161,7 +161,12 @@ def read_asset(file: Path, seconds: Float) -> list[Node]:
 
 
 def compare(
-    nodes: list[Node], wanted: list[Part], points: Float, part_id: NDArray[np.int64], frames: list[int], extent: float
+    nodes: list[Node],
+    wanted: list[TruePart],
+    points: Float,
+    part_id: NDArray[np.int64],
+    frames: list[int],
+    extent: float,
 ) -> list[PartFigures]:
     """Matches the parts of the truth with nodes, and compares their motion.
 

@@ -98,7 +98,7 @@ def read_convergence(out: Path, capture: str) -> Row | None:
 
 def once(settings: Settings) -> Settings:
     """The settings with one attempt of as many iterations a frame, the first too."""
-    update = settings.update.model_copy(update={"judge": False, "cold_longer": 1.0})
+    update = settings.update.model_copy(update={"reject_outliers": False, "cold_start_iterations": 1.0})
     return settings.model_copy(update={"update": update})
 
 

@@ -103,7 +103,7 @@ AXES: Mapping[str, tuple[Variant, ...]] = {
         _changed(f"{count:,} Gaussians", "static.max_gaussians", count) for count in (6_000, 12_000, 40_000)
     ),
     "max-scale": (Variant("max_scale 2 m", constants=((MAX_SCALE, 2.0),)),),
-    "covariance": (_changed("separate covariance", "update.covariance", "separate", "update.own_start=0"),),
+    "covariance": (_changed("separate covariance", "update.covariance", "separate", "update.deltas_start=0"),),
     "seeds": tuple(
         Variant(f"{name} {DEFAULT_ITERATIONS}, seed {seed}", name, seed=seed) for name in METHODS for seed in SEEDS[1:]
     ),

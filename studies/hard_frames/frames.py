@@ -124,7 +124,7 @@ def violations(case: FrameCase, steps: Sequence[FrameStep], size: Any) -> list[s
 def held(steps: Sequence[FrameStep], size: Any) -> list[str]:
     """The state stays as it was, and the report says why."""
     faults = [f"frame {step.report.index}: the state has changed" for step in steps if not step.kept]
-    return faults + [f"frame {s.report.index}: not said to be held" for s in steps if not s.report.outcome.held]
+    return faults + [f"frame {s.report.index}: not said to be held" for s in steps if not s.report.outcome.rejected]
 
 
 def left_out(names: Callable[[Any], Sequence[str]], first: int = 0, may: Sequence[str] = ()) -> Holds:

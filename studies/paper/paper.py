@@ -165,7 +165,7 @@ EXPERIMENTS: tuple[Experiment, ...] = (
         (ClaimSetting("Entangled", DEFAULT, {}), ClaimSetting("Separate", variant("separate covariance"), {})),
         (Claim("better pictures", "Entangled", "Separate", 1),),
         "The paper shows a picture of its wheel. Separate (`update.covariance`): the cascade moves means alone, and a "
-        "Gaussian's own ΔR and Δs are all that changes its covariance; they begin at once (`update.own_start` 0), "
+        "Gaussian's own ΔR and Δs are all that changes its covariance; they begin at once (`update.deltas_start` 0), "
         "not after 40 % of the iterations.",
     ),
     Experiment(

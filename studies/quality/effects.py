@@ -109,7 +109,7 @@ def variants(names: Sequence[str], settings: Settings) -> list[Pins]:
             raise ValueError(f"effect {name!r} is unknown; docs/effects.md lists all")
         one = effect(name)
         modes = ("off",) if not one.auto else ("off", "removed", "on")
-        refused = one.refused(settings) is not None
+        refused = one.refusal(settings) is not None
         for mode in modes:
             contradicts = mode != "removed" and any(contradictions(pinned(settings, {name: mode})))
             if not contradicts and not (refused and mode != "removed"):

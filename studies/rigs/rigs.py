@@ -115,8 +115,8 @@ def measured(
         began = time.perf_counter()
         report = scene.step(given.frame(index))
         seconds.append(time.perf_counter() - began)
-        held += report.outcome.held
-        unmoved += report.kept is Candidate.STILL
+        held += report.outcome.rejected
+        unmoved += report.kept is Candidate.PREVIOUS
     trained = [_psnr(scene, truth.rig, truth.frame(index)) for index in range(count)]
     row: Row = {
         "capture": given.name,

@@ -28,13 +28,13 @@ def scale(
 
     Example: NUMBA_NUM_THREADS=1 scripts/bench scale --sweep cameras
     """
-    from studies.scale.scale import FRAMES, SWEEPS, plot, run, told
+    from studies.scale.scale import FRAMES, SWEEPS, plot, run, summarize
 
     if unknown := set(sweep or []) - set(SWEEPS):
         raise typer.BadParameter(f"there is no sweep {sorted(unknown)[0]!r}; they are {', '.join(SWEEPS)}")
     counts = [count for count in frames or FRAMES if count]
     sizes_run = run(work.resolve(), sweep or list(SWEEPS), counts, typer.echo)
-    text = told(sizes_run)
+    text = summarize(sizes_run)
     typer.echo(text)
     write_page(out, text)
     if picture is not None:

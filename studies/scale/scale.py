@@ -145,7 +145,7 @@ def run(work: Path, sweeps: Sequence[str], frames: Sequence[int], echo: Echo) ->
     return {"sweeps": {name: [_kept(work, asdict(size)) for size in SWEEPS[name]] for name in sweeps}, "frames": grown}
 
 
-def told(found: Mapping[str, Any]) -> str:
+def summarize(found: Mapping[str, Any]) -> str:
     """Tables of costs and slopes, as Markdown."""
     lines = []
     for name, costs in found["sweeps"].items():

@@ -46,13 +46,13 @@ class Flips:
     """Outcome of the flipped bits.
 
     Attributes:
-        counts: noticed or harmless, by kind. remade, lost: frames whose state is another one, or gone.
+        counts: noticed or harmless, by kind. recomputed, lost: frames whose state is another one, or gone.
         unreported: frames whose state is as it was and whose report is gone.
         faults: what should not be.
     """
 
     counts: Counter[str] = field(default_factory=Counter)
-    remade: set[int] = field(default_factory=set)
+    recomputed: set[int] = field(default_factory=set)
     lost: set[int] = field(default_factory=set)
     unreported: set[int] = field(default_factory=set)
     faults: list[str] = field(default_factory=list)
@@ -96,7 +96,7 @@ def flips(study: Study, count: int, seed: int, echo: Callable[[str], None]) -> F
             counts.faults += [f"{said}: {fault}" for fault in one.faults]
         counts.faults += sender.check()
         states = digests(DataFolder(service.data).scene(scene).states)
-        others = counts.remade | counts.lost | counts.unreported
+        others = counts.recomputed | counts.lost | counts.unreported
         wrong = [index for index in expected if index not in others and states.get(index) != expected[index]]
         if wrong:
             counts.faults.append(f"states {wrong} are not bit-identical")
@@ -190,19 +190,19 @@ class _Flip:
             time.sleep(AGAIN_S)
         self._no_path(answer)
         report = self.service.frame(self.scene, index)
-        if answer.status_code == 404 and report.deleted and not report.held:
+        if answer.status_code == 404 and report.deleted and not report.pictures_kept:
             found.lost.add(index)
         elif answer.status_code != 200:
             self.faults.append(f"a view of frame {index} is answered {answer.status_code}: {answer.text}")
-        elif report.remade:
-            found.remade.add(index)
+        elif report.recomputed:
+            found.recomputed.add(index)
             truth = self.study.frames[index][0][self.study.capture.full_rig.names[0]]
             loss = _psnr(views[index], truth) - _psnr(answer.content, truth)
             if loss > CLOSE_DB:
                 self.faults.append(f"frame {index}, made again, is {loss:.1f} dB worse")
         elif report.iterations is None:
             found.unreported.add(index)
-        if answer.status_code == 200 and not report.remade and answer.content != views[index]:
+        if answer.status_code == 200 and not report.recomputed and answer.content != views[index]:
             self.faults.append(f"the view of frame {index} is another one")
 
     def _no_path(self, answer: httpx.Response) -> None:

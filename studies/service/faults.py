@@ -137,7 +137,7 @@ def damaged_log(
             if hit is not None:
                 report = victim.frame(scene, hit)
                 dropped += 1
-                if report.state != FrameState.SET_ASIDE or not report.error:
+                if report.state != FrameState.FAILED or not report.error:
                     wrong.append(f"frame {hit} is {report.state}, its record is damaged")
             elif not status.damage:
                 wrong.append("the damage was not said")
@@ -236,7 +236,7 @@ def flipped_bits(study: Study, count: int, seed: int, echo: Echo) -> ScenarioRes
     flipped = damage.flips(longer, count, seed, echo)
     counts = Counter(kind.rpartition(" ")[2] for kind in flipped.counts.elements())
     said = (
-        f"{counts['noticed']} noticed, {counts['harmless']} harmless; {len(flipped.remade)} states made again from "
+        f"{counts['noticed']} noticed, {counts['harmless']} harmless; {len(flipped.recomputed)} states made again from "
         f"pictures, {len(flipped.lost)} named as lost, {len(flipped.unreported)} without their report"
     )
     target = "each noticed or harmless; no wrong picture, no 500, the scene goes on"

@@ -99,14 +99,14 @@ class SimulatedCluster:
     # Failures.
 
     def join(self) -> None:
-        """A new node joins."""
+        """A new node parents."""
         node = Node(self._made, self._cpus, self._memory)
         self._made += 1
         self.nodes.append(node)
         self._changed(node)
 
     def kill(self, node: Node) -> None:
-        """Ends a node with all that runs on it; a new one joins after a while."""
+        """Ends a node with all that runs on it; a new one parents after a while."""
         self._fails(node, NodeState.DEAD)
         for process in tuple(node.processes):
             process.kill()

@@ -33,10 +33,10 @@ def simulate(
     need_server()
     from studies.simulation.simulate import Sizes
     from studies.simulation.simulate import simulate as run
-    from studies.simulation.targets import rows, told
+    from studies.simulation.targets import rows, summarize
 
     outcome = run(Sizes(scenes, nodes, failures, frames, seed, silent))
-    text = told(outcome)
+    text = summarize(outcome)
     typer.echo(text)
     write_page(out, text)
     if not all(row.reached for row in rows(outcome)):

@@ -40,7 +40,7 @@ ADRIFT_UPDATE_S: Range = (0.5, 5.0)
 PAUSE_S: Range = (1.0, 240.0)
 """A node is stopped, or cut off, for so long; for less than Ray takes to notice, too."""
 REPLACED_S: Range = (30.0, 120.0)
-"""A new node joins so long after one was killed, or came back too late."""
+"""A new node parents so long after one was killed, or came back too late."""
 DOWN_S: Range = (1.0, 20.0)
 """From the service's end to its next start."""
 RECOVER_S = 5.0

@@ -10,7 +10,7 @@ from typing import Any
 
 from server.cluster.needs import Needs
 from server.messages import SceneSpec, WaitsForNode
-from server.processes.placement import STOP_SECONDS, AnyProcess, Ended, Entry, Placement
+from server.processes.placement import STOP_SECONDS, AnyProcess, Entry, Placement, ProcessExit
 from studies.simulation.cluster import SimulatedCluster
 from studies.simulation.delays import LATE_S, LONGEST_SHARE, MESSAGE_S, STOPPING_S, TOLD_S, WAIT_S
 from studies.simulation.nodes import Node, NodeState
@@ -31,7 +31,7 @@ class SimulatedProcess:
         needs: Needs,
         spec: SceneSpec,
         on_message: Callable[[Any], None],
-        on_end: Callable[[Ended], None],
+        on_end: Callable[[ProcessExit], None],
     ) -> None:
         self.needs = needs
         self.over = False
@@ -117,7 +117,7 @@ class SimulatedProcess:
             self._times.hit(self.needs.scene, "node", self.node.failed_at, self._kind)
             began = self.work is not None
             why = "the node of its worker is lost" if began else "the actor of its worker ended: its node is lost"
-            self._cluster.later(TOLD_S, lambda: self._tell_end(Ended(None, why, lost=began)))
+            self._cluster.later(TOLD_S, lambda: self._tell_end(ProcessExit(None, why, lost=began)))
 
     def die(self) -> None:
         """The worker is killed; its node goes on."""
@@ -142,7 +142,7 @@ class SimulatedProcess:
         if self.over:
             self._cluster.give(self.node, self)
         else:
-            self._last_message = self._pass(lambda: self._tell_end(Ended(-signal.SIGKILL)), self._last_message)
+            self._last_message = self._pass(lambda: self._tell_end(ProcessExit(-signal.SIGKILL)), self._last_message)
 
     def _finish(self) -> None:
         """Ends on its node, as soon as that can be reached."""
@@ -181,7 +181,7 @@ class SimulatedProcess:
         if not self.over and self.work is None:
             self._on_message(WaitsForNode(f"its worker is not placed on a node yet; it needs {self.needs.words()}"))
 
-    def _tell_end(self, why: Ended) -> None:
+    def _tell_end(self, why: ProcessExit) -> None:
         if not self.over:
             self._let_go()
             if self.node is not None and (self.node.state is NodeState.DEAD or self.work is None or not why.lost):
@@ -215,7 +215,7 @@ class SimulatedPlacement(Placement):
         self._endings: set[asyncio.Task[None]] = set()
 
     def start(
-        self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[Ended], None]
+        self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[ProcessExit], None]
     ) -> AnyProcess:
         """See `Placement`."""
         assert isinstance(spec, SceneSpec)

@@ -9,7 +9,7 @@ from typing import Any
 
 from server.background import Background
 from server.messages import FrameCommitted, FrameReady, Ready, SceneSpec, WaitsForNode
-from server.processes.placement import STOP_SECONDS, Ended
+from server.processes.placement import STOP_SECONDS, ProcessExit
 from server.updates.worker_process import WorkerProcess
 from studies.simulation.delays import JOURNAL_S
 from studies.simulation.process import SimulatedPlacement
@@ -151,13 +151,13 @@ class SimulatedScene:
         self._background.run(self.worker.sweep(), endless=True)
         self._end_if_done()
 
-    def _worker_ended(self, reason: Ended) -> None:
+    def _worker_ended(self, reason: ProcessExit) -> None:
         self._times.want(self.plan.name, "loss", self.plan.kind)
         _, delay = self.worker.deaths.died(reason)
         self.trouble = f"the worker is gone: {reason}"
         self._background.run(self._after_death(reason, delay))
 
-    async def _after_death(self, reason: Ended, delay: float) -> None:
+    async def _after_death(self, reason: ProcessExit, delay: float) -> None:
         index, self._at = self._at, None
         if index is not None and not reason.lost:
             await asyncio.sleep(self._random.uniform(*JOURNAL_S))

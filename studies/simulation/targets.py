@@ -73,7 +73,7 @@ def rows(outcome: Outcome) -> list[Row]:
     return table_rows
 
 
-def told(outcome: Outcome) -> str:
+def summarize(outcome: Outcome) -> str:
     """The failures in a sentence, and the table, as Markdown."""
     sizes = outcome.sizes
     kinds = ", ".join(f"{kind} {count}" for kind, count in sorted(outcome.happened.items()))

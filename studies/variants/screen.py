@@ -39,8 +39,8 @@ class Contender:
         name: for tables. preset: that it starts from. changes: settings as ``"update.iterations=80"``.
         constants: of the method, by dotted name.
 
-    >>> Contender.read("longer: update.cold_longer=2 scas4d_core.update.warm_start.WARM_START=0.5")
-    Contender(name='longer', preset='scas4d', changes=('update.cold_longer=2',), constants=(('scas4d_core...', 0.5),))
+    >>> Contender.read("seeded: update.seed=2 scas4d_core.update.warm_start.WARM_START=0.5")
+    Contender(name='seeded', preset='scas4d', changes=('update.seed=2',), constants=(('scas4d_core...', 0.5),))
     >>> Contender.read("adaptive").preset
     'adaptive'
     """
@@ -62,7 +62,7 @@ class Contender:
             return cls(text.strip(), text.strip())
         given = rest.split()
         if not name.strip() or not all("=" in change for change in given):
-            raise ValueError(f"contender {text!r} cannot be read; write it as 'longer: update.cold_longer=2'")
+            raise ValueError(f"contender {text!r} cannot be read; write it as 'longer: update.cold_start_iterations=2'")
         presets = [change.removeprefix("preset=") for change in given if change.startswith("preset=")]
         constants = [change.split("=", 1) for change in given if change.startswith(CONSTANTS)]
         changes = [c for c in given if not c.startswith((CONSTANTS, "preset="))]

@@ -64,7 +64,7 @@ def test_a_scene_is_picked_and_shown_with_its_figures(page, service, finished):
 
 def test_the_effects_are_listed_with_what_switched_them(page, service):
     with Client(service.url, patience=HANG_S) as sdk:
-        id = start_scene(sdk, settings={"effects": {"standing_colour": "off"}})
+        id = start_scene(sdk, settings={"effects": {"static_colour": "off"}})
         push(sdk, id, 0)
         sdk.wait(id, 0)
         opened(page, service, id)
@@ -187,7 +187,7 @@ def test_a_bumped_camera_shows(page, service, finished):
 
 def test_a_scene_from_its_first_frame_to_its_deletion(page, service, finished):
     with Client(service.url, patience=HANG_S) as sdk:
-        id = start_scene(sdk, "young")
+        id = start_scene(sdk, "newborn")
         opened(page, service, id)
         until(page, "document.querySelector('#curtain h2').innerText === 'Waiting for the first frame'")
         assert page.locator("#time").is_disabled()

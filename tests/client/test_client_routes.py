@@ -103,7 +103,7 @@ def test_pause_close_missing_and_listings(service):
             assert client.declare_missing(scene.id, 2, "lost").error
             assert client.scene(scene.id).state == "paused"
             assert not client.resume(scene.id).paused
-            assert client.wait(scene.id, 1).state in ("committed", "set_aside")
+            assert client.wait(scene.id, 1).state in ("committed", "failed")
             listed = client.frames(scene.id, first=1)
             assert [(report.index, report.state) for report in listed.frames][1] == (2, "missing")
             assert client.frames(scene.id, limit=1).next == 1

@@ -143,9 +143,9 @@ def test_resumed_after_any_frame_it_goes_on_with_the_same_bits(kind, index, undi
 def test_the_scenes_are_what_they_should_be(undisturbed):
     """Otherwise the test above says little: labels are learnt late, exposures differ from 1."""
     scene, _ = undisturbed("without masks")
-    relabelled = [scene.history.report(index).get("relabelled") for index in INDICES]
-    assert relabelled[0] is None
-    assert any(relabelled[1:])
+    learn_labels = [scene.history.report(index).get("learn_labels") for index in INDICES]
+    assert learn_labels[0] is None
+    assert any(learn_labels[1:])
     assert 0 < scene._prepared.carried.labels.sum() < len(BOX)
     scene, _ = undisturbed("masks, floor, image scale and exposures")
     assert any((exposure != [1, 0]).any() for exposure in scene._fixed.exposures.values())

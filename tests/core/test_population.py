@@ -15,11 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.effects import effect as effect_module
-from scas4d_core.effects.evidence import Seen
+from scas4d_core.effects.evidence import FrameObservation
 from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.first_frame.static_result import StaticResult
+from scas4d_core.recompute import recompute
 from scas4d_core.reconstruction import Reconstruction
-from scas4d_core.remake import remake
 from scas4d_core.robust.solve_frame import FrameSolver, Solved
 from scas4d_core.robust.update_input import UpdateInput
 from scas4d_core.settings import SceneSettings, Settings, StaticSettings, UpdateSettings
@@ -49,7 +49,7 @@ PLAN = plan(BIRTHS, RETIRED, REVIVED)
 
 
 @pytest.fixture
-def populated(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def add_and_retire_gaussians(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     install(monkeypatch, PLAN)
     yield
     effect_module.effect.cache_clear()
@@ -77,7 +77,7 @@ def assert_same(one: History, other: History) -> None:
     assert one.lives(one.ids) == other.lives(other.ids)
 
 
-def test_they_come_and_go(populated: None) -> None:
+def test_they_come_and_go(add_and_retire_gaussians: None) -> None:
     scene = start(History(), masks=True)
     rows = [len(scene._prepared.updater.hierarchy.rows)]
     reports = []
@@ -103,14 +103,16 @@ def test_they_come_and_go(populated: None) -> None:
     assert carried["seen"].shape == ()
 
 
-def test_what_effects_carry_is_lengthened_by_the_founders(populated: None) -> None:
+def test_what_effects_carry_is_lengthened_by_the_founders(add_and_retire_gaussians: None) -> None:
     scene = go_on(start(History(), masks=True), FRAMES[True][:3])
     assert scene._prepared.carried.effects[NAME]["rows"][-4:].tolist() == [3, 0, 3, COUNT - 1]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("masks", [True, False])
-def test_resumed_after_any_frame_it_goes_on_with_the_same_bits(populated: None, masks: bool, tmp_path: Path) -> None:
+def test_resumed_after_any_frame_it_goes_on_with_the_same_bits(
+    add_and_retire_gaussians: None, masks: bool, tmp_path: Path
+) -> None:
     whole = start(History(tmp_path / "live"), masks)
     frames = FRAMES[masks]
     for frame in frames[1:]:
@@ -148,12 +150,12 @@ def test_an_effect_that_leaves_rows_alone_changes_no_bit(monkeypatch: pytest.Mon
     effect_module.effect.cache_clear()
 
 
-def test_a_state_made_again_has_the_born_of_its_frame(populated: None, tmp_path: Path) -> None:
+def test_a_state_made_again_has_the_born_of_its_frame(add_and_retire_gaussians: None, tmp_path: Path) -> None:
     whole = go_on(start(History(tmp_path), masks=True), FRAMES[True])
     (tmp_path / "frame_000003.npz").write_bytes(b"")
     history = History.open(tmp_path)
-    report = remake(RIG, SETTINGS, history, 2, FRAMES[True][3], {})
-    assert report["remade"]
+    report = recompute(RIG, SETTINGS, history, 2, FRAMES[True][3], {})
+    assert report["recomputed"]
     made = History.load(tmp_path).gaussians(3)
     assert len(made) == COUNT + 6
     np.testing.assert_array_equal(made.retired, whole.history.gaussians(3).retired)
@@ -166,7 +168,7 @@ def test_a_state_made_again_has_what_came_back_where_it_was_then(
 ) -> None:
     rows, far = np.array([3, 4, 5, 40]), np.float32([0.4, -0.3, 0.0])
 
-    def populated(seen: Seen) -> UpdateResult:
+    def add_and_retire_gaussians(seen: FrameObservation) -> UpdateResult:
         state = seen.result.gaussians
         if seen.index == 2:
             state = state.retire(rows)
@@ -176,12 +178,12 @@ def test_a_state_made_again_has_what_came_back_where_it_was_then(
             state = state.replace(means=means).revive(rows)
         return replace(seen.result, gaussians=state)
 
-    install(monkeypatch, populated)
+    install(monkeypatch, add_and_retire_gaussians)
     whole = go_on(start(History(tmp_path), masks=True), FRAMES[True])
     then = whole.history.gaussians(4)
     (tmp_path / "frame_000004.npz").write_bytes(b"")
     history = History.open(tmp_path)
-    remake(RIG, SETTINGS, history, 3, FRAMES[True][4], {})
+    recompute(RIG, SETTINGS, history, 3, FRAMES[True][4], {})
     made = History.load(tmp_path).gaussians(4)
     assert not made.retired.any()
     off = np.linalg.norm(made.means - then.means, axis=1)
@@ -190,9 +192,9 @@ def test_a_state_made_again_has_what_came_back_where_it_was_then(
     effect_module.effect.cache_clear()
 
 
-def test_a_copy_aside_goes_on_with_the_born(populated: None) -> None:
+def test_a_copy_aside_goes_on_with_the_born(add_and_retire_gaussians: None) -> None:
     scene = go_on(start(History(), masks=True), FRAMES[True][:4])
-    aside = Reconstruction.aside(RIG, SETTINGS, scene.history, 3)
+    aside = Reconstruction.fork(RIG, SETTINGS, scene.history, 3)
     aside.step(FRAMES[True][4])
     assert len(aside.history.newest) == COUNT + 6
     assert scene.history.indices == [0, 1, 2, 3]
@@ -200,7 +202,7 @@ def test_a_copy_aside_goes_on_with_the_born(populated: None) -> None:
 
 @pytest.mark.parametrize(
     ("births", "fault"),
-    [(([3], [COUNT]), "founder"), (([3], [3, 4]), "joins"), (([3], []), "joins")],
+    [(([3], [COUNT]), "parent"), (([3], [3, 4]), "parents"), (([3], []), "parents")],
 )
 def test_an_effect_that_breaks_the_rules_is_named(
     births: tuple[list[int], list[int]], fault: str, monkeypatch: pytest.MonkeyPatch
@@ -226,7 +228,7 @@ def test_births_have_their_time_in_the_budget(monkeypatch: pytest.MonkeyPatch) -
         ends.append(given.end)
         return asked(self, given)
 
-    def populated(seen: Seen) -> UpdateResult:
+    def add_and_retire_gaussians(seen: FrameObservation) -> UpdateResult:
         assert seen.time.end is not None
         ends.append(seen.time.end)
         if seen.index == 2:
@@ -234,7 +236,7 @@ def test_births_have_their_time_in_the_budget(monkeypatch: pytest.MonkeyPatch) -
         return seen.result
 
     monkeypatch.setattr(FrameSolver, "run", run)
-    install(monkeypatch, populated)
+    install(monkeypatch, add_and_retire_gaussians)
     scene = start(History(), masks=True, settings=SETTINGS)
     scene.set_budget(budget_ms=1000.0)
     reports = [scene.step(frame) for frame in FRAMES[True][1:5]]

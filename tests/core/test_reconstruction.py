@@ -31,7 +31,7 @@ WORLD = WorldFrame(np.array([4.0, -7.0, 11.0]), METRES)
 SETTINGS = Settings(
     scene=SceneSettings(metres_per_unit=METRES),
     static=StaticSettings(iterations=300, max_gaussians=600),
-    update=UpdateSettings(iterations=40, clusters=(2, 12, 48), rate_end=0.1),
+    update=UpdateSettings(iterations=40, clusters=(2, 12, 48), final_rate=0.1),
 )
 
 
@@ -70,7 +70,7 @@ def start(settings: Settings = SETTINGS, frame: Frame = FRAMES[0], world: WorldF
 def shortened(**changes: object) -> Settings:
     """Few iterations; changes of ``update``."""
     static = SETTINGS.static.model_copy(update={"iterations": 20})
-    update = SETTINGS.update.model_copy(update={"iterations": 3, "cold_longer": 1.0, **changes})
+    update = SETTINGS.update.model_copy(update={"iterations": 3, "cold_start_iterations": 1.0, **changes})
     return SETTINGS.model_copy(update={"static": static, "update": update})
 
 
@@ -247,10 +247,10 @@ def test_what_seems_to_move_in_a_frame_that_is_held_is_not_learnt() -> None:
     with pytest.MonkeyPatch.context() as patch:
         unmet(patch)
         held = scene.step(frames[2])
-    assert held.outcome is FrameOutcome.HELD_UNMET
+    assert held.outcome is FrameOutcome.REJECTED_MISFIT
     assert held.moving == held.gaussians
     assert scene.history.gaussians(frames[2].index).moving.all()
-    assert not scene.history.report(frames[2].index)["relabelled"]
+    assert not scene.history.report(frames[2].index)["learn_labels"]
     back = replace(frames[1], index=15, time=frames[2].time + 1 / 30)
     assert scene.step(back).moving == other.step(frames[1]).moving < held.gaussians
 
@@ -275,7 +275,7 @@ def test_pictures_that_were_not_believed_are_not_taken_for_what_stands() -> None
         unmet(patch)
         for index in (11, 12):
             report = scene.step(replace(FRAMES[1], index=index, time=5 + index / 1000))
-            assert report.outcome is FrameOutcome.HELD_UNMET
+            assert report.outcome is FrameOutcome.REJECTED_MISFIT
     back = scene.step(replace(FRAMES[0], index=13, time=5.03))
     assert (back.attempts, back.degraded) == (["the same pictures again"], None)
 

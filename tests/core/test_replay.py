@@ -19,7 +19,9 @@ from scas4d_core.storage.history import History, UnreadableFrameError
 BOX, RIG = make_box(), make_rig()
 TURN = Rotation.from_rotvec([0, 0.06, 0])
 FRAMES = [take_frame(k, 0.1 * k, moved(BOX, TURN**k, k * SHIFT), RIG) for k in range(5)]
-SETTINGS = Settings(update=UpdateSettings(iterations=6, clusters=(2, 12), still=0.5, stop_gain=0.5, budget_ms=5))
+SETTINGS = Settings(
+    update=UpdateSettings(iterations=6, clusters=(2, 12), skip_tolerance=0.5, stop_gain=0.5, budget_ms=5)
+)
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +48,7 @@ def test_it_is_the_update_with_so_many_iterations_and_neither_clock_nor_stop_rul
     assert (found.iterations, found.frames, len(told)) == (12, 3, 4)
     assert digests(folder) == before
     plain = Settings(update=SETTINGS.update.model_copy(update={"iterations": 12, "budget_ms": None, "stop_gain": 0.0}))
-    plain = plain.model_copy(update={"update": plain.update.model_copy(update={"still": -1.0})})
+    plain = plain.model_copy(update={"update": plain.update.model_copy(update={"skip_tolerance": -1.0})})
     scene = Reconstruction.start(RIG, FRAMES[0], plain, static=StaticResult(BOX, {}, [0.5]))
     reports = [scene.step(frame) for frame in FRAMES[1:]]
     assert [len(report.loss) for report in reports] == [36, 12, 12, 12]  # the first finds the motion
@@ -70,9 +72,9 @@ def test_it_starts_from_any_committed_frame_and_refuses_others(folder):
 def test_frames_that_were_not_met_do_not_count_unless_all_are():
     def report(milliseconds, error, **more):
         seconds = {"decode": milliseconds / 1000}
-        return FrameReport(0, 0.0, 5, seconds, [0.1], 30.0, 1, 1, errors={"end": error, "still": 9.0}, **more)
+        return FrameReport(0, 0.0, 5, seconds, [0.1], 30.0, 1, 1, errors={"end": error, "previous": 9.0}, **more)
 
-    clean, held = report(10, 0.1), report(99, 0.9, degraded="held as it was: dark", kept="still")
+    clean, held = report(10, 0.1), report(99, 0.9, degraded="held as it was: dark", kept="previous")
     tried = report(50, 0.5, attempts=["as set: 9 are not finite", "smaller steps"])
     found = summary(5, [clean, held, tried])
     assert (found.milliseconds, found.error, found.frames) == (pytest.approx(10), 0.1, 1)

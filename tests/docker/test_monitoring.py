@@ -14,7 +14,7 @@ from prometheus_client import Metric
 
 from client.wire import Cluster, Node
 from server import counters
-from server.health.metrics import State
+from server.health.metrics import ServiceState
 from server.settings import ServerSettings
 
 DOCKER = Path(__file__).parents[2] / "docker"
@@ -40,7 +40,7 @@ def families(tmp_path_factory: pytest.TempPathFactory) -> list[Metric]:
     room = {"cpus": 8, "cpus_taken": 1, "gpus": 0, "memory_mb": 16_000, "memory_taken_mb": 700}
     node = Node(id="n", host="h", alive=True, scenes=["s"], **room)
     cluster = Cluster(placement="ray", nodes=[node], waiting=[])
-    state = State(settings, [], 0, 1.0, {"idle": 0}, cluster)
+    state = ServiceState(settings, [], 0, 1.0, {"idle": 0}, cluster)
     return [*counters.registry.collect(), *state.collect()]
 
 

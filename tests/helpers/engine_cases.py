@@ -44,7 +44,7 @@ class Case:
         count = len(self.rows)
         standard = AttemptStart(
             layers=((0.02, 0.02, 0.005),) * len(CLUSTERS), position=0.002, rotation=0.01, scale=0.01,
-            colour=0.01, colour_standing=0.005, beta1=0.8, beta2=0.95,
+            colour=0.01, static_colour=0.005, beta1=0.8, beta2=0.95,
             samples=[np.arange(0, count, 2), np.arange(1, count, 2)],
             gains=np.ones((len(self.views), 3), np.float32) if self.plan.camera_gains else None,
         )  # fmt: skip

@@ -152,7 +152,7 @@ class FakeReconstruction:
         known = self.history.indices
         before = self.history.gaussians(known[-1]).colours[0, 0] if known else None
         red = int(next(iter(frame.images.values()))[0, 0, 0])
-        outcome = {HELD: "held_unmet", STANDS: "stood"}.get(red, "updated")
+        outcome = {HELD: "rejected_misfit", STANDS: "unchanged"}.get(red, "updated")
         record = {
             **asdict(report),
             "outcome": outcome,
@@ -161,9 +161,9 @@ class FakeReconstruction:
             **(notes or {}),
         }
         if red == HELD:
-            record |= {"degraded": "held as it was: the fake was told so", "kept": "still", "used": []}
+            record |= {"degraded": "held as it was: the fake was told so", "kept": "previous", "used": []}
         if red == STANDS:
-            record |= {"iterations": 0, "kept": "still", "used": []}
+            record |= {"iterations": 0, "kept": "previous", "used": []}
         if red == LEAVES_OUT:
             record["dropped"] = {**record["dropped"], "c1": "it shows nothing"}
             out = {"what": "camera_left_out", "camera": "c1", "evidence": "left out of this frame: it shows nothing"}
@@ -182,7 +182,7 @@ class FakeReconstruction:
             {"iterations": first, "milliseconds": MS_EACH * first, "loss": 0.5},
             {"iterations": self.iterations, "milliseconds": MS_EACH * self.iterations, "loss": 0.25},
         ]
-        record["errors"] = {"still": 0.5, "end": 1 / self.iterations}
+        record["errors"] = {"previous": 0.5, "end": 1 / self.iterations}
         record |= {"kept": record.get("kept", "end"), "attempts": ["as set"], "threads": 2}
         self.history.append(frame.index, frame.time, state(self.points, frame.index, before, red), record)
         return report
@@ -192,7 +192,7 @@ class FakeReconstruction:
         obey(frame)
         return self.commit(frame, dropped, notes)
 
-    def set_budget(self, *, iterations=None, budget_ms=None, stop_gain=None, still=None):
+    def set_budget(self, *, iterations=None, budget_ms=None, stop_gain=None, skip_tolerance=None):
         self.iterations = int(budget_ms / MS_EACH) if budget_ms else iterations or ITERATIONS
 
     def write_checkpoint(self, index):
@@ -242,7 +242,7 @@ class FakeCommitted:
         path.write_bytes(b"ply\n" + str(index).encode())
 
 
-def remake(rig, settings, history, base, frame, budget, *, dropped=None, notes=None):
+def recompute(rig, settings, history, base, frame, budget, *, dropped=None, notes=None):
     obey(frame)
     first = history.indices[0]
     copy = History()
@@ -250,7 +250,7 @@ def remake(rig, settings, history, base, frame, budget, *, dropped=None, notes=N
     points = history.gaussians(first).means - np.array([STEP_M * first, 0, 0])
     scene = FakeReconstruction(points, copy)
     scene.set_budget(**budget)
-    scene.commit(frame, dropped, {**(notes or {}), "remade": True})
+    scene.commit(frame, dropped, {**(notes or {}), "recomputed": True})
     report = copy.report(frame.index)
     history.replace(frame.index, frame.time, copy.gaussians(frame.index).arrays(), report)
     return report
@@ -288,7 +288,7 @@ def install(**others):
     of_core = {
         "scas4d_core.reconstruction": {"Reconstruction": FakeReconstruction},
         "scas4d_core.query.committed": {"CommittedScene": FakeCommitted},
-        "scas4d_core.remake": {"remake": remake},
+        "scas4d_core.recompute": {"recompute": recompute},
         "scas4d_core.replay": {"replay": replay},
         "scas4d_core.warm_up": {
             "warm_up": warm_up,

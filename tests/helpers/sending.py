@@ -59,7 +59,7 @@ def finished(http, id, index):
 
     def over():
         reports.append(http.get(f"/v1/scenes/{id}/frames/{index}").json())
-        return reports[-1].get("state") in ("committed", "set_aside", "missing", "skipped")
+        return reports[-1].get("state") in ("committed", "failed", "missing", "skipped")
 
     wait_for(over)
     return reports[-1]

@@ -94,7 +94,9 @@ def background_colour(text: str) -> tuple[float, float, float]:
 
 
 def _compile_kernels(bars: Bars) -> None:
-    from scas4d_core.compilation.manifest import Group
+    from scas4d_core.compilation.manifest import KernelGroup
     from scas4d_core.warm_up import warm_up_elsewhere
 
-    warm_up_elsewhere((Group.FIRST_FRAME,), told=lambda done, total: bars("compiling the kernels", done, total))
+    warm_up_elsewhere(
+        (KernelGroup.FIRST_FRAME,), on_progress=lambda done, total: bars("compiling the kernels", done, total)
+    )

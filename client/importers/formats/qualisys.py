@@ -44,7 +44,7 @@ WHOLE = 0.1
 
 
 @dataclass
-class _Camera:
+class _QualisysCamera:
     """The attributes of one camera and of the elements in it."""
 
     own: Mapping[str, str]
@@ -64,18 +64,18 @@ def read_qualisys(path: Path) -> Calibration:
     return calibration_of_cameras(path, [_lens(path, camera) for camera in video], markers, why)
 
 
-def _films(camera: _Camera) -> bool:
+def _films(camera: _QualisysCamera) -> bool:
     model = camera.own.get("model", "none").lower()
     return "video" in model or model == "none"
 
 
-def _cameras(path: Path) -> list[_Camera]:
+def _cameras(path: Path) -> list[_QualisysCamera]:
     """The cameras of the file. Documents that define entities are refused: no calibration does."""
-    cameras: list[_Camera] = []
+    cameras: list[_QualisysCamera] = []
 
     def started(name: str, attributes: dict[str, str]) -> None:
         if name == "camera":
-            cameras.append(_Camera(attributes))
+            cameras.append(_QualisysCamera(attributes))
         elif cameras and name in PARTS:
             cameras[-1].parts[name] = attributes
 
@@ -98,7 +98,7 @@ def _cameras(path: Path) -> list[_Camera]:
     return cameras
 
 
-def _lens(path: Path, camera: _Camera) -> LensCamera:
+def _lens(path: Path, camera: _QualisysCamera) -> LensCamera:
     name = camera.own.get("serial", "")
     where = f"{path}: camera {name!r}"
 

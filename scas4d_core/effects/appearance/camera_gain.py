@@ -17,11 +17,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.effects.effect import Effect, Group
-from scas4d_core.effects.evidence import Evidence, Seen
+from scas4d_core.effects.effect import Effect, EffectGroup
+from scas4d_core.effects.evidence import Evidence, FrameObservation
 from scas4d_core.engines.exposure import CAMERAS, FOOT, exposure_of, gain_of
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.update.parts import Array, Arrays, Attempt, Part, PlanBuilder
+from scas4d_core.update.parts import Array, Arrays, Attempt, PlanBuilder, UpdatePart
 
 NAME = "camera_gain"
 POWER = 2.4
@@ -41,7 +41,7 @@ def known_gains(exposures: dict[str, Array], carried: Mapping[str, Arrays], name
     return {name: exposure_of(gain) for name, gain in zip(names, carried[NAME]["gains"], strict=True)}
 
 
-class CameraGains(Part):
+class CameraGains(UpdatePart):
     """Where the gains of an update start, and what they leave for the next one."""
 
     def __init__(self, builder: PlanBuilder) -> None:
@@ -69,7 +69,7 @@ def _centre(gains: Array) -> Array:
     return centre
 
 
-def spread_of(seen: Seen) -> float | None:
+def spread_of(seen: FrameObservation) -> float | None:
     """Standard deviation over the cameras of the colour of their gains of light; None: untold.
 
     Means of the pictures and of their renderings tell it. What all channels of a camera share has no say: a thing
@@ -92,7 +92,7 @@ def spread_of(seen: Seen) -> float | None:
 class CameraGain(Effect):
     """A gain for each camera and channel, read off the renderings of an update."""
 
-    def evidence(self, seen: Seen) -> Evidence | None:
+    def evidence(self, seen: FrameObservation) -> Evidence | None:
         """How much the cameras' gains differ: those that are known, times what their pictures still lack."""
         spread = spread_of(seen)
         return (
@@ -109,7 +109,7 @@ class CameraGain(Effect):
 
 EFFECT = CameraGain(
     name=NAME,
-    group=Group.APPEARANCE,
+    group=EffectGroup.APPEARANCE,
     says="Each camera has a gain per channel, which may drift.",
     gauge="Per channel the product over the cameras is 1: what all cameras share is light, and goes into the colours.",
     cost="the median over about 4,000 pixels per iteration, 1 % of an update",

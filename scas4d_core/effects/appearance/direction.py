@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.effects.evidence import Evidence
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.update.parts import Array, Attempt, Part, PlanBuilder
+from scas4d_core.update.parts import Array, Attempt, PlanBuilder, UpdatePart
 
 if TYPE_CHECKING:
-    from scas4d_core.effects.evidence import Seen
+    from scas4d_core.effects.evidence import FrameObservation
 
 TURNED_TOGETHER = 32
 """Gaussians whose places tell the rotation of a normal."""
@@ -57,7 +57,7 @@ def neighbourhoods(means: Array) -> NDArray[np.int64]:
     return nearest.reshape(count, -1)
 
 
-class DirectionPart(Part):
+class DirectionPart(UpdatePart):
     """Turns the gloss with the deformation; does nothing in a scene whose frame 0 had none."""
 
     def __init__(self, builder: PlanBuilder) -> None:
@@ -66,7 +66,7 @@ class DirectionPart(Part):
 
     def end(self, attempt: Attempt, state: Gaussians) -> Gaussians:
         """Θ_t has the gloss turned with its neighbourhood, where it moved."""
-        if state.gloss is None or state.environment is None or attempt.kept is Candidate.STILL:
+        if state.gloss is None or state.environment is None or attempt.kept is Candidate.PREVIOUS:
             return state
         if self._near is None:
             self._near = neighbourhoods(self._roots[: len(state.gloss)])
@@ -78,7 +78,7 @@ class DirectionPart(Part):
 class Direction(Effect):
     """Waits for the evidence of frame 0."""
 
-    def evidence(self, seen: Seen) -> Evidence | None:
+    def evidence(self, seen: FrameObservation) -> Evidence | None:
         """The share of the squared error of a few pictures that the gloss takes away."""
         from scas4d_core.update.best_state import spread
 
@@ -103,7 +103,7 @@ class Direction(Effect):
 
 EFFECT = Direction(
     name="direction",
-    group=Group.APPEARANCE,
+    group=EffectGroup.APPEARANCE,
     says="Colour depends on direction: glossy objects mirror lights and surroundings, which stay as the objects move.",
     gauge="The environment sums to zero over the sphere: what is seen from everywhere is colour.",
     cost="two passes over the Gaussians per rendered view; a trial in frame 0, which takes half as long again where on",

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.effects.effect import Effect, Group, refused_at_zero
-from scas4d_core.effects.evidence import Evidence, Seen
+from scas4d_core.effects.effect import Effect, EffectGroup, refusal_at_zero
+from scas4d_core.effects.evidence import Evidence, FrameObservation
 from scas4d_core.update.parts import PlanBuilder
 
 if TYPE_CHECKING:
@@ -73,11 +73,11 @@ def change_of_light(before: Gaussians, after: Gaussians, centre: Double) -> floa
 class Light(Effect):
     """Faster colours."""
 
-    def refused(self, settings: Settings) -> tuple[str, str] | None:
+    def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Refused where no colours of what moves are learnt."""
-        return refused_at_zero(settings, "rate_colour")
+        return refusal_at_zero(settings, "rate_colour")
 
-    def evidence(self, seen: Seen) -> Evidence | None:
+    def evidence(self, seen: FrameObservation) -> Evidence | None:
         """How much the colours change together from a frame to the next."""
         if not seen.views:
             return None
@@ -93,7 +93,7 @@ class Light(Effect):
 
 EFFECT = Light(
     name="light",
-    group=Group.APPEARANCE,
+    group=EffectGroup.APPEARANCE,
     says="While the light changes, colours follow faster, those of moving Gaussians as fast as those of static ones.",
     gauge="Colours hold the light of their frame; differences between cameras, and flicker, are gains.",
     cost="none that can be measured",

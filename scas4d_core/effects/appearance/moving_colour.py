@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from scas4d_core.effects.effect import Effect, Group, refused_at_zero
+from scas4d_core.effects.effect import Effect, EffectGroup, refusal_at_zero
 from scas4d_core.update.parts import PlanBuilder
 
 if TYPE_CHECKING:
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 class MovingColour(Effect):
     """RGB of the Gaussians that move, at the rate ``rate_colour``."""
 
-    def refused(self, settings: Settings) -> tuple[str, str] | None:
+    def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Refused with a rate of 0."""
-        return refused_at_zero(settings, "rate_colour")
+        return refusal_at_zero(settings, "rate_colour")
 
     def join(self, builder: PlanBuilder) -> None:
         """Frees their colours."""
@@ -27,7 +27,7 @@ class MovingColour(Effect):
 
 EFFECT = MovingColour(
     name="moving_colour",
-    group=Group.APPEARANCE,
+    group=EffectGroup.APPEARANCE,
     says="The colours of moving Gaussians follow the pictures slowly: shading changes as objects rotate.",
     gauge="The mean absolute colour change is a loss term: motion and gains are not absorbed by colours.",
     cost="one Adam step over RGB per iteration, shared with the other colours",

@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scas4d_core.effects.appearance.closed_form import follow_pictures
-from scas4d_core.effects.effect import Effect, Group, refused_at_zero
+from scas4d_core.effects.effect import Effect, EffectGroup, refusal_at_zero
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.update.parts import Attempt, Part, PlanBuilder
+from scas4d_core.update.parts import Attempt, PlanBuilder, UpdatePart
 
 if TYPE_CHECKING:
     from scas4d_core.settings import Settings
 
 
-class ShadingPart(Part):
+class ShadingPart(UpdatePart):
     """Steps the colours of what moves at the end of an update."""
 
     def __init__(self, builder: PlanBuilder) -> None:
@@ -30,7 +30,7 @@ class ShadingPart(Part):
 
     def end(self, attempt: Attempt, state: Gaussians) -> Gaussians:
         """Steps them, where a motion is what is kept and colours were not held."""
-        if attempt.kept is Candidate.STILL or attempt.rates.colour == 0 or not self._moves.any():
+        if attempt.kept is Candidate.PREVIOUS or attempt.rates.colour == 0 or not self._moves.any():
             return state
         return follow_pictures(state, attempt.views, attempt.renderer, self._moves)
 
@@ -39,9 +39,9 @@ class ShadingPart(Part):
 class Shading(Effect):
     """A closed-form step of the colours of what moves."""
 
-    def refused(self, settings: Settings) -> tuple[str, str] | None:
+    def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Refused with a rate of 0."""
-        return refused_at_zero(settings, "rate_colour")
+        return refusal_at_zero(settings, "rate_colour")
 
     def join(self, builder: PlanBuilder) -> None:
         """Adds the part."""
@@ -50,7 +50,7 @@ class Shading(Effect):
 
 EFFECT = Shading(
     name="shading",
-    group=Group.APPEARANCE,
+    group=EffectGroup.APPEARANCE,
     says="The colours of moving Gaussians follow the pictures once per frame, as objects rotate in the light.",
     gauge="Moving Gaussians only, once the motion of the frame is found; camera gains are removed before.",
     cost="one render of each view, with its blending weights, per frame",

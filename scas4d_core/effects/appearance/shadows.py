@@ -13,16 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.effects.appearance.closed_form import follow_pictures
-from scas4d_core.effects.effect import Effect, Group, refused_at_zero
+from scas4d_core.effects.effect import Effect, EffectGroup, refusal_at_zero
 from scas4d_core.effects.evidence import Evidence
 from scas4d_core.engines.renderer import BLOCK
 from scas4d_core.engines.views import SIDE
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.update.parts import Array, Arrays, Attempt, Part, PlanBuilder
+from scas4d_core.update.parts import Array, Arrays, Attempt, PlanBuilder, UpdatePart
 
 if TYPE_CHECKING:
-    from scas4d_core.effects.evidence import Seen
+    from scas4d_core.effects.evidence import FrameObservation
     from scas4d_core.engines.renderer import Renderer
     from scas4d_core.engines.views import TrainingView
     from scas4d_core.settings import Settings
@@ -39,7 +39,7 @@ STANDS = 0.05
 """Share of Gaussians that stand, below which there is nothing for shadows to wander over."""
 
 
-class ShadowsPart(Part):
+class ShadowsPart(UpdatePart):
     """Steps the colours of what stands at the end of an update."""
 
     def __init__(self, builder: PlanBuilder) -> None:
@@ -48,7 +48,7 @@ class ShadowsPart(Part):
 
     def end(self, attempt: Attempt, state: Gaussians) -> Gaussians:
         """Steps them, where the end of the update is what is kept."""
-        if attempt.kept is not Candidate.END or not self._stands.any() or attempt.rates.colour_standing == 0:
+        if attempt.kept is not Candidate.END or not self._stands.any() or attempt.rates.static_colour == 0:
             return state
         before: Arrays = attempt.carried.get(NAME, {})
         known = [view for view in attempt.views if view.name in before]
@@ -64,11 +64,11 @@ class ShadowsPart(Part):
 class Shadows(Effect):
     """A closed-form step of the colours of what stands."""
 
-    def refused(self, settings: Settings) -> tuple[str, str] | None:
+    def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Refused with a rate of 0."""
-        return refused_at_zero(settings, "rate_colour_standing")
+        return refusal_at_zero(settings, "rate_static_colour")
 
-    def began(self, seen: Seen) -> Arrays | None:
+    def began(self, seen: FrameObservation) -> Arrays | None:
         """[h, w, 4] float16 of each view: mean colours of squares, and 1 where what moves reaches."""
         state = seen.result.gaussians
         stands = float((~state.moving).mean())
@@ -82,11 +82,11 @@ class Shadows(Effect):
             arrays[view.name] = np.concatenate([means, hidden[..., None]], axis=-1).astype(np.float16)
         return arrays
 
-    def on_at_first(self, seen: Seen) -> bool:
+    def on_at_first(self, seen: FrameObservation) -> bool:
         """True where something stands."""
         return bool((~seen.result.gaussians.moving).mean() >= STANDS)
 
-    def evidence(self, seen: Seen) -> Evidence | None:
+    def evidence(self, seen: FrameObservation) -> Evidence | None:
         """Share of what stands, seen in frame 0 and now, that looks other than then."""
         before: Arrays = seen.result.carried.get(NAME, {})
         if seen.result.gaussians.moving.all():
@@ -133,7 +133,7 @@ def _hidden(view: TrainingView, state: Gaussians, renderer: Renderer) -> NDArray
 
 EFFECT = Shadows(
     name=NAME,
-    group=Group.APPEARANCE,
+    group=EffectGroup.APPEARANCE,
     says="The colours of static Gaussians follow the pictures once per frame, as shadows and light move over them.",
     gauge="Static Gaussians only, where they look different from frame 0; camera gains are removed before.",
     cost="one render of each view, with its blending weights, per frame",

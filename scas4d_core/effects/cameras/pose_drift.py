@@ -39,14 +39,14 @@ from scas4d_core.effects.cameras.alignment import (
     turn_equations,
     twist_equations,
 )
-from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.effects.evidence import Evidence
 from scas4d_core.engines.views import LABEL
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.update.parts import Arrays, PlanBuilder
 
 if TYPE_CHECKING:
-    from scas4d_core.effects.evidence import Seen
+    from scas4d_core.effects.evidence import FrameObservation
     from scas4d_core.engines.views import TrainingView
 
 NAME = "pose_drift"
@@ -210,7 +210,7 @@ def centred(twists: Double, rig: Rig, believed: NDArray[np.bool_]) -> Double:
 class PoseDrift(Effect):
     """Poses that follow the pictures, once a frame."""
 
-    def noted(self, seen: Seen, on: bool) -> Arrays | None:
+    def record(self, seen: FrameObservation, on: bool) -> Arrays | None:
         """What each camera is off by; where it is on, the poses of the frames after."""
         if not _says(seen):
             return None
@@ -238,7 +238,7 @@ class PoseDrift(Effect):
                 _look(poses, rows[view.name], view, _rendered(seen, view)[0], 1)
         return poses.arrays()
 
-    def evidence(self, seen: Seen) -> Evidence | None:
+    def evidence(self, seen: FrameObservation) -> Evidence | None:
         """The share of its residual that a shift found in earlier frames explains, of the camera with the largest."""
         arrays = seen.result.carried.get(NAME)
         if arrays is None or not _says(seen):
@@ -255,11 +255,11 @@ class PoseDrift(Effect):
         """Adds nothing: updates know nothing of it, for the poses are those of their views."""
 
 
-def _says(seen: Seen) -> bool:
+def _says(seen: FrameObservation) -> bool:
     return len(seen.views) >= max(CAMERAS, ENOUGH * len(seen.rig))
 
 
-def _looked_at(seen: Seen, poses: Poses, rows: Mapping[str, int]) -> list[TrainingView]:
+def _looked_at(seen: FrameObservation, poses: Poses, rows: Mapping[str, int]) -> list[TrainingView]:
     """Views to be aligned: of cameras that are off or set aside, and of some that stand, others in each frame."""
     off = poses.off()
     standing = [view for view in seen.views if not off[rows[view.name]]]
@@ -269,7 +269,7 @@ def _looked_at(seen: Seen, poses: Poses, rows: Mapping[str, int]) -> list[Traini
     return [*(standing[k] for k in sorted(some)), *others, *seen.suspects]
 
 
-def _aligned(seen: Seen, views: list[TrainingView]) -> dict[int, tuple[Equations, Camera, Array]]:
+def _aligned(seen: FrameObservation, views: list[TrainingView]) -> dict[int, tuple[Equations, Camera, Array]]:
     """By row, the equations of each view, its camera and lens; without those that tell too little."""
     rows, by_row = {name: row for row, name in enumerate(seen.rig.names)}, {}
     for view in views:
@@ -291,7 +291,7 @@ def _exposed(view: TrainingView, shown: Array) -> Array:
     return view.exposure[:3, 0, None, None] * shown + view.exposure[:3, 1, None, None]
 
 
-def _rendered(seen: Seen, view: TrainingView) -> tuple[Array, Array]:
+def _rendered(seen: FrameObservation, view: TrainingView) -> tuple[Array, Array]:
     """[3, H, W] as a view is rendered, without its exposure, and [H, W] metres along z; NaN where nothing is."""
     state = seen.result.gaussians
     planes, rest = seen.renderer.render(state, view.camera, depth_channel=LABEL)
@@ -302,7 +302,7 @@ def _rendered(seen: Seen, view: TrainingView) -> tuple[Array, Array]:
 
 EFFECT = PoseDrift(
     name=NAME,
-    group=Group.CAMERAS,
+    group=EffectGroup.CAMERAS,
     says="Cameras drift, or are knocked by a few pixels: their poses follow the pictures once per frame.",
     gauge="The median twist over the cameras is 0: what most cameras share is motion of the scene.",
     cost="samples of eight renderings per frame; where on, one render of each camera that is off, and of six others",

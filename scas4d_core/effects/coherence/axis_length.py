@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from scas4d_core.effects.effect import Effect, Group, refused_at_zero
+from scas4d_core.effects.effect import Effect, EffectGroup, refusal_at_zero
 from scas4d_core.update.parts import PlanBuilder
 
 if TYPE_CHECKING:
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 class AxisLength(Effect):
     """The term ``weights.scale``."""
 
-    def refused(self, settings: Settings) -> tuple[str, str] | None:
+    def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Refused with a weight of 0."""
-        return refused_at_zero(settings, "weights.scale")
+        return refusal_at_zero(settings, "weights.scale")
 
     def join(self, builder: PlanBuilder) -> None:
         """Adds the term, with its weight."""
@@ -30,7 +30,7 @@ class AxisLength(Effect):
 
 EFFECT = AxisLength(
     name="axis_length",
-    group=Group.COHERENCE,
+    group=EffectGroup.COHERENCE,
     says="No Gaussian grows longer than in frame 0, or than 2 cm.",
     gauge="Lengths of frame 0.",
     cost="none measurable: a part of the cascade's backward pass",

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scas4d_core.effects.effect import Effect, Group, refused_at_zero
-from scas4d_core.effects.evidence import Evidence, Seen
+from scas4d_core.effects.effect import Effect, EffectGroup, refusal_at_zero
+from scas4d_core.effects.evidence import Evidence, FrameObservation
 from scas4d_core.update.parts import PlanBuilder
 
 if TYPE_CHECKING:
@@ -91,14 +91,14 @@ def bend(before: Gaussians, after: Gaussians) -> float | None:
 class Bending(Effect):
     """Turns that are free of one another."""
 
-    def refused(self, settings: Settings) -> tuple[str, str] | None:
+    def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Refused where the term that it leaves out is pinned, or has no weight."""
         mode = settings.effects.get("rotation", "auto")
         if mode != "auto":
             return f"effects.rotation is '{mode}'", "leave rotation 'auto'"
-        return refused_at_zero(settings, "weights.rotation")
+        return refusal_at_zero(settings, "weights.rotation")
 
-    def evidence(self, seen: Seen) -> Evidence | None:
+    def evidence(self, seen: FrameObservation) -> Evidence | None:
         """The turn of neighbourhoods against those around them, from a frame to the next."""
         angle = bend(seen.before, seen.result.gaussians)
         if angle is None:
@@ -114,7 +114,7 @@ class Bending(Effect):
 
 EFFECT = Bending(
     name="bending",
-    group=Group.COHERENCE,
+    group=EffectGroup.COHERENCE,
     says="Neighbours rotate each in their own way, as in cloth: the term rotation is left out.",
     gauge="Rotations of patches beyond the rest of their motion; joints between rigid parts are too few to count.",
     cost="1 % of an update: the rotations of 400 patches per frame",

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scas4d_core.cameras import WorldFrame
-from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.engines.plan import Plane
 from scas4d_core.update.parts import PlanBuilder
 
@@ -44,7 +44,7 @@ def floor_inside(plane: Sequence[float], world: WorldFrame) -> Plane:
 class Floor(Effect):
     """The term for the plane ``scene.floor``."""
 
-    def refused(self, settings: Settings) -> tuple[str, str] | None:
+    def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Refused without a plane."""
         if settings.scene.floor is None:
             return "the scene names no floor", "give scene.floor, a plane (a, b, c, d)"
@@ -58,7 +58,7 @@ class Floor(Effect):
 
 EFFECT = Floor(
     name="floor",
-    group=Group.COHERENCE,
+    group=EffectGroup.COHERENCE,
     says="Moving Gaussians stay above the floor plane of the scene.",
     gauge="A plane in the user's world.",
     cost="one dot product per moving Gaussian and iteration",

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from scas4d_core.effects.effect import Effect, Group, refused_at_zero
+from scas4d_core.effects.effect import Effect, EffectGroup, refusal_at_zero
 from scas4d_core.update.parts import PlanBuilder
 
 if TYPE_CHECKING:
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 class Isometry(Effect):
     """The term ``weights.isometry``."""
 
-    def refused(self, settings: Settings) -> tuple[str, str] | None:
+    def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Refused with a weight of 0."""
-        return refused_at_zero(settings, "weights.isometry")
+        return refusal_at_zero(settings, "weights.isometry")
 
     def join(self, builder: PlanBuilder) -> None:
         """Adds the term, with its weight."""
@@ -31,7 +31,7 @@ class Isometry(Effect):
 
 EFFECT = Isometry(
     name="isometry",
-    group=Group.COHERENCE,
+    group=EffectGroup.COHERENCE,
     says="Neighbours keep the distance that they had in frame 0: objects bend, but do not tear.",
     gauge="Distances of frame 0; it ignores rotations.",
     cost="one pass over 4,000 Gaussians and their neighbours per iteration, shared with rigidity and rotation",

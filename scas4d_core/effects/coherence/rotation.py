@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from scas4d_core.effects.effect import Effect, Group, refused_at_zero
+from scas4d_core.effects.effect import Effect, EffectGroup, refusal_at_zero
 from scas4d_core.update.parts import PlanBuilder
 
 if TYPE_CHECKING:
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 class Rotation(Effect):
     """The term ``weights.rotation``."""
 
-    def refused(self, settings: Settings) -> tuple[str, str] | None:
+    def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Refused with a weight of 0."""
-        return refused_at_zero(settings, "weights.rotation")
+        return refusal_at_zero(settings, "weights.rotation")
 
     def join(self, builder: PlanBuilder) -> None:
         """Adds the term, with its weight."""
@@ -31,7 +31,7 @@ class Rotation(Effect):
 
 EFFECT = Rotation(
     name="rotation",
-    group=Group.COHERENCE,
+    group=EffectGroup.COHERENCE,
     says="Neighbours rotate alike.",
     gauge="Rotations since the previous frame.",
     cost="one pass over 4,000 Gaussians and their neighbours per iteration, shared with rigidity and isometry",

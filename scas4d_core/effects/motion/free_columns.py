@@ -24,14 +24,14 @@ MOVES = (
 
 def may_be_on(name: str, settings: Settings) -> bool:
     """True where the settings neither pin an effect off nor contradict it."""
-    return settings.effects.get(name) != "off" and effect(name).refused(settings) is None
+    return settings.effects.get(name) != "off" and effect(name).refusal(settings) is None
 
 
 @dataclass(frozen=True)
 class FreeColumns(Effect):
     """An effect that frees the parameters of its name (``engines.freedom.Freedom``)."""
 
-    def needed(self, settings: Settings) -> tuple[str, str] | None:
+    def requirement(self, settings: Settings) -> tuple[str, str] | None:
         """Refused where nothing at all could move."""
         if any(may_be_on(name, settings) for name in MOVES):
             return None
@@ -46,7 +46,7 @@ class FreeColumns(Effect):
 class ClusterColumns(FreeColumns):
     """An effect that frees parameters of the clusters."""
 
-    def refused(self, settings: Settings) -> tuple[str, str] | None:
+    def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Refused without clusters."""
         if settings.update.clusters:
             return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from scas4d_core.effects.effect import Group, refused_at_zero
+from scas4d_core.effects.effect import EffectGroup, refusal_at_zero
 from scas4d_core.effects.motion.free_columns import FreeColumns
 
 if TYPE_CHECKING:
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 class OwnScale(FreeColumns):
     """Δs, at the rate ``rate_scale``."""
 
-    def refused(self, settings: Settings) -> tuple[str, str] | None:
+    def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Refused with a rate of 0."""
-        return refused_at_zero(settings, "rate_scale")
+        return refusal_at_zero(settings, "rate_scale")
 
 
 EFFECT = OwnScale(
     name="own_scale",
-    group=Group.MOTION,
+    group=EffectGroup.MOTION,
     says="Each Gaussian's axes may grow and shrink.",
     gauge="The limit of the axes' lengths; it learns last and slowly.",
     cost="1 % of an update, together with own_position and own_rotation",

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.update.parts import PlanBuilder
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ OWN = ("own_position", "own_rotation")
 class Prediction(Effect):
     """The motion before as the start."""
 
-    def refused(self, settings: Settings) -> tuple[str, str] | None:
+    def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Refused where all that it carries on is pinned off."""
         carried = CLUSTERS if settings.update.momentum == 0 else CLUSTERS + OWN
         if any(settings.effects.get(name) != "off" for name in carried):
@@ -37,7 +37,7 @@ class Prediction(Effect):
 
 EFFECT = Prediction(
     name="prediction",
-    group=Group.MOTION,
+    group=EffectGroup.MOTION,
     says="An update starts from the motion of the previous frame, if that shows the frame better.",
     gauge="It sets the start alone: the pictures decide where the update ends.",
     cost="one comparison of half-size pictures of four views per update",

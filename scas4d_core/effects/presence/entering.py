@@ -10,17 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.effects.evidence import Evidence
 from scas4d_core.effects.presence.carving import Hull, carve_new, footprint
-from scas4d_core.effects.presence.catching import Catching
+from scas4d_core.effects.presence.newborn_tracking import NewbornTracking
 from scas4d_core.effects.presence.novelty import Novelty, glance, said
 from scas4d_core.effects.presence.returning import returned, revived
 from scas4d_core.posed_pictures import pixels_inside
 from scas4d_core.update.parts import Arrays
 
 if TYPE_CHECKING:
-    from scas4d_core.effects.evidence import Seen
+    from scas4d_core.effects.evidence import FrameObservation
     from scas4d_core.gaussians import Gaussians
     from scas4d_core.update.parts import PlanBuilder
     from scas4d_core.update.result import UpdateResult
@@ -54,7 +54,7 @@ NONE = np.zeros(0, np.int64)
 NOBODY: Arrays = {
     "rows": NONE,
     "age": NONE,
-    "young": NONE,
+    "newborn": NONE,
     "thing": NONE,
     "centres": np.zeros((0, 3)),
     "volumes": np.zeros(0),
@@ -63,8 +63,8 @@ NOBODY: Arrays = {
     "cameras": np.array(0),
 }
 """What is left before anything was born."""
-OF_THE_YOUNG = ("young", "thing", "centres", "volumes", "places")
-"""Arrays that are of the last frame alone, see ``Catching``."""
+NEWBORN_ARRAYS = ("newborn", "thing", "centres", "volumes", "places")
+"""Arrays that are of the last frame alone, see ``NewbornTracking``."""
 BUDGET = 0.1
 """Gaussians that are born in a frame at most, as a share of those that are there."""
 
@@ -84,7 +84,7 @@ class Found:
     cameras: int
 
 
-def entered(seen: Seen) -> Found | None:
+def entered(seen: FrameObservation) -> Found | None:
     """What a frame shows that the state does not have; None where there is nothing of the kind."""
     if sum(_says(one) for one in glance(seen, GLANCED, new=SMALLEST)) < GLANCED:
         return None
@@ -136,7 +136,7 @@ def _remembered(found: Found, state: Gaussians, rows: NDArray[np.int64], left: A
     return {
         "rows": np.concatenate([left["rows"], rows]),
         "age": np.concatenate([left["age"], np.zeros(len(rows), np.int64)]),
-        "young": np.concatenate([left["young"], rows]),
+        "newborn": np.concatenate([left["newborn"], rows]),
         "thing": np.concatenate([left["thing"], len(left["centres"]) + np.searchsorted(things, thing)]),
         "centres": np.concatenate(
             [left["centres"], [found.hull.points[found.hull.things == n].mean(axis=0) for n in things]]
@@ -156,7 +156,7 @@ def _remembered(found: Found, state: Gaussians, rows: NDArray[np.int64], left: A
 class Entering(Effect):
     """Births, in frames that show more than the state has."""
 
-    def evidence(self, seen: Seen) -> Evidence | None:
+    def evidence(self, seen: FrameObservation) -> Evidence | None:
         """What is new explains so much; once something was born, what that explained, for as long as it is there."""
         if not seen.views:
             return None
@@ -166,19 +166,19 @@ class Entering(Effect):
         things = entered(seen)
         return Evidence(0.0, "") if things is None else _evidence(things.share, things.cameras)
 
-    def populated(self, seen: Seen) -> UpdateResult:
-        """The result with the Gaussians that are born, and the young ones settled."""
+    def add_and_retire_gaussians(self, seen: FrameObservation) -> UpdateResult:
+        """The result with the Gaussians that are born, and the newborn ones settled."""
         from scas4d_core.effects.presence.growing import grown, seeds, settled
 
         result, things = seen.result, entered(seen)
         left = result.carried.get(NAME, NOBODY)
         state, rng = result.gaussians, np.random.default_rng([seen.index, len(result.gaussians)])
-        young = left["age"] < SETTLED
-        settling = left["rows"][young & state.present[left["rows"]]]
+        newborn = left["age"] < SETTLED
+        settling = left["rows"][newborn & state.present[left["rows"]]]
         if len(settling):
             state = settled(state, settling, seen.views, seen.rig, seen.renderer, rng, seen.time)
-        arrays = {**left, **{name: NOBODY[name] for name in OF_THE_YOUNG}, "age": left["age"] + 1}
-        joins = result.joins
+        arrays = {**left, **{name: NOBODY[name] for name in NEWBORN_ARRAYS}, "age": left["age"] + 1}
+        parents = result.parents
         grown_up = left["rows"][(left["age"] == SETTLED) & state.present[left["rows"]]]
         if len(grown_up):
             denied = _denied(said(seen, seen.views), state.means[grown_up].astype(np.float64))
@@ -202,14 +202,14 @@ class Entering(Effect):
             state = state.joined(born)
             arrays |= _remembered(things, state, rows, arrays)
             alone = np.full(len(born), -1, np.int64)
-            joins = alone if joins is None else np.concatenate([joins, alone])
+            parents = alone if parents is None else np.concatenate([parents, alone])
         if state is result.gaussians and left is NOBODY:
             return result
-        return replace(result, gaussians=state, joins=joins, carried={**result.carried, NAME: arrays})
+        return replace(result, gaussians=state, parents=parents, carried={**result.carried, NAME: arrays})
 
     def join(self, builder: PlanBuilder) -> None:
         """Adds the search for what was born in the frame before."""
-        builder.parts.append(Catching(builder, NAME))
+        builder.parts.append(NewbornTracking(builder, NAME))
 
 
 def _evidence(share: float, cameras: int) -> Evidence:
@@ -218,7 +218,7 @@ def _evidence(share: float, cameras: int) -> Evidence:
 
 EFFECT = Entering(
     name=NAME,
-    group=Group.PRESENCE,
+    group=EffectGroup.PRESENCE,
     says="Objects enter the scene: Gaussians are added where cameras agree that nothing explains the pictures.",
     gauge="Only what no Gaussian covers, beyond what has moved away elsewhere.",
     cost="a check of the last rendered pictures; where something enters, about an update more",

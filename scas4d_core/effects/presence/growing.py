@@ -110,8 +110,8 @@ def settled(
     """The state with means, factors and colours of some rows fitted to the views; opacities stay for ever.
 
     Args:
-        rows: of young Gaussians: their hull was rough, and their first update as well. What is glossy, and came back as
-            itself, is left as it is: more is seen of it than its colours, which alone are fitted.
+        rows: of newborn Gaussians, whose hull and first update were rough. Revived glossy Gaussians are left as
+            they are: only colours are fitted, and gloss shows more than these.
         time: for the fit; without enough of it they stay as they are.
     """
     if state.gloss is not None:  # those born later have none
@@ -133,7 +133,7 @@ def settled(
     given = views, rig, renderer, rng, time
     fitted = _fit_crops(others, parameters, *given, iterations=SETTLING, opacities=False)
     if fitted is None:
-        time.put_off.append(f"{len(rows)} young Gaussians were not settled")
+        time.put_off.append(f"{len(rows)} newborn Gaussians were not settled")
         return state
     means, factors, colours = state.means.copy(), state.factors.copy(), state.colours.copy()
     means[rows], colours[rows] = fitted.means, fitted.colours

@@ -12,13 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.effects.evidence import Evidence
 from scas4d_core.gaussians import Gaussians, moving_extent
 
 if TYPE_CHECKING:
     from scas4d_core.cameras import Rig
-    from scas4d_core.effects.evidence import Seen
+    from scas4d_core.effects.evidence import FrameObservation
     from scas4d_core.update.parts import Arrays, PlanBuilder
     from scas4d_core.update.result import UpdateResult
 
@@ -59,7 +59,7 @@ def outside(state: Gaussians, rig: Rig) -> NDArray[np.bool_]:
 class Leaving(Effect):
     """Retirements, in frames in which something has left all views."""
 
-    def evidence(self, seen: Seen) -> Evidence | None:
+    def evidence(self, seen: FrameObservation) -> Evidence | None:
         """How much of what moves is in no picture, or was when the first was retired, as long as it stays away."""
         if not seen.views:
             return None
@@ -70,7 +70,7 @@ class Leaving(Effect):
         moving = int(state.moving.sum())
         return _evidence(float(outside(state, seen.rig).sum()) / max(1, moving))
 
-    def populated(self, seen: Seen) -> UpdateResult:
+    def add_and_retire_gaussians(self, seen: FrameObservation) -> UpdateResult:
         """The result with those retired that have been outside for long enough."""
         state = seen.result.gaussians
         out = outside(state, seen.rig)
@@ -98,7 +98,7 @@ def _evidence(share: float) -> Evidence:
 
 EFFECT = Leaving(
     name=NAME,
-    group=Group.PRESENCE,
+    group=EffectGroup.PRESENCE,
     says="Objects leave the scene: Gaussians in no picture are retired, and may come back under their ids.",
     gauge="None is needed: what is in no picture explains nothing.",
     cost="one projection of the moving Gaussians per frame; an update costs less without what has left",

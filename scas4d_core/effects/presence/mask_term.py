@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.update.parts import PlanBuilder
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 class MaskTerm(Effect):
     """The term ``weights.mask``, or ``weights.mask_alone``, in frames that come with masks."""
 
-    def refused(self, settings: Settings) -> tuple[str, str] | None:
+    def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Refused where masks are not used, and with both weights 0."""
         update = settings.update
         if not update.use_masks:
@@ -37,7 +37,7 @@ class MaskTerm(Effect):
 
 EFFECT = MaskTerm(
     name="mask_term",
-    group=Group.PRESENCE,
+    group=EffectGroup.PRESENCE,
     says="With masks, moving and static Gaussians must cover the pixels that the masks give them.",
     gauge="Labels come from frame 0 and are no parameter: the term moves Gaussians, and relabels none.",
     cost="a fourth channel beside RGB, forward and backward; without masks nothing",

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.update.parts import PlanBuilder
 
 
@@ -22,7 +22,7 @@ class MotionLabels(Effect):
 
 EFFECT = MotionLabels(
     name="motion_labels",
-    group=Group.PRESENCE,
+    group=EffectGroup.PRESENCE,
     says="Without masks, only Gaussians that most cameras have seen in changed pixels move.",
     gauge="A Gaussian that has moved once may always move: labels are added and never removed.",
     cost="a comparison of each view with the previous frame; static Gaussians save more than that",

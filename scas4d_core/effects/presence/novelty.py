@@ -20,7 +20,7 @@ from scas4d_core.frame_outcome import Candidate
 
 if TYPE_CHECKING:
     from scas4d_core.cameras import Camera, Rig
-    from scas4d_core.effects.evidence import Seen
+    from scas4d_core.effects.evidence import FrameObservation
     from scas4d_core.engines.engine import Thinned
     from scas4d_core.engines.renderer import Renderer
     from scas4d_core.engines.views import TrainingView
@@ -95,7 +95,7 @@ _glimpsed: WeakKeyDictionary[UpdateTrace, list[Glimpse]] = WeakKeyDictionary()
 """Those of an update."""
 
 
-def glance(seen: Seen, least: int, new: float = 0.0, bare: float = 0.0) -> list[Novelty]:
+def glance(seen: FrameObservation, least: int, new: float = 0.0, bare: float = 0.0) -> list[Novelty]:
     """What some cameras say of a frame; nothing where too few of them can say that something is new, or bare.
 
     Args:
@@ -110,7 +110,7 @@ def glance(seen: Seen, least: int, new: float = 0.0, bare: float = 0.0) -> list[
     return said(seen, [seen.views[(seen.index + count * k // looked_at) % count] for k in range(looked_at)])
 
 
-def _glimpses(seen: Seen) -> list[Glimpse]:
+def _glimpses(seen: FrameObservation) -> list[Glimpse]:
     """Those of the cameras that the update rendered last."""
     trace = seen.result.trace
     if trace not in _glimpsed:
@@ -146,7 +146,7 @@ def _all(plane: Bool) -> Bool:
     return everywhere
 
 
-def said(seen: Seen, views: Sequence[TrainingView]) -> list[Novelty]:
+def said(seen: FrameObservation, views: Sequence[TrainingView]) -> list[Novelty]:
     """What some views say, in the colours of the frame before: what is new may be painted on what stands by now."""
     state = seen.result.gaussians
     known = _said.setdefault(state, {})

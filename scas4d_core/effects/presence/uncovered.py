@@ -8,14 +8,14 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from scas4d_core.effects.effect import Effect, Group
+from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.effects.evidence import Evidence
 from scas4d_core.effects.presence.carving import footprint
 from scas4d_core.effects.presence.novelty import glance, said
 from scas4d_core.effects.presence.uncovering import Uncovered, uncovered
 
 if TYPE_CHECKING:
-    from scas4d_core.effects.evidence import Seen
+    from scas4d_core.effects.evidence import FrameObservation
     from scas4d_core.gaussians import Gaussians
     from scas4d_core.update.parts import Arrays, PlanBuilder
     from scas4d_core.update.result import UpdateResult
@@ -39,7 +39,7 @@ _found_in: WeakKeyDictionary[Gaussians, dict[int, Found | None]] = WeakKeyDictio
 """What was found, by state and the cameras of a glance that were asked for: evidence and births ask for the same."""
 
 
-def _found(seen: Seen, glanced: int) -> Found | None:
+def _found(seen: FrameObservation, glanced: int) -> Found | None:
     """Points on what is uncovered, and the share of the squared error that they explain."""
     known = _found_in.setdefault(seen.result.gaussians, {})
     if glanced not in known:
@@ -47,7 +47,7 @@ def _found(seen: Seen, glanced: int) -> Found | None:
     return known[glanced]
 
 
-def _looked_for(seen: Seen, glanced: int) -> Found | None:
+def _looked_for(seen: FrameObservation, glanced: int) -> Found | None:
     if sum(one.bare.sum() >= SMALLEST * one.bare.size for one in glance(seen, glanced, bare=SMALLEST)) < glanced:
         return None
     everyone = said(seen, seen.views)
@@ -64,14 +64,14 @@ def _looked_for(seen: Seen, glanced: int) -> Found | None:
 class UncoveredEffect(Effect):
     """Births behind what moves away."""
 
-    def evidence(self, seen: Seen) -> Evidence | None:
+    def evidence(self, seen: FrameObservation) -> Evidence | None:
         """What is bare has so much of the error; once something was born, fewer cameras have to see it."""
         if not seen.views:
             return None
         points = _found(seen, GLANCED_ON if NAME in seen.result.carried else GLANCED)
         return Evidence(0.0, "") if points is None else _evidence(points[1])
 
-    def populated(self, seen: Seen) -> UpdateResult:
+    def add_and_retire_gaussians(self, seen: FrameObservation) -> UpdateResult:
         """The result with the Gaussians that are born."""
         result, uncovered_points = seen.result, _found(seen, GLANCED_ON)
         if uncovered_points is None or uncovered_points[1] < WORTH:
@@ -90,13 +90,13 @@ class UncoveredEffect(Effect):
         born = grown(state, points.points[some], points.colours[some], *given, moves=False, time=seen.time)
         if born is None:
             return result
-        joins = np.full(len(born), -1, np.int64)
+        parents = np.full(len(born), -1, np.int64)
         left = result.carried.get(NAME)
         arrays: Arrays = {"share": np.array(share if left is None else max(share, float(left["share"])))}
         return replace(
             result,
             gaussians=state.joined(born),
-            joins=joins if result.joins is None else np.concatenate([result.joins, joins]),
+            parents=parents if result.parents is None else np.concatenate([result.parents, parents]),
             carried={**result.carried, NAME: arrays},
         )
 
@@ -110,7 +110,7 @@ def _evidence(share: float) -> Evidence:
 
 EFFECT = UncoveredEffect(
     name=NAME,
-    group=Group.PRESENCE,
+    group=EffectGroup.PRESENCE,
     says="Motion uncovers what was hidden: static Gaussians are added where nothing was known.",
     gauge="Only pixels in which the state has nothing.",
     cost="a check of the last rendered pictures; where something is uncovered, about half an update more",

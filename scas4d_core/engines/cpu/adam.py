@@ -51,7 +51,7 @@ class Adam:
         self.guards.add(ACTED, acted)
 
 
-class FreeColumns:
+class AdamColumns:
     """Adam over the columns of a table whose rate is above 0; the others have no moments and stay as they are.
 
     Args:

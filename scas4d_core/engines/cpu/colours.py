@@ -38,7 +38,7 @@ class Colours:
         self._whole = standing or len(rows) > MOST * count
         if self._whole:
             self._before, self._table = before, colours
-            by_row = np.full(count, start.colour_standing if standing else 0, np.float32)
+            by_row = np.full(count, start.static_colour if standing else 0, np.float32)
             by_row[rows] = start.colour
         else:
             self._before, self._table = before[rows], colours[rows]

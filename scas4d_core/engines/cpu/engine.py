@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.engines.cpu.adam import FreeColumns
+from scas4d_core.engines.cpu.adam import AdamColumns
 from scas4d_core.engines.cpu.changed_pixels import MOST, ChangedPixels
 from scas4d_core.engines.cpu.colours import Colours
 from scas4d_core.engines.cpu.deformation import CpuDeformation
 from scas4d_core.engines.cpu.floor import floor_term
 from scas4d_core.engines.cpu.gloss import LearntGloss, features_seen, without_turn
 from scas4d_core.engines.cpu.renderer import CpuRenderer
-from scas4d_core.engines.engine import REPORT, AttemptStart, IterationLog, Rendered, StepScalars, Tables, Thinned
-from scas4d_core.engines.gains import CameraGains
+from scas4d_core.engines.engine import REPORT, AttemptStart, IterationLog, StepScalars, Tables, Thinned, ViewRecord
+from scas4d_core.engines.gains import GainEstimator
 from scas4d_core.engines.plan import Structure, UpdatePlan
 from scas4d_core.engines.renderer import Gradients
 from scas4d_core.engines.views import TrainingView
@@ -70,10 +70,10 @@ class CpuEngine:
         self._colours = previous.colours.copy()
         self._features = previous.features(previous.colours)
         self._gloss: LearntGloss | None = None
-        self._gains: CameraGains | None = None
+        self._gains: GainEstimator | None = None
         self._colour_table: Colours | None = None
-        self._layer_columns: list[FreeColumns | None] = []
-        self._own_columns: FreeColumns | None = None
+        self._layer_columns: list[AdamColumns | None] = []
+        self._own_columns: AdamColumns | None = None
         self._log = IterationLog()
         self._deformed = False
 
@@ -98,15 +98,15 @@ class CpuEngine:
             roots = self._structure.roots
             self._gloss = LearntGloss(previous.gloss, previous.environment, len(previous), self._rows, roots)
         if start.gains is not None:
-            self._gains = CameraGains(start.gains, self._camera_rows, self._views)
+            self._gains = GainEstimator(start.gains, self._camera_rows, self._views)
         columns = [[r] * 3 + [t] * 3 + [scaling] * 4 for r, t, scaling in start.layers]
         own = [start.position] * 3 + [start.rotation] * 3 + [start.scale] * 3
         deformation = self._deformation
         self._layer_columns = [
-            FreeColumns(table, rates, betas) if any(rates) else None
+            AdamColumns(table, rates, betas) if any(rates) else None
             for table, rates in zip(deformation.clusters, columns, strict=True)
         ]
-        self._own_columns = FreeColumns(deformation.deltas, own, betas) if any(own) else None
+        self._own_columns = AdamColumns(deformation.deltas, own, betas) if any(own) else None
 
     def iterate(self, views: Sequence[int], step: StepScalars) -> None:
         """See ``UpdateEngine.iterate``."""
@@ -161,7 +161,7 @@ class CpuEngine:
             height, width = view.target.shape[1:]
             self._gains.saw(view, renderer.rasterizer.planes[:3, :height, :width])
         loss = renderer.image_part + renderer.mask_part
-        self._log.rendered.append(Rendered(index, renderer.psnr, renderer.colour_shift(view)))
+        self._log.rendered.append(ViewRecord(index, renderer.psnr, renderer.colour_shift(view)))
         if step.keep_pictures:
             self._log.keep(index, Thinned.of(*renderer.shown(view)))
         lap(REPORT)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.engines.cpu.gloss import Shading, features_seen, without_turn
+from scas4d_core.engines.cpu.gloss import GlossShading, features_seen, without_turn
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.engine import EngineError
 from scas4d_core.engines.fit import COLOUR, FitLoss, FitScalars, FitTable
@@ -65,7 +65,7 @@ class CpuFitEngine:
 
     def load_table(self, table: FitTable) -> None:
         """See ``FitEngine.load_table``."""
-        if not isinstance(table.gloss, Shading | None):
+        if not isinstance(table.gloss, GlossShading | None):
             raise EngineError("cpu", ["a gloss of another engine"])
         self._table, self._gloss, count = table, table.gloss, len(table.parameters)
         self._gradients = np.zeros_like(table.parameters)

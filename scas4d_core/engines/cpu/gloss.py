@@ -78,7 +78,7 @@ def gloss_rate(rate: float, gloss: Array) -> float:
     return round(rate * typical / float(GLOSS), 9)
 
 
-class Shading:
+class GlossShading:
     """Gloss and environment as parameters, with their gradients and steps.
 
     Args:
@@ -103,7 +103,7 @@ class Shading:
         self._near: tuple[Any, Any] | None = None
 
     @classmethod
-    def fresh(cls, gloss: Array, means: Array, environment: Array | None = None) -> Shading:
+    def fresh(cls, gloss: Array, means: Array, environment: Array | None = None) -> GlossShading:
         """With an environment of nothing, unless one is given; the middle is that of the means."""
         from scas4d_core.kernels.appearance import direction
 
@@ -148,10 +148,10 @@ class Shading:
         nearness = self.environment[self._kernel.NEARNESS]
         np.clip(nearness, 0, None, out=nearness)
 
-    def taken(self, rows: NDArray[np.int64], parents: NDArray[np.int64]) -> Shading:
+    def taken(self, rows: NDArray[np.int64], parents: NDArray[np.int64]) -> GlossShading:
         """The same for some rows, with their moments, and for further ones like their parents, without."""
         every = np.concatenate([rows, parents])
-        chosen = Shading(self.gloss[every], self.environment, self._rates)
+        chosen = GlossShading(self.gloss[every], self.environment, self._rates)
         moments = self.moments[0][:, every]
         moments[:, len(rows) :] = 0
         chosen.moments = [np.ascontiguousarray(moments), self.moments[1]]
@@ -200,7 +200,7 @@ class LearntGloss:
 
     def __init__(self, gloss: Array, environment: Array, count: int, rows: NDArray[np.int64], roots: Array) -> None:
         rates = (gloss_rate(UPDATE_RATE_GLOSS, gloss), UPDATE_RATE_ENVIRONMENT, UPDATE_RATE_NEARNESS)
-        self._shading = Shading(gloss.copy(), environment.copy(), rates)
+        self._shading = GlossShading(gloss.copy(), environment.copy(), rates)
         self._turns, self._rows, self._roots = without_turn(count), rows, roots
 
     @property

@@ -19,8 +19,8 @@ from scas4d_core.engines.cpu.gloss import (
     UPDATE_RATE_NEARNESS,
     gloss_rate,
 )
-from scas4d_core.engines.engine import AttemptStart, IterationLog, Rendered, StepScalars, Tables, Thinned
-from scas4d_core.engines.gains import CameraGains
+from scas4d_core.engines.engine import AttemptStart, IterationLog, StepScalars, Tables, Thinned, ViewRecord
+from scas4d_core.engines.gains import GainEstimator
 from scas4d_core.engines.plan import MAX_SCALE, Structure, UpdatePlan
 from scas4d_core.engines.torch import losses
 from scas4d_core.engines.torch.gloss import cell_shares, no_turns
@@ -64,7 +64,7 @@ class TorchEngine:
         self._scene = scene = Scene(self._plan, self._structure, previous)
         moving, standing = scene.colours[scene.rows].clone(), scene.colours[scene.standing].clone()
         self._parameters = Parameters(*deformation_of(Tables.still(self._structure.hierarchy)), moving, standing)
-        self._gains: CameraGains | None = None
+        self._gains: GainEstimator | None = None
         self._smoothing: tuple[Tensor, Tensor] | None = None
         self._log, self._gradients = IterationLog(), dict[str, Array]()
 
@@ -82,7 +82,7 @@ class TorchEngine:
                 environment[MIDDLE:NEARNESS].clone(), (rate, UPDATE_RATE_ENVIRONMENT, UPDATE_RATE_NEARNESS),
             )  # fmt: skip
         if start.gains is not None:
-            self._gains = CameraGains(start.gains, self._camera_rows, self._views)
+            self._gains = GainEstimator(start.gains, self._camera_rows, self._views)
         self._parameters.free(start, self._plan.colours)
 
     def iterate(self, views: Sequence[int], step: StepScalars) -> None:
@@ -120,7 +120,7 @@ class TorchEngine:
         psnr = float(losses.psnr(shown.detach(), target[..., :LABEL]))
         mean = planes.detach()[..., :LABEL].mean(dim=(0, 1)) * gain + offset
         red, green, blue = (view.mean - mean.numpy()).tolist()
-        self._log.rendered.append(Rendered(index, psnr, (red, green, blue)))
+        self._log.rendered.append(ViewRecord(index, psnr, (red, green, blue)))
         if step.keep_pictures:
             self._log.keep(index, Thinned.of(picture, (1 - alpha.detach()).float().numpy()))
         return loss
@@ -260,7 +260,7 @@ class TorchEngine:
             f"{k}.{name}": v for k, params in enumerate(parameters.clusters) for name, v in params._asdict().items()
         }
         named |= parameters.deltas._asdict()
-        named |= {"moving": parameters.moving_colours, "standing": parameters.standing_colours}
+        named |= {"moving": parameters.moving_colours, "standing": parameters.static_colours}
         if gloss is not None:
             named |= {"gloss": gloss.gloss, "light": gloss.light, "nearness": gloss.nearness}
         return named

@@ -50,13 +50,13 @@ class Parameters:
 
     Attributes:
         clusters: for each layer, coarse to fine, r, t, c, s of equation (6). deltas: Δp, ΔR, Δs of equation (7).
-        moving_colours, standing_colours: [M, 3] and [N − M, 3] RGB. gloss: None: not learnt.
+        moving_colours, static_colours: [M, 3] and [N − M, 3] RGB. gloss: None: not learnt.
     """
 
     clusters: list[ClusterParams]
     deltas: Deltas
     moving_colours: Tensor
-    standing_colours: Tensor
+    static_colours: Tensor
     gloss: GlossParameters | None = None
     optimizers: list[FreeParameter] = field(default_factory=list)
 
@@ -89,7 +89,7 @@ class Parameters:
         if learnt is not None:
             self._free(iter([(self.moving_colours, start.colour)]), betas, "colour")
             if learnt.standing:
-                self._free(iter([(self.standing_colours, start.colour_standing)]), betas, "colour")
+                self._free(iter([(self.static_colours, start.static_colour)]), betas, "colour")
         if self.gloss is not None:
             own = (self.gloss.gloss, self.gloss.light, self.gloss.nearness)
             self._free(zip(own, self.gloss.rates, strict=True), GLOSS_BETAS, "gloss")

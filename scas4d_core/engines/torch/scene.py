@@ -74,7 +74,7 @@ class Scene:
     def all_colours(self, parameters: Parameters) -> Tensor:
         """[N, 3] RGB, without gloss."""
         colours = self.colours.index_copy(0, self.rows, parameters.moving_colours)
-        return colours.index_copy(0, self.standing, parameters.standing_colours)
+        return colours.index_copy(0, self.standing, parameters.static_colours)
 
     def seen(
         self, moved: Moved, colours: Tensor, gloss: Tensor | None, environment: Tensor | None, camera: CameraArrays

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import WorldFrame
-from scas4d_core.compact import Head
+from scas4d_core.compact import FileHeader
 from scas4d_core.errors import InputError
 from scas4d_core.exports.cloud import Cloud
 from scas4d_core.exports.reading.faults import readable
@@ -54,7 +54,7 @@ class ReadStates:
     >>> first = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1)
     >>> world = WorldFrame(np.zeros(3))
     >>> clouds = [cloud_of(state, world) for state in (first.rows([0]), first, first.rows([1]))]
-    >>> read = ReadStates([3, 4, 5], [0.0, 0.1, 0.2], clouds.__getitem__, Head(world))
+    >>> read = ReadStates([3, 4, 5], [0.0, 0.1, 0.2], clouds.__getitem__, FileHeader(world))
     >>> [(index, state.ids.tolist(), state.present.tolist()) for index, _, state in read.states()]
     [(3, [0], [True]), (4, [0, 1], [True, True]), (5, [0, 1], [False, True])]
     """
@@ -62,7 +62,7 @@ class ReadStates:
     frames: Sequence[int]
     times: Sequence[float]
     cloud: Callable[[int], Cloud]
-    head: Head
+    head: FileHeader
     part_of: dict[int, int] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
     damage: str | None = None
@@ -164,10 +164,10 @@ def _state(
     )
 
 
-def head_of(metres_per_unit: float, frames_per_second: float | None) -> Head:
+def head_of(metres_per_unit: float, frames_per_second: float | None) -> FileHeader:
     """The head of states in the user's world, in metres.
 
     >>> head_of(0.01, 30.0).world.to_inside(np.array([[100.0, 0, 0]]))
     array([[1., 0., 0.]])
     """
-    return Head(WorldFrame(np.zeros(3), metres_per_unit=metres_per_unit), frames_per_second=frames_per_second)
+    return FileHeader(WorldFrame(np.zeros(3), metres_per_unit=metres_per_unit), frames_per_second=frames_per_second)

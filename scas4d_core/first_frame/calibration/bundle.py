@@ -73,7 +73,7 @@ def adjusted(cameras: Sequence[Camera], tracks: Sequence[Track], *, focal: bool 
 
 
 @dataclass(frozen=True, eq=False)
-class Observed:
+class Observations:
     """Features of points: index of the camera and of the point of each [M], and its pixel [M, 2]."""
 
     camera: NDArray[np.intp]
@@ -81,7 +81,9 @@ class Observed:
     pixel: Float
 
 
-def _observed(cameras: Sequence[Camera], tracks: Sequence[Track], bound: float, seed: int) -> tuple[Observed, Float]:
+def _observed(
+    cameras: Sequence[Camera], tracks: Sequence[Track], bound: float, seed: int
+) -> tuple[Observations, Float]:
     """The right features of each track that gives a point, and the points [P, 3] (LO-RANSAC, pycolmap)."""
     point_of = triangulator(cameras, angle=MIN_ANGLE_DEG, error=bound, trials=100, seed=seed)
     points, owner, pixels = [], [], []
@@ -96,14 +98,14 @@ def _observed(cameras: Sequence[Camera], tracks: Sequence[Track], bound: float, 
             pixels.append(uv[right])
     index = np.repeat(np.arange(len(points)), [len(who) for who in owner])
     none = np.zeros(0, np.intp)
-    seen = Observed(np.concatenate([*owner, none]), index, np.concatenate([*pixels, np.zeros((0, 2))]))
+    seen = Observations(np.concatenate([*owner, none]), index, np.concatenate([*pixels, np.zeros((0, 2))]))
     return seen, np.array(points).reshape(-1, 3)
 
 
 class _Bundle:
     """Levenberg-Marquardt over poses and points; the points are eliminated (Schur complement)."""
 
-    def __init__(self, given: Sequence[Camera], seen: Observed, focal: bool, trust: float) -> None:
+    def __init__(self, given: Sequence[Camera], seen: Observations, focal: bool, trust: float) -> None:
         self.given, self.seen, self.focal, self.trust = given, seen, focal, trust
         self.size = 7 if focal else 6
         self.count = len(given)
@@ -211,7 +213,7 @@ class _Bundle:
         return moves.reshape(self.count, size), shifts
 
 
-def _sparse(blocks: Float, seen: Observed, cameras: int, points: int) -> csr_array:
+def _sparse(blocks: Float, seen: Observations, cameras: int, points: int) -> csr_array:
     """Blocks [M, s, 3] at (camera, point) as one matrix [s · cameras, 3 · points]."""
     size = blocks.shape[1]
     rows = np.broadcast_to(size * seen.camera[:, None, None] + np.arange(size)[:, None], blocks.shape)

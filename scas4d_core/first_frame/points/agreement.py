@@ -25,7 +25,7 @@ from scas4d_core.first_frame.points.surfaces import (
     settle,
     surface_depth,
 )
-from scas4d_core.first_frame.points.triangulation import Tracks, Triangulation, triangulate
+from scas4d_core.first_frame.points.triangulation import FeatureTracks, Triangulation, triangulate
 from scas4d_core.first_frame.points.visual_hull import MISSES, VisualHull, carve, contradicted, pixel_at
 from scas4d_core.first_frame.time_limit import TimeLimit
 from scas4d_core.posed_pictures import (
@@ -60,7 +60,7 @@ class Search:
 
     labelled: Sequence[PosedPicture]
     views: Sequence[PosedPicture]
-    tracks: Tracks
+    tracks: FeatureTracks
     backdrop: bool
     min_views: int
     stereo: bool

@@ -49,7 +49,7 @@ class Surface(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Plane:
+class PatchPlane:
     """normal · x = offset, |normal| = 1."""
 
     normal: Float
@@ -110,14 +110,14 @@ class Support:
     points: Float
 
 
-def fit_plane(points: Float) -> Plane | None:
+def fit_plane(points: Float) -> PatchPlane | None:
     """Least-squares plane of points [P, 3], P ≥ 3; None where they are collinear."""
     middle = points.mean(0)
     _, values, axes = np.linalg.svd(points - middle, full_matrices=False)
     if len(points) < 3 or values[1] < 1e-9 * max(values[0], 1e-300):
         return None
     normal = axes[2]
-    return Plane(normal, float(normal @ middle))
+    return PatchPlane(normal, float(normal @ middle))
 
 
 def fit_sphere(points: Float) -> Sphere | None:
@@ -197,7 +197,7 @@ def _sphere_residuals(parameters: Float, near: Float) -> Float:
 
 
 def _refined(surface: Surface, near: Float, tolerance: float) -> Surface | None:
-    if isinstance(surface, Plane):
+    if isinstance(surface, PatchPlane):
         return fit_plane(near) if len(near) >= 3 else None
     assert isinstance(surface, Sphere)
     if len(near) < 4:

@@ -168,7 +168,7 @@ def mutual_best(distance: NDArray[np.float32]) -> NDArray[np.intp]:
 
 
 @dataclass(frozen=True, eq=False)
-class Tracks:
+class FeatureTracks:
     """SIFT features of all views, and those that match from view to view.
 
     Attributes:
@@ -180,7 +180,7 @@ class Tracks:
     groups: list[NDArray[np.intp]]
 
 
-def matched_tracks(views: Sequence[PosedPicture], limit: TimeLimit | None = None) -> Tracks:
+def matched_tracks(views: Sequence[PosedPicture], limit: TimeLimit | None = None) -> FeatureTracks:
     """Matches SIFT features over all pairs of views; masks do not matter.
 
     Args:
@@ -195,7 +195,7 @@ def matched_tracks(views: Sequence[PosedPicture], limit: TimeLimit | None = None
     chosen = _pairs_in_time(described, limit)
     pairs = [guided_matches(described[a], described[b]) + offsets[[a, b]] for a, b in chosen]
     edges = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.intp)
-    return Tracks(pixels, owner, grouped(joined(edges, len(owner))))
+    return FeatureTracks(pixels, owner, grouped(joined(edges, len(owner))))
 
 
 def joined(edges: NDArray[np.intp], count: int) -> NDArray[np.intp]:
@@ -276,7 +276,7 @@ def triangulator(
 
 
 def triangulate(
-    views: Sequence[PosedPicture], tracks: Tracks | None = None, *, min_views: int = 3, seed: int = 0
+    views: Sequence[PosedPicture], tracks: FeatureTracks | None = None, *, min_views: int = 3, seed: int = 0
 ) -> Triangulation:
     """Triangulates each track of features robustly (LO-RANSAC), poses fixed.
 

@@ -10,7 +10,7 @@ export function reasonOf(report) {
   return report.degraded[0].toUpperCase() + report.degraded.slice(1);
 }
 
-const HELD = ["held_unusable", "held_implausible", "held_unmet"];
+const HELD = ["rejected_unusable", "rejected_implausible", "rejected_misfit"];
 
 export const isHeld = (report) => HELD.includes(report?.outcome);
 
@@ -20,7 +20,7 @@ export function showFacts(list, status) {
     ["Gaussians", status.gaussians === null ? "none yet" : number.format(status.gaussians)],
     ["Cameras", number.format(status.cameras.length)],
   ];
-  for (const [key, words] of [["set_aside", "set aside"], ["missing", "declared missing"], ["skipped", "skipped"]]) {
+  for (const [key, words] of [["failed", "failed"], ["missing", "declared missing"], ["skipped", "skipped"]]) {
     if (status[key]) facts.push([words[0].toUpperCase() + words.slice(1), number.format(status[key])]);
   }
   if (status.worker_deaths) facts.push(["Worker restarts", number.format(status.worker_deaths)]);
@@ -87,7 +87,7 @@ const outOfStep = (one) => (one?.off ? `, whose pictures are taken ${Math.abs(on
 /** Evidence of the alarms about a camera; they are made where the frame was reconstructed, and only shown here. */
 export const complaints = (name, report) => (report?.alarms ?? []).filter((one) => one.camera === name).map((one) => one.evidence);
 
-const TOLD = ["frame_held", "frame_in_part"];
+const TOLD = ["frame_rejected", "frame_in_part"];
 
 /** Alarms in sentences, but for those that the reason of the frame tells. */
 function sentences(report) {

@@ -18,8 +18,8 @@ from client.importers.open_source import CaptureOptions, open_source
 from client.pictures import psnr
 from scas4d_core.compact import CompactReader
 from scas4d_core.query.ply import read_ply
-from scas4d_core.storage.frame_aside import FrameAside, ScratchFile
 from scas4d_core.storage.history import History
+from scas4d_core.storage.scratch_frames import ScratchFile, ScratchFrame
 
 pytestmark = pytest.mark.slow
 
@@ -71,7 +71,7 @@ def test_scores_are_the_same_with_the_states_in_a_scratch_file(capture_folder, t
 
     def noted(self, frame):
         if "means" in frame:  # else it is a report
-            moved.append(isinstance(frame, FrameAside))
+            moved.append(isinstance(frame, ScratchFrame))
         return own(self, frame)
 
     rows = []

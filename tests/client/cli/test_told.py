@@ -18,8 +18,8 @@ def test_a_frame_that_went_as_it_should_has_no_more_lines() -> None:
 def test_a_held_frame_and_its_alarms_are_told_once() -> None:
     why = "held as it was: the pictures are met at 20.6 dB, 19.4 dB less than usual"
     alarms = [
-        Alarm(AlarmKind.FRAME_HELD, None, "the pictures are met at 20.6 dB"),
+        Alarm(AlarmKind.FRAME_REJECTED, None, "the pictures are met at 20.6 dB"),
         Alarm(AlarmKind.CAMERA_LEFT_OUT, "cam2", "no picture came"),
     ]
-    held = report(outcome=FrameOutcome.HELD_UNMET, degraded=why, alarms=alarms)
+    held = report(outcome=FrameOutcome.REJECTED_MISFIT, degraded=why, alarms=alarms)
     assert told(held).splitlines() == ["", f"  ! {why}", "  ! camera cam2: no picture came"]

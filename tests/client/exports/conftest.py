@@ -10,14 +10,14 @@ from export_cases.blob import BACKGROUND, BLOB, FRAMES, RATE, WORLD, make_rig, s
 
 from scas4d_core.cameras import Rig
 from scas4d_core.captures import Capture
-from scas4d_core.compact import CompactWriter, Head
+from scas4d_core.compact import CompactWriter, FileHeader
 
 
 @pytest.fixture(scope="session")
 def source(tmp_path_factory):
     """A folder like that of `scas4d reconstruct`."""
     folder = tmp_path_factory.mktemp("reconstructed")
-    head = Head(WORLD, background=BACKGROUND, rig=make_rig(), frames_per_second=RATE)
+    head = FileHeader(WORLD, background=BACKGROUND, rig=make_rig(), frames_per_second=RATE)
     with CompactWriter(folder / "states.s4d", head) as writer:
         for frame in range(FRAMES):
             writer.add(frame, frame / RATE, state(frame))

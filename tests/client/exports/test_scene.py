@@ -15,7 +15,7 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from client.scene import Scene
-from scas4d_core.compact import CompactWriter, Head
+from scas4d_core.compact import CompactWriter, FileHeader
 from scas4d_core.errors import InputError
 
 ROOT = Path(__file__).parents[3]
@@ -62,7 +62,7 @@ def test_what_is_not_there_is_told(tmp_path):
     later = first.retire([0])
     born = later.joined(first.rows([1, 2]).replace(means=first.means[1:3] + np.float32(0.1)))
     born = born.replace(ids=np.concatenate([first.ids, [400, 401]]))
-    with CompactWriter(tmp_path / "states.s4d", Head(WORLD)) as writer:
+    with CompactWriter(tmp_path / "states.s4d", FileHeader(WORLD)) as writer:
         for frame, one in enumerate((first, later, born)):
             writer.add(frame, float(frame), one)
     with Scene.open(tmp_path) as given:

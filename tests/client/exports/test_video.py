@@ -21,7 +21,7 @@ from client.exports.video.video import make_video, picture_size
 from client.exports.video.video_file import video_file
 from client.sdk import Client
 from client.wire import part_colour
-from scas4d_core.compact import CompactReader, CompactWriter, Head
+from scas4d_core.compact import CompactReader, CompactWriter, FileHeader
 from scas4d_core.errors import InputError
 
 av = pytest.importorskip("av")
@@ -199,7 +199,7 @@ def test_a_scene_of_the_service(service, tmp_path):
 
 
 def test_tracks_of_what_stands_are_refused(tmp_path):
-    with CompactWriter(tmp_path / "states.s4d", Head(WORLD, rig=make_rig())) as writer:
+    with CompactWriter(tmp_path / "states.s4d", FileHeader(WORLD, rig=make_rig())) as writer:
         still = state(0)
         writer.add(0, 0.0, still.replace(foreground=0 * still.foreground))
     with pytest.raises(InputError, match="tracks: nothing moves in these frames; leave --tracks out"):

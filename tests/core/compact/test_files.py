@@ -13,17 +13,17 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Camera, Rig, WorldFrame
-from scas4d_core.compact import Bounds, CompactReader, CompactWriter, DamagedFileError, FileError, Head
+from scas4d_core.compact import Bounds, CompactReader, CompactWriter, DamagedFileError, FileError, FileHeader
 from scas4d_core.compact.columns import Columns
 from scas4d_core.compact.frame_code import errors_of
 from scas4d_core.compact.index import footer
 from scas4d_core.compact.planes import deflated
-from scas4d_core.compact.records import HEAD_SIZE, Kind, parse_head, record_bytes, scan
+from scas4d_core.compact.records import HEAD_SIZE, RecordKind, parse_head, record_bytes, scan
 from scas4d_core.compact.writer import KEY_EVERY
 from scas4d_core.gaussians import Gaussians, quaternion_products
 
 RIG = Rig((Camera("front", [[100.0, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48),))
-HEAD = Head(WorldFrame(np.array([1.0, 2, 3]), 0.5), background=(0.1, 0.2, 0.3), rig=RIG, frames_per_second=30.0)
+HEAD = FileHeader(WorldFrame(np.array([1.0, 2, 3]), 0.5), background=(0.1, 0.2, 0.3), rig=RIG, frames_per_second=30.0)
 FRAMES = (0, 1, 2, 5, *range(6, 24))
 BORN_AT, RETIRED_AT, REVIVED_AT = 5, 12, 18
 
@@ -128,11 +128,11 @@ def test_the_head_tells_what_numbers_mean(file: Path) -> None:
 def test_keys_come_often_enough(file: Path) -> None:
     with file.open("rb") as opened:
         kinds = [record.kind for record in scan(opened, 0, "a")]
-    told = [kind for kind in kinds if kind in (Kind.KEY, Kind.DELTA)]
-    runs = "".join("k" if kind is Kind.KEY else "d" for kind in told).split("k")
+    told = [kind for kind in kinds if kind in (RecordKind.KEY, RecordKind.DELTA)]
+    runs = "".join("k" if kind is RecordKind.KEY else "d" for kind in told).split("k")
     assert max(map(len, runs)) == KEY_EVERY - 1
-    assert kinds[:2] == [Kind.HEAD, Kind.BORN]
-    assert kinds[-2:] == [Kind.PARTS, Kind.INDEX]
+    assert kinds[:2] == [RecordKind.HEAD, RecordKind.BORN]
+    assert kinds[-2:] == [RecordKind.PARTS, RecordKind.INDEX]
 
 
 def test_a_file_is_read_while_it_is_written(tmp_path: Path) -> None:
@@ -156,7 +156,7 @@ def test_a_file_that_was_cut_is_read_up_to_the_cut(file: Path, tmp_path: Path) -
     for cut in sorted({*rng.integers(0, len(data), 60).tolist(), *(record.end for record in records)}):
         path = tmp_path / f"{cut}.s4d"
         path.write_bytes(data[:cut])
-        states = [one for one in records if one.kind in (Kind.KEY, Kind.DELTA) or one.frame == 0]
+        states = [one for one in records if one.kind in (RecordKind.KEY, RecordKind.DELTA) or one.frame == 0]
         whole = [one.frame for one in states if one.end <= cut]
         if records[0].end > cut:
             with pytest.raises(FileError):
@@ -289,7 +289,7 @@ def test_an_index_that_is_none_is_passed_over(file: Path, tmp_path: Path, index:
         index = (0).to_bytes(4, "little") + deflated(b"[" * 100_000)
     assert isinstance(index, bytes)
     path = tmp_path / "a.s4d"
-    path.write_bytes(data + record_bytes(Kind.INDEX, index) + footer(len(data)))
+    path.write_bytes(data + record_bytes(RecordKind.INDEX, index) + footer(len(data)))
     with CompactReader(path) as reader:
         assert reader.frames == list(FRAMES)
         near(reader, 12)
@@ -297,14 +297,14 @@ def test_an_index_that_is_none_is_passed_over(file: Path, tmp_path: Path, index:
 
 def test_a_head_that_is_no_json_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises((TypeError, ValueError)):
-        CompactWriter(tmp_path / "a.s4d", Head(WorldFrame(np.zeros(3)), remark={"a": object()}))
+        CompactWriter(tmp_path / "a.s4d", FileHeader(WorldFrame(np.zeros(3)), remark={"a": object()}))
     assert not list(tmp_path.iterdir())
 
 
 def test_a_count_that_lies_fills_no_memory(tmp_path: Path) -> None:
     body = (2**31 - 1).to_bytes(4, "little") + bytes(9) * 40
     path = tmp_path / "a.s4d"
-    path.write_bytes(record_bytes(Kind.HEAD, HEAD.text()) + record_bytes(Kind.BORN, body, 0))
+    path.write_bytes(record_bytes(RecordKind.HEAD, HEAD.text()) + record_bytes(RecordKind.BORN, body, 0))
     with CompactReader(path) as reader, pytest.raises(DamagedFileError, match="2147483647 Gaussians in 364 bytes"):
         reader.state(0)
 
@@ -329,7 +329,7 @@ def test_a_count_that_lies_fills_no_memory(tmp_path: Path) -> None:
 )
 def test_heads_that_are_none_are_refused(text: bytes, says: str, tmp_path: Path) -> None:
     path = tmp_path / "a.s4d"
-    path.write_bytes(record_bytes(Kind.HEAD, text))
+    path.write_bytes(record_bytes(RecordKind.HEAD, text))
     with pytest.raises(FileError, match=says):
         CompactReader(path)
 
@@ -345,7 +345,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_record_of_a_later_version_is_named() -> None:
-    data = bytearray(record_bytes(Kind.KEY, b"abc", 3))
+    data = bytearray(record_bytes(RecordKind.KEY, b"abc", 3))
     data[4] = 77
     data[HEAD_SIZE - 4 : HEAD_SIZE] = zlib.crc32(data[: HEAD_SIZE - 4]).to_bytes(4, "little")
     with pytest.raises(FileError, match="kind 77 is at byte 12; a later version"):

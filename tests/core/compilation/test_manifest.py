@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from scas4d_core.compilation.compiling import types_of
-from scas4d_core.compilation.manifest import KERNELS, Group, kernels_of
+from scas4d_core.compilation.manifest import KERNELS, KernelGroup, kernels_of
 
 ROOT = Path(__file__).parents[3]
 
@@ -78,7 +78,7 @@ def test_every_kernel_is_listed_once_in_one_group():
     calls = [(kernel.module, kernel.name, kernel.arguments) for kernel in KERNELS]
     assert len(set(calls)) == len(calls)
     assert len({kernel.key for kernel in KERNELS}) == len(KERNELS)
-    assert kernels_of(Group) == sorted(KERNELS, key=lambda kernel: list(Group).index(kernel.group))
+    assert kernels_of(KernelGroup) == sorted(KERNELS, key=lambda kernel: list(KernelGroup).index(kernel.group))
 
 
 @pytest.mark.parametrize("kernel", KERNELS, ids=lambda kernel: kernel.key)

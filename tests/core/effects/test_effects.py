@@ -14,13 +14,13 @@ from source_tree import ROOT
 from scas4d_core.effect_names import EFFECTS
 from scas4d_core.effects import effect as effect_module
 from scas4d_core.effects.coherence.floor import FLOOR_WEIGHT
-from scas4d_core.effects.effect import Effect, Group, effect, refused_at_zero
-from scas4d_core.effects.evidence import Evidence, Seen
-from scas4d_core.effects.switches import IDLE, Switch, decided, first_switches, joined, names_on
+from scas4d_core.effects.effect import Effect, EffectGroup, effect, refusal_at_zero
+from scas4d_core.effects.evidence import Evidence, FrameObservation
+from scas4d_core.effects.switches import IDLE, Switch, decided, first_switches, names_on, register_effects
 from scas4d_core.errors import InputError
 from scas4d_core.presets import SettingError, preset
 from scas4d_core.settings import SceneSettings, Settings
-from scas4d_core.update.parts import Part, PlanBuilder
+from scas4d_core.update.parts import PlanBuilder, UpdatePart
 
 WEIGHTS = ("rigidity", "isometry", "rotation", "scale")
 
@@ -41,11 +41,11 @@ def test_the_descriptions_are_light() -> None:
 
 
 def test_an_effect_that_is_off_has_no_part() -> None:
-    off = joined(builder(), [])
+    off = register_effects(builder(), [])
     assert off.parts == []
     assert off.plan.axis_length == 0
     assert (off.plan.neighbour_terms, off.plan.colours) == (False, None)
-    plan = joined(builder(), ["isometry", "standing_colour"]).plan
+    plan = register_effects(builder(), ["isometry", "static_colour"]).plan
     assert plan.neighbour_terms
     assert (plan.rigidity, plan.isometry, plan.rotation) == (0, UPDATE.weights.isometry, 0)
     assert plan.colours is not None
@@ -72,7 +72,7 @@ def test_off_is_a_weight_of_nothing(name: str, weights: dict[str, float]) -> Non
 def test_colours_that_no_effect_frees_stay() -> None:
     usual = names_on(first_switches(Settings(update=UPDATE), 0))
     moving = BEFORE.moving
-    held = updated([name for name in usual if name != "standing_colour"])["colours"]
+    held = updated([name for name in usual if name != "static_colour"])["colours"]
     assert np.array_equal(held[~moving], BEFORE.colours[~moving])
     assert not np.array_equal(held[moving], BEFORE.colours[moving])
     assert np.array_equal(
@@ -84,9 +84,9 @@ def test_a_scene_without_a_floor_has_no_floor_term() -> None:
     assert not first_switches(Settings(), 0)["floor"].on
     scene = SceneSettings(floor=(0, 1, 0, -0.5))
     assert first_switches(Settings(scene=scene), 0)["floor"].on
-    plan = joined(builder(scene)).plan
+    plan = register_effects(builder(scene)).plan
     assert (plan.floor, plan.floor_weight) == (scene.floor, FLOOR_WEIGHT)
-    without = joined(builder()).plan
+    without = register_effects(builder()).plan
     assert (without.floor, without.floor_weight) == (None, 0.0)
 
 
@@ -114,11 +114,11 @@ def test_contradictions_are_refused(given: dict[str, object], fault: str, remedy
 @pytest.mark.parametrize("name", EFFECTS)
 def test_refusals_of_one_kind_have_one_text(name: str) -> None:
     """A rate or weight of 0 is refused in the same words by all effects that refuse it."""
-    for key in ("rate_colour", "rate_colour_standing", "rate_scale", *(f"weights.{one}" for one in WEIGHTS)):
+    for key in ("rate_colour", "rate_static_colour", "rate_scale", *(f"weights.{one}" for one in WEIGHTS)):
         first, _, last = key.partition(".")
         zero = Settings.model_validate({"update": {first: {last: 0} if last else 0}, "scene": {"floor": (0, 1, 0, 0)}})
-        refusal = effect(name).refused(zero)
-        assert refusal in (None, refused_at_zero(zero, key))
+        refusal = effect(name).refusal(zero)
+        assert refusal in (None, refusal_at_zero(zero, key))
         assert refusal is None or f"update.{key} is 0" == refusal[0]
 
 
@@ -132,15 +132,15 @@ def test_a_pinned_effect_is_on_or_off() -> None:
 class Shy(Effect):
     """An effect that goes by the number of the frame alone."""
 
-    def evidence(self, seen: Seen) -> Evidence | None:
+    def evidence(self, seen: FrameObservation) -> Evidence | None:
         share = {0: 0.5, 1: 0.9, 2: None}.get(seen.index, 0.1)
         return None if share is None else Evidence(share, f"frame {seen.index}")
 
     def join(self, builder: PlanBuilder) -> None:
-        builder.parts.append(Part())
+        builder.parts.append(UpdatePart())
 
 
-SHY = Shy("shy", Group.MOTION, "It moves.", "none", "none", auto=True, on_above=0.8, off_below=0.3)
+SHY = Shy("shy", EffectGroup.MOTION, "It moves.", "none", "none", auto=True, on_above=0.8, off_below=0.3)
 
 
 @pytest.fixture
@@ -151,8 +151,8 @@ def shy(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(sys.modules[module], "effect", lambda name: SHY if name == "shy" else found(name))
 
 
-def seen(index: int) -> Seen:
-    return Seen(index, BEFORE, None, RIG, [], None)  # type: ignore[arg-type]
+def seen(index: int) -> FrameObservation:
+    return FrameObservation(index, BEFORE, None, RIG, [], None)  # type: ignore[arg-type]
 
 
 @pytest.mark.usefixtures("shy")

@@ -16,7 +16,7 @@ from scas4d_core.engines.torch.engine import TorchEngine
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.parts import Attempt, Part, PlanBuilder
+from scas4d_core.update.parts import Attempt, PlanBuilder, UpdatePart
 from scas4d_core.update.result import AttemptOptions
 from scas4d_core.update.schedule import Stopping
 from scas4d_core.update.view_factory import ViewFactory
@@ -117,7 +117,7 @@ def test_an_update_of_eight_iterations_ends_where_the_reference_does(effect: str
         assert apart(true.environment, scene.previous.environment) > 0.01  # it is learnt
 
 
-class GainsOfOne(Part):
+class GainsOfOne(UpdatePart):
     """Follows gains that start at 1, and remembers their end."""
 
     def begin(self, attempt: Attempt) -> None:
@@ -184,7 +184,7 @@ def test_iterations_lower_the_error_of_the_probes(engine: UpdateEngine) -> None:
 def test_what_has_no_rate_or_no_factor_stays(engine: UpdateEngine) -> None:
     scene = case(**EFFECTS["standing colours"])
     tables = random_tables(scene)
-    loaded(engine, scene, tables, layers=((0.02, 0.0, 0.005), (0.02, 0.02, 0.0)), scale=0.0, colour_standing=0.0)
+    loaded(engine, scene, tables, layers=((0.02, 0.0, 0.005), (0.02, 0.02, 0.0)), scale=0.0, static_colour=0.0)
     for _ in range(3):
         engine.iterate([1], step(layers=(1.0, 0.0), resting=0))
     after, state = engine.tables(), engine.state(learnt=True)

@@ -173,9 +173,9 @@ def test_a_missing_package_is_named(tmp_path, monkeypatch):
 
 def test_from_a_compact_file(tmp_path):
     pytest.importorskip("zstandard", reason="compact files need zstandard")
-    from scas4d_core.compact import CompactReader, CompactWriter, Head
+    from scas4d_core.compact import CompactReader, CompactWriter, FileHeader
 
-    with CompactWriter(tmp_path / "a.s4d", Head(corner.WORLD, rig=corner.rig())) as writer:
+    with CompactWriter(tmp_path / "a.s4d", FileHeader(corner.WORLD, rig=corner.rig())) as writer:
         for index, time, state in states():
             writer.add(index, time, state)
     with CompactReader(tmp_path / "a.s4d") as reader:

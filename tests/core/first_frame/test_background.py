@@ -83,7 +83,7 @@ def test_it_is_committed_and_goes_on(tmp_path: Path, background: list[float] | s
     assert as_begun(settings, read.history).scene.background == expected
     again = Reconstruction.resume(rig, settings, History.open(tmp_path / "states"))
     assert again.settings.scene.background == expected
-    assert Reconstruction.aside(rig, settings, again.history, 0).settings.scene.background == expected
+    assert Reconstruction.fork(rig, settings, again.history, 0).settings.scene.background == expected
     again.step(take_frame(1, 1 / 30, moved(box), rig))
     np.testing.assert_allclose(again.render(outside).colour, np.broadcast_to(expected, (8, 8, 3)), atol=1e-6)
 
@@ -93,7 +93,7 @@ def test_a_history_that_says_nothing_has_black() -> None:
     history.append(0, 0.0, Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0]))
     away = Camera("away", [[100, 0, 8], [0, 100, 8], [0, 0, 1]], FAR_AWAY, 16, 16)
     assert not CommittedScene(history, WorldFrame(np.zeros(3))).render(away).colour.any()
-    assert as_begun(Settings(), history).scene.behind == (0.0, 0.0, 0.0)
+    assert as_begun(Settings(), history).scene.background_rgb == (0.0, 0.0, 0.0)
 
 
 def test_a_thing_that_fills_the_pictures_has_the_colour_painted_behind_it() -> None:
@@ -104,7 +104,7 @@ def test_a_thing_that_fills_the_pictures_has_the_colour_painted_behind_it() -> N
 
 def test_pictures_that_are_refused_later_are_not_looked_at() -> None:
     for images in ({}, {"c0": np.zeros((48, 64), np.uint8)}, {"c0": np.zeros((1, 2, 3), np.uint8)}):
-        assert with_background(Settings(), images).scene.behind == (0.0, 0.0, 0.0)
+        assert with_background(Settings(), images).scene.background_rgb == (0.0, 0.0, 0.0)
 
 
 def test_a_colour_beyond_1_is_refused() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from scas4d_core.first_frame.points.silhouettes import plain_background, silhouette
-from scas4d_core.first_frame.points.surfaces import Plane, Sphere, fit_surfaces, sample_surfaces, settle
+from scas4d_core.first_frame.points.surfaces import PatchPlane, Sphere, fit_surfaces, sample_surfaces, settle
 from scas4d_core.first_frame.points.visual_hull import carve, contradicted
 from scas4d_core.posed_pictures import PosedPicture
 
@@ -115,13 +115,13 @@ def test_floor_and_dome_are_found_among_wrong_points(scene):
     wrong = rng.uniform(-1.5, 0.7, (80, 3))
     found = fit_surfaces(np.concatenate([_dome(120), wrong]), centres, 0.03, most=3, seed=0)
     kinds = {type(support.surface) for support in found}
-    assert kinds == {Plane, Sphere}
+    assert kinds == {PatchPlane, Sphere}
     assert len(found) == 2
     for support in found:
         if isinstance(support.surface, Sphere):
             assert support.surface.radius == pytest.approx(3.0, abs=0.02)
             assert support.surface.centre == pytest.approx(np.zeros(3), abs=0.03)
-        elif isinstance(support.surface, Plane):
+        elif isinstance(support.surface, PatchPlane):
             assert np.abs(support.surface.normal[1]) == pytest.approx(1.0, abs=1e-3)
 
 

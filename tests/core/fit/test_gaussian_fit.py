@@ -9,7 +9,7 @@ import pytest
 from box_scene import make_box, make_rig, take_frame
 
 from scas4d_core.engines.choose import fit_engine_of, renderer_of
-from scas4d_core.engines.cpu.gloss import Shading
+from scas4d_core.engines.cpu.gloss import GlossShading
 from scas4d_core.engines.fit import COLOUR, COLUMNS, LABEL, MEAN, OPACITY, SCALE, FitLoss, FitScalars
 from scas4d_core.engines.limits import scene_limits
 from scas4d_core.engines.views import TrainingView
@@ -103,7 +103,7 @@ def test_fixed_gaussians_are_drawn_and_stay_as_they_are() -> None:
 
 def test_glossy_fixed_gaussians_are_drawn_as_each_camera_sees_them() -> None:
     normals = BOX.means / np.linalg.norm(BOX.means, axis=1, keepdims=True)
-    environment = Shading.fresh(normals, BOX.means).environment
+    environment = GlossShading.fresh(normals, BOX.means).environment
     environment[:CELLS] = np.random.default_rng(0).uniform(-0.5, 1, (CELLS, 3))
     glossy = BOX.replace(gloss=normals, environment=environment)
     clear = table()[:1]
@@ -163,7 +163,7 @@ def test_gloss_is_learnt_where_it_is_given_and_new_rows_inherit_it() -> None:
     assert plain.table.gloss is None
     assert plain.state().gloss is None
     normals = (BOX.means[:COUNT] / np.linalg.norm(BOX.means[:COUNT], axis=1, keepdims=True)).astype(np.float32)
-    gloss = Shading.fresh(0.5 * normals, table()[:, MEAN])
+    gloss = GlossShading.fresh(0.5 * normals, table()[:, MEAN])
     fit = make_fit(gloss=gloss)
     fit.run([0, 1, 2], lambda now: only(COLOUR))
     state = fit.state()

@@ -14,7 +14,7 @@ from hypothesis import given
 from law_cases import law, seeds
 
 from scas4d_core.cameras import Rig
-from scas4d_core.effects.switches import joined
+from scas4d_core.effects.switches import register_effects
 from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import SMALLEST_CLUSTER
@@ -57,7 +57,7 @@ def updated(state: Gaussians, hierarchy: Hierarchy, rig: Rig, monkeypatch: pytes
     views = factory.views(FRAME, {})
     names = [view.name for view in views]
     monkeypatch.setattr(ViewPlan, "take", lambda plan: [names.index(next(sequence))])
-    built = joined(PlanBuilder(SceneSettings(), SETTINGS, factory, hierarchy, state))
+    built = register_effects(PlanBuilder(SceneSettings(), SETTINGS, factory, hierarchy, state))
     return FrameUpdate(CpuEngine(), built, NEIGHBOURS).run(state, views, None, 1.0, seed=1)
 
 

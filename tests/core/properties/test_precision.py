@@ -15,7 +15,7 @@ from box_scene import MOVING, make_box, make_rig, moved, take_frame
 from law_cases import doubles
 from torch import Tensor
 
-from scas4d_core.effects.switches import joined
+from scas4d_core.effects.switches import register_effects
 from scas4d_core.engines.cpu.deformation import CpuDeformation
 from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.cpu.renderer import CpuRenderer
@@ -194,7 +194,7 @@ def optimizer(found: dict[str, float]) -> None:
 
 def updated(engine: UpdateEngine, iterations: int, state: Gaussians = BOX) -> UpdateResult:
     settings = SETTINGS.model_copy(update={"iterations": iterations})
-    built = joined(PlanBuilder(SceneSettings(), settings, FACTORY, HIERARCHY, BOX))
+    built = register_effects(PlanBuilder(SceneSettings(), settings, FACTORY, HIERARCHY, BOX))
     views = FACTORY.views(FRAME, {})
     return FrameUpdate(engine, built, NEIGHBOURS).run(state, views, disturbed_motion(), 1.0, seed=2)
 

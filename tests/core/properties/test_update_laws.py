@@ -146,7 +146,7 @@ def iterate(case: Case, view: int = 0) -> Iteration:
     engine.set_tables(case.start)
     start = AttemptStart(
         layers=((0.02, 0.008, 0.002), (0.01, 0.002, 0.002)), position=5e-4, rotation=2e-3, scale=1e-3, colour=2e-3,
-        colour_standing=1e-2, beta1=0.9, beta2=0.999, samples=[case.rows],
+        static_colour=1e-2, beta1=0.9, beta2=0.999, samples=[case.rows],
     )  # fmt: skip
     engine.begin(start)
     engine.iterate([view], STEP)
@@ -156,7 +156,7 @@ def iterate(case: Case, view: int = 0) -> Iteration:
         for p in parameters.clusters
     ]
     tables.append(np.concatenate([values.detach().numpy() for values in parameters.deltas], axis=1))
-    colours = np.concatenate([parameters.moving_colours.detach().numpy(), parameters.standing_colours.detach().numpy()])
+    colours = np.concatenate([parameters.moving_colours.detach().numpy(), parameters.static_colours.detach().numpy()])
     names = ("cluster 0", "cluster 1", "deltas", "colours")
     return Iteration(engine.log().losses[0], [gradients[name] for name in names], [*tables, colours])
 

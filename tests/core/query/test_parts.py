@@ -180,7 +180,7 @@ def test_refusals():
 def test_gaussians_born_later_belong_to_the_part_of_their_founders():
     whole, which = bodies()
     born, count, birth = np.arange(0, len(which), 3), len(which), 5
-    founders = np.array([int(np.flatnonzero(which == which[row])[1]) for row in born])
+    parents = np.array([int(np.flatnonzero(which == which[row])[1]) for row in born])
     history, roots = History(), None
     for t in whole.indices:
         state = whole.gaussians(t)
@@ -188,12 +188,12 @@ def test_gaussians_born_later_belong_to_the_part_of_their_founders():
             there = state.rows(born)
             ids = np.full(len(born), -1) if t == birth else history.ids[count:]
             state = state.joined(there).replace(ids=np.concatenate([state.ids, ids]))
-            roots = grown_roots(history.roots(), state, founders) if t == birth else None
-        given = {} if t != birth else {"joins": founders, "roots": roots}
+            roots = grown_roots(history.roots(), state, parents) if t == birth else None
+        given = {} if t != birth else {"parents": parents, "roots": roots}
         history.append(t, t / 30, state.retire([0, 1]) if t == whole.indices[-1] else state, **given)
     positions, rotations = module.motion(history, np.arange(count, count + len(born)), 12)
     then, turned = module.motion(whole, born, 12)
-    np.testing.assert_allclose(positions, then, atol=1e-5)  # before their birth they were where their founders led
+    np.testing.assert_allclose(positions, then, atol=1e-5)  # before their birth they were where their parents led
     assert np.abs(np.sum(rotations * turned, axis=-1)).min() > 1 - 1e-5
     labels = parts(history, 3)
     assert np.array_equal(labels[2:count], which[2:])

@@ -247,7 +247,7 @@ def living_history() -> tuple[History, np.ndarray]:
             state = state.replace(ids=ids if t == 2 else np.concatenate([state.ids[:200], history.ids[200:]]))
         if t in (3, 4):
             state = state.retire(np.arange(200))
-        history.append(t, t / 30, state, joins=np.zeros(200, np.int64) if t == 2 else None)
+        history.append(t, t / 30, state, parents=np.zeros(200, np.int64) if t == 2 else None)
     assert history.born_at[rows].tolist() == [2] * 200
     return history, rest
 

@@ -31,7 +31,7 @@ def missed(one: Reconstruction, truth: np.ndarray) -> float:
 
 
 def test_the_first_update_is_longer_and_the_next_is_not() -> None:
-    short, longer = scene(cold_longer=1.0), scene()
+    short, longer = scene(cold_start_iterations=1.0), scene()
     reports = [one.step(take_frame(1, 0.1, FAR, RIG)) for one in (short, longer)]
     assert [report.attempts for report in reports] == [["as set"], ["as set, the best of 3 orders"]]
     assert [(report.iterations, report.outcome) for report in reports] == [
@@ -60,7 +60,7 @@ def test_a_budget_in_milliseconds_is_kept() -> None:
 def test_where_nothing_moves_there_is_nothing_to_go_on_with() -> None:
     one = scene()
     report = one.step(take_frame(1, 0.1, BOX, RIG))
-    assert (report.outcome, report.iterations) == (FrameOutcome.STOOD, 0)
+    assert (report.outcome, report.iterations) == (FrameOutcome.UNCHANGED, 0)
     np.testing.assert_array_equal(one.history.newest.means, BOX.means)
 
 
@@ -74,7 +74,7 @@ def test_a_later_update_without_a_motion_is_longer_too() -> None:
 def test_while_the_light_changes_no_frame_stands() -> None:
     rng = np.random.default_rng(0)
     for mode, iterations in (("off", 0), ("on", 15)):
-        one = scene(effects={"light": mode}, still=1.0)
+        one = scene(effects={"light": mode}, skip_tolerance=1.0)
         for index in (1, 2, 3):
             still = take_frame(index, 0.1 * index, FAR, RIG)
             noisy = {name: image ^ rng.integers(0, 2, image.shape, np.uint8) for name, image in still.images.items()}

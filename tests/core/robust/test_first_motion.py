@@ -15,7 +15,7 @@ from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_outcome import OTHER_ORDERS, Candidate
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.robust import first_motion
-from scas4d_core.robust.first_motion import ANOTHER_ORDER, FASTER, Ended, best_order
+from scas4d_core.robust.first_motion import ANOTHER_ORDER, FASTER, OrderResult, best_order
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.solve_frame import FrameSolver
 from scas4d_core.settings import Settings, UpdateSettings
@@ -27,24 +27,24 @@ FURTHER = moved(BOX, Rotation.from_rotvec([0.1, 0.5, 0.0]), np.array([0.16, 0.0,
 NAMES = ("c0", "c1", "c2")
 
 
-def end(error: float, *, fault: str | None = None, kept: Candidate = Candidate.END, fits: Any = NAMES) -> Ended:
+def end(error: float, *, fault: str | None = None, kept: Candidate = Candidate.END, fits: Any = NAMES) -> OrderResult:
     """An end whose cameras have this root mean square error."""
     trace = UpdateTrace([0.1], seconds={"start": 2.0, "end": 1.0}, kept=kept)
-    return Ended(UpdateResult(BOX, None, trace), fault, dict.fromkeys(fits, -20 * math.log10(error)))
+    return OrderResult(UpdateResult(BOX, None, trace), fault, dict.fromkeys(fits, -20 * math.log10(error)))
 
 
-def ends(*given: Ended) -> Any:
+def ends(*given: OrderResult) -> Any:
     """Runs that end so, and the seeds and factors that they were given."""
     asked: list[tuple[int, float]] = []
 
-    def run(seed: int, faster: float) -> Ended:
+    def run(seed: int, faster: float) -> OrderResult:
         asked.append((seed, faster))
         return given[len(asked) - 1]
 
     return run, asked
 
 
-def best_of(*given: Ended) -> tuple[int, int]:
+def best_of(*given: OrderResult) -> tuple[int, int]:
     """Which of some ends is taken, and how many ran."""
     best, orders = best_order(ends(*given)[0], 0)
     return next(k for k, one in enumerate(given) if one.fits is best.fits), orders
@@ -66,7 +66,7 @@ def test_where_two_disagree_a_third_is_tried(errors: tuple[float, ...]) -> None:
     assert len({seed for seed, _ in asked}) == 3
 
 
-@pytest.mark.parametrize("worse", [{"fault": "flew away"}, {"kept": Candidate.STILL}])
+@pytest.mark.parametrize("worse", [{"fault": "flew away"}, {"kept": Candidate.PREVIOUS}])
 def test_a_state_that_cannot_be_or_did_not_move_is_the_last_choice(worse: dict[str, Any]) -> None:
     assert best_of(end(0.001, **worse), end(0.02), end(0.03)) == (1, 3)
     assert best_of(end(0.001, **worse), end(0.001, **worse), end(0.02)) == (2, 3)  # two of them do not agree
@@ -84,7 +84,7 @@ def test_a_camera_that_one_order_left_out_has_no_say() -> None:
 
 
 def test_one_that_needed_no_iteration_is_not_tried_again() -> None:
-    stood = Ended(UpdateResult(BOX, None, UpdateTrace()), None, {})
+    stood = OrderResult(UpdateResult(BOX, None, UpdateTrace()), None, {})
     assert best_of(stood) == (0, 1)
 
 
@@ -107,7 +107,7 @@ def test_only_the_first_update_of_a_scene_is_tried_in_several_orders() -> None:
     assert np.linalg.norm(one.history.newest.means - FURTHER.means, axis=1)[:MOVING].mean() < 0.02
 
 
-@pytest.mark.parametrize("update", [{"cold_longer": 1.0}, {"budget_ms": 200.0}])
+@pytest.mark.parametrize("update", [{"cold_start_iterations": 1.0}, {"budget_ms": 200.0}])
 def test_neither_where_it_may_take_no_longer_nor_by_the_clock(update: dict[str, float]) -> None:
     assert OTHER_ORDERS not in scene(**update).step(take_frame(1, 0.1, FAR, RIG)).seconds
 

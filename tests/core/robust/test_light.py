@@ -15,8 +15,8 @@ from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.frame_report import FrameReport
 from scas4d_core.metrics import psnr
 from scas4d_core.reconstruction import Reconstruction
-from scas4d_core.robust.checks import ALIKE, EXPOSURE, goes_on, noted
-from scas4d_core.robust.checks import lit as with_light
+from scas4d_core.robust.checks import ALIKE, EXPOSURE, light_continues, noted
+from scas4d_core.robust.checks import with_light as with_light
 from scas4d_core.robust.outliers import Past
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
@@ -38,10 +38,10 @@ NOISE = 1.0
 """Levels of 255: with more of it, what seems to move without masks differs from light to light."""
 
 GIVEN: Settings = SyntheticFootage().settings
-PINNED: dict[str, Mode] = {"standing_colour": "on", "shadows": "off"}
+PINNED: dict[str, Mode] = {"static_colour": "on", "shadows": "off"}
 """The state was not fitted to pictures: what stands has to learn its colours, whether they change or not."""
 SETTINGS = GIVEN.model_copy(
-    update={"update": GIVEN.update.model_copy(update={"patience": PATIENCE}), "effects": PINNED}
+    update={"update": GIVEN.update.model_copy(update={"max_rejected_frames": PATIENCE}), "effects": PINNED}
 )
 FOOTAGE = SyntheticFootage(SETTINGS)
 
@@ -51,13 +51,13 @@ def quiet(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(frames_footage, "NOISE", NOISE)
 
 
-def lit(pictures: dict[str, np.ndarray], light: float) -> dict[str, np.ndarray]:
+def brighten(pictures: dict[str, np.ndarray], light: float) -> dict[str, np.ndarray]:
     return {name: (light * picture).round().clip(0, 255).astype(np.uint8) for name, picture in pictures.items()}
 
 
 def sent(index: int, light: float, masks: bool) -> Frame:
     frame = FOOTAGE.frame(index)
-    return replace(frame, images=lit(dict(frame.images), light), masks=frame.masks if masks else {})
+    return replace(frame, images=brighten(dict(frame.images), light), masks=frame.masks if masks else {})
 
 
 def started(light: float, masks: bool) -> Reconstruction:
@@ -74,7 +74,7 @@ def run(lights: list[float], masks: bool) -> tuple[list[float], list[FrameReport
     scene, found, reports = started(lights[0], masks), [], []
     for index in range(1, len(lights)):
         reports.append(scene.step(sent(index, lights[index], masks)))
-        truth = lit(dict(FOOTAGE.truth(index)), lights[index])
+        truth = with_light(dict(FOOTAGE.truth(index)), lights[index])
         shown = {camera.name: scene.render(camera, index).colour for camera in FOOTAGE.held_out}
         found.append(float(np.mean([psnr(shown[name], truth[name]) for name in shown])))
     return found, reports, scene
@@ -98,11 +98,11 @@ def test_a_light_that_flickers_is_not_taken_on() -> None:
     past = Past()
     for light in (1.3, 0.8, 1.3, 1.3, 1.31, 1.0):
         past = with_light(past, light)
-    assert past.lit == 0
+    assert past.light_frames == 0
     counts = []
     for light in (1.3, 0.8, 1.3, 1.3, 1.33, 2.4, 2.5, 0.02, 0.0):
         past = with_light(past, light)
-        counts.append(past.lit)
+        counts.append(past.light_frames)
     assert counts == [1, 1, 1, 2, 3, 4, 5, 0, 0]
 
 
@@ -118,17 +118,17 @@ def test_frames_that_were_held_or_stood_are_told_as_they_are() -> None:
     again = scene.step(replace(sent(1, 1.0, True), index=2, time=2 / 30))
     dark = scene.step(sent(3, 0.02, True))
     outcomes = [report.outcome for report in (moved, again, dark)]
-    assert outcomes == [FrameOutcome.UPDATED, FrameOutcome.STOOD, FrameOutcome.HELD_UNUSABLE]
+    assert outcomes == [FrameOutcome.UPDATED, FrameOutcome.UNCHANGED, FrameOutcome.REJECTED_UNUSABLE]
     assert (moved.used, moved.kept) == (list(FOOTAGE.rig.names), "end")
-    assert (again.used, again.iterations, again.kept, again.exposure) == ([], 0, "still", 1.0)
-    assert (dark.used, dark.iterations, dark.kept, dark.errors) == ([], 0, "still", {})
+    assert (again.used, again.iterations, again.kept, again.exposure) == ([], 0, "previous", 1.0)
+    assert (dark.used, dark.iterations, dark.kept, dark.errors) == ([], 0, "previous", {})
     assert dark.exposure == pytest.approx(0.02, abs=0.01)
     upside_down = {name: image[::-1].copy() for name, image in sent(4, 1.2, True).images.items()}
     held = scene.step(replace(sent(4, 1.0, True), images=upside_down))
-    assert (held.used, held.kept, held.outcome) == ([], "still", FrameOutcome.HELD_UNMET)
+    assert (held.used, held.kept, held.outcome) == ([], "previous", FrameOutcome.REJECTED_MISFIT)
     assert str(held.degraded).startswith("held as it was: ")
     assert held.exposure > 1.0
-    assert held.errors[Candidate.END] < held.errors[Candidate.STILL]
+    assert held.errors[Candidate.END] < held.errors[Candidate.PREVIOUS]
 
 
 DIMS = [1.0, 0.99, 0.97, 0.94, 0.90, 0.85, 0.79, 0.73, 0.68]
@@ -161,6 +161,6 @@ def test_lights_that_flicker_or_jump_do_not_go_on() -> None:
         past, found = noted(Past(), bright), []
         for light in lights[1:]:
             pictures = {name: light * value for name, value in bright.items()}
-            found.append(goes_on(past, pictures))
+            found.append(light_continues(past, pictures))
             past = Past.of_arrays(noted(past, pictures).arrays())
         assert found == goes

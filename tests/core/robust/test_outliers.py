@@ -173,7 +173,7 @@ def test_an_update_that_renders_one_camera_says_as_much_as_one_that_renders_all(
     past = replace(PAST, places=places)
     only = {name: LEVEL + places[name]}
     assert abs(places[name]) > 4
-    assert outliers.behind(replace(past, held=1), only) is None
+    assert outliers.behind(replace(past, rejected=1), only) is None
     after = outliers.settle(past, only, BRIGHT, 1.0)
     assert after.level == pytest.approx(LEVEL)
     assert after.places[name] == pytest.approx(places[name])
@@ -197,7 +197,7 @@ def test_what_is_usual_follows_slowly_and_not_what_was_left_out() -> None:
     better = outliers.settle(PAST, {name: value + 2 for name, value in USUAL.items()}, times(1.2), 1.2)
     assert better.level == pytest.approx(LEVEL + outliers.LEVEL_RATE * 2)
     assert better.brightness["c0"] == pytest.approx(BRIGHT["c0"])
-    assert (better.updates, better.held) == (PAST.updates + 1, 0)
+    assert (better.updates, better.rejected) == (PAST.updates + 1, 0)
     one = outliers.settle(PAST, {**USUAL, "c0": USUAL["c0"] - 3}, BRIGHT, 1.0)
     assert PLACES["c0"] - 3 * outliers.PLACE_RATE - 0.2 < one.places["c0"] < PLACES["c0"]
 
@@ -221,7 +221,7 @@ def test_a_camera_that_was_not_there_keeps_its_past_and_a_new_one_gets_its_own()
 
 
 def test_the_past_goes_through_arrays_unchanged() -> None:
-    past = replace(PAST, held=3, error={"c0": 0.02, "c5": 0.03}, places={**PLACES, "x": nan})
+    past = replace(PAST, rejected=3, error={"c0": 0.02, "c5": 0.03}, places={**PLACES, "x": nan})
     past = replace(past, brightness={**BRIGHT, "x": nan}, out={**PAST.out, "x": 2})
     back = Past.of_arrays(past.arrays())
     assert repr(back) == repr(past)

@@ -11,13 +11,13 @@ import pytest
 
 from scas4d_core.cameras import rig_inside
 from scas4d_core.captures.frame import Frame
-from scas4d_core.effects.switches import joined
+from scas4d_core.effects.switches import register_effects
 from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.robust.checks import evened, gain_of, relit
+from scas4d_core.robust.checks import compensate_exposure, gain_of, relit
 from scas4d_core.robust.relocation import find_jump, shifted
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
@@ -39,7 +39,7 @@ SETTINGS = UpdateSettings(iterations=30, clusters=(2, 12))
 
 def updater(settings: UpdateSettings = SETTINGS, engine: CpuEngine | None = None) -> FrameUpdate:
     hierarchy = build_hierarchy(BEFORE.means, BEFORE.moving, settings.clusters, 8)
-    built = joined(PlanBuilder(SceneSettings(metres_per_unit=1.0), settings, FACTORY, hierarchy, BEFORE))
+    built = register_effects(PlanBuilder(SceneSettings(metres_per_unit=1.0), settings, FACTORY, hierarchy, BEFORE))
     return FrameUpdate(engine or CpuEngine(), built, None)
 
 
@@ -82,7 +82,7 @@ def test_probe_views_tell_the_nearer_of_two_states() -> None:
 @pytest.mark.parametrize("iterations", [1, 3, 30])
 @pytest.mark.parametrize("index", [0, 1, 2])
 def test_an_update_is_never_worse_than_standing_or_going_on(iterations: int, index: int) -> None:
-    settings = SETTINGS.model_copy(update={"cold_start": 8.0})  # few steps of this size only do harm
+    settings = SETTINGS.model_copy(update={"cold_start_rates": 8.0})  # few steps of this size only do harm
     update, frame = updater(settings), FOOTAGE.frame(index)
     moved = update.run(BEFORE, views(FOOTAGE.frame(1)), None, 0.1, 0, compared(30))
     for motion in (None, moved.motion):
@@ -91,7 +91,7 @@ def test_an_update_is_never_worse_than_standing_or_going_on(iterations: int, ind
         assert here <= error(BEFORE, frame) + 1e-6
         assert here <= min(mean_error(errors, list(errors)) for errors in found.trace.errors.values()) + 1e-6
         assert found.trace.kept in found.trace.errors
-        if found.trace.kept == "still":
+        if found.trace.kept == "previous":
             assert found.gaussians is BEFORE
 
 
@@ -154,7 +154,7 @@ def test_a_frame_that_stands_needs_no_iteration() -> None:
         1,
         compared(30, enough),
     )
-    assert (stands.trace.losses, stands.trace.kept) == ([], "still")
+    assert (stands.trace.losses, stands.trace.kept) == ([], "previous")
     for later, expected in ((FOOTAGE.frame(1), 30), (frame, 30)):
         asked = enough if expected and later is not frame else None
         moves = update.run(
@@ -185,7 +185,7 @@ def test_the_gain_of_the_light_is_found_and_taken_out(gain: float) -> None:
     frame = FOOTAGE.frame(0)
     brighter = {name: (gain * picture).round().clip(0, 255).astype(np.uint8) for name, picture in frame.images.items()}
     sent = views(replace(frame, images=brighter))
-    found, without, others = evened(FACTORY, RENDERER, BEFORE, sent[2:], sent[:2])
+    found, without, others = compensate_exposure(FACTORY, RENDERER, BEFORE, sent[2:], sent[:2])
     assert found == pytest.approx(gain, rel=0.03)
     assert gain_of(RENDERER, BEFORE, sent) == pytest.approx(gain, rel=0.03)
     for view, usual in zip([*others, *without], views(frame), strict=True):
@@ -196,7 +196,7 @@ def test_the_gain_of_the_light_is_found_and_taken_out(gain: float) -> None:
 
 def test_pictures_that_are_not_brighter_stay_as_they_are() -> None:
     before = views(FOOTAGE.frame(1))
-    found, without, others = evened(FACTORY, RENDERER, BEFORE, before[2:], before[:2])
+    found, without, others = compensate_exposure(FACTORY, RENDERER, BEFORE, before[2:], before[:2])
     assert found == 1.0
     assert all(one is other for one, other in zip(before, [*others, *without], strict=True))
 

@@ -17,7 +17,7 @@ from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust import outliers as judge
 from scas4d_core.robust.checks import axis_lengths, brightness, check_brightness
-from scas4d_core.robust.checks import lit as with_light
+from scas4d_core.robust.checks import with_light as with_light
 from scas4d_core.robust.outliers import ERROR_RISE, Past
 from scas4d_core.robust.solve_frame import FrameSolver
 from scas4d_core.robust.update_input import UpdateInput
@@ -41,7 +41,7 @@ BRIGHT = brightness(FRAME.images)
 FACTORY = ViewFactory(RIG)
 VIEWS = FACTORY.views(FRAME, {})
 RENDERER = CpuRenderer((0.0, 0.0, 0.0))
-SETTINGS = UpdateSettings(iterations=30, clusters=(2,), patience=3)
+SETTINGS = UpdateSettings(iterations=30, clusters=(2,), max_rejected_frames=3)
 LEVEL = 33.0
 PAST = judge.settle(Past(), dict.fromkeys(NAMES, LEVEL), BRIGHT, 1.0)
 MOTION = Motion([np.zeros((1, 3))], [np.full((1, 3), 0.01)], np.zeros((1, 3)), np.zeros((1, 3)), 0.1)
@@ -139,9 +139,9 @@ def test_where_no_rung_holds_the_state_stays_and_says_why() -> None:
     assert len(fake.options) == 3
     assert outcome.gaussians is BEFORE
     assert outcome.motion is MOTION
-    assert outcome.outcome is FrameOutcome.HELD_IMPLAUSIBLE
+    assert outcome.outcome is FrameOutcome.REJECTED_IMPLAUSIBLE
     assert "not finite" in outcome.reason
-    assert (after.held, after.updates) == (PAST.held + 1, PAST.updates)
+    assert (after.rejected, after.updates) == (PAST.rejected + 1, PAST.updates)
 
 
 def test_an_unmet_frame_is_sought_longer_and_from_where_the_update_ended() -> None:
@@ -155,13 +155,13 @@ def test_an_unmet_frame_is_sought_longer_and_from_where_the_update_ended() -> No
 
 def test_what_is_sought_from_where_an_update_ended_has_the_motion_of_both() -> None:
     fake = Fake(met(LEVEL - 3))
-    outcome, _ = solve(fake, given(replace(PAST, held=1)))
+    outcome, _ = solve(fake, given(replace(PAST, rejected=1)))
     assert names(fake) == ["as set", "on from where the update ended"]
     np.testing.assert_array_equal(fake.starts[1].means, AFTER.means)
     np.testing.assert_array_equal(fake.starts[1].colours, BEFORE.colours)  # not those that followed it astray
     assert outcome.motion is MOTION  # no better: the first is taken
     fake = Fake(met(LEVEL - 3), met(LEVEL - 1, gone(BEFORE, 0.06)))
-    outcome, _ = solve(fake, given(replace(PAST, held=1)))
+    outcome, _ = solve(fake, given(replace(PAST, rejected=1)))
     assert outcome.motion is not None
     np.testing.assert_allclose(outcome.motion.shifts[0], 2 * MOTION.shifts[0])
     assert outcome.gaussians is not AFTER
@@ -171,7 +171,7 @@ def test_nothing_is_sought_from_what_may_not_be_committed() -> None:
     means = AFTER.means.copy()
     means[0] = np.nan
     spoilt = AFTER.replace(means=means)
-    for past, psnr in ((PAST, LEVEL - 20), (replace(PAST, held=1), LEVEL - 3)):
+    for past, psnr in ((PAST, LEVEL - 20), (replace(PAST, rejected=1), LEVEL - 3)):
         fake = Fake(met(psnr, spoilt), lambda previous, options: (previous, LEVEL))
         outcome, _ = solve(fake, given(past))
         assert all(np.isfinite(start.means).all() for start in fake.starts)
@@ -185,14 +185,14 @@ def test_a_motion_that_is_not_finite_is_not_carried_on(monkeypatch: pytest.Monke
 
 def test_a_frame_that_stands_says_nothing_of_its_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
     suspect = NAMES[0]
-    past = replace(PAST, held=1, out={**PAST.out, suspect: 2})
+    past = replace(PAST, rejected=1, out={**PAST.out, suspect: 2})
     fake = Fake(met())
-    changed(fake, monkeypatch, lambda trace: UpdateTrace(kept=Candidate.STILL, errors=trace.errors))
+    changed(fake, monkeypatch, lambda trace: UpdateTrace(kept=Candidate.PREVIOUS, errors=trace.errors))
     asked = replace(given(past), views=VIEWS[1:], suspects=VIEWS[:1])
     outcome, after = solve(fake, asked)
-    assert (outcome.outcome, outcome.reason) == (FrameOutcome.STOOD, "")
+    assert (outcome.outcome, outcome.reason) == (FrameOutcome.UNCHANGED, "")
     assert (outcome.gaussians is BEFORE, outcome.motion is MOTION) == (True, True)
-    assert after == replace(past, held=0, behind=1)
+    assert after == replace(past, rejected=0, behind=1)
 
 
 def test_frames_that_follow_others_are_not_sought_longer() -> None:
@@ -205,7 +205,7 @@ def test_frames_that_follow_others_are_not_sought_longer() -> None:
 @pytest.mark.parametrize(("left", "tries"), [(-0.01, 1), (0.01, 1), (60.0, 2)])
 def test_frames_are_not_sought_longer_than_their_budget(left: float, tries: int) -> None:
     fake = Fake(met(LEVEL - 3))
-    asked = replace(given(replace(PAST, held=1)), end=perf_counter() + left, each=0.01)
+    asked = replace(given(replace(PAST, rejected=1)), end=perf_counter() + left, each=0.01)
     solve(fake, asked)
     assert len(fake.options) == tries
 
@@ -215,7 +215,7 @@ def test_what_was_lost_is_not_sought_longer_than_the_budget(left: float, tries: 
     fake = Fake(met(LEVEL - 20), met(LEVEL))
     outcome, _ = solve(fake, replace(given(), end=perf_counter() + left, each=0.01))
     assert len(fake.options) == tries
-    assert (not outcome.outcome.held) == (tries > 1)
+    assert (not outcome.outcome.rejected) == (tries > 1)
     assert any("the budget is spent" in attempt for attempt in outcome.attempts) == (tries == 1)
 
 
@@ -224,11 +224,11 @@ def test_what_is_sought_for_a_moment_has_to_meet_its_frame_all_the_same(monkeypa
     counts = iter([64, 1])
     changed(fake, monkeypatch, lambda trace: replace(trace, losses=[0.1] * next(counts)))
     outcome, _ = solve(fake, given(replace(PAST, updates=5, iterations=64)))
-    assert (len(fake.options), outcome.outcome) == (2, FrameOutcome.HELD_UNMET)
+    assert (len(fake.options), outcome.outcome) == (2, FrameOutcome.REJECTED_MISFIT)
 
 
 def test_brighter_pictures_of_a_scene_that_is_not_are_no_other_light() -> None:
-    outcome, _ = solve(Fake(met()), given(replace(PAST, lit=SETTINGS.patience), exposure=1.2))
+    outcome, _ = solve(Fake(met()), given(replace(PAST, light_frames=SETTINGS.max_rejected_frames), exposure=1.2))
     assert (outcome.attempts, outcome.exposure) == (["as set"], 1.0)
 
 
@@ -236,22 +236,22 @@ def test_pictures_that_stay_brighter_in_the_same_light_are_not_held_for_ever() -
     """Something bright has come in: the cameras tell of no other light, and it is learnt as it is."""
     bright = {name: 2.5 * value for name, value in BRIGHT.items()}
     past, fake = PAST, Fake(met())
-    for number in range(1, SETTINGS.patience + 1):
+    for number in range(1, SETTINGS.max_rejected_frames + 1):
         exposure, _, unusable = check_brightness(past, bright)
         past = with_light(past, exposure)
         assert unusable
         outcome, after = solve(fake, given(past, exposure=exposure, unusable=unusable, brightness=bright))
         past = after
-        assert (not outcome.outcome.held) == (number == SETTINGS.patience)
+        assert (not outcome.outcome.rejected) == (number == SETTINGS.max_rejected_frames)
     assert outcome.gaussians is AFTER
     np.testing.assert_array_equal(fake.starts[0].colours, BEFORE.colours)
     assert outcome.attempts == ["the same light, for good", "as set"]
-    assert (check_brightness(past, bright), past.lit) == ((1.0, {}, None), 0)
+    assert (check_brightness(past, bright), past.light_frames) == ((1.0, {}, None), 0)
 
 
 def test_after_a_held_frame_half_of_the_budget_is_kept_for_what_is_sought() -> None:
     now = perf_counter()
-    for past, ends in ((PAST, [60.0]), (replace(PAST, held=1), [30.0, 60.0])):
+    for past, ends in ((PAST, [60.0]), (replace(PAST, rejected=1), [30.0, 60.0])):
         fake = Fake(met(LEVEL - 3), met(LEVEL))
         solve(fake, replace(given(past), end=now + 60.0, each=0.01))
         found = [options.stopping.end for options in fake.options if options.stopping is not None]
@@ -259,22 +259,22 @@ def test_after_a_held_frame_half_of_the_budget_is_kept_for_what_is_sought() -> N
 
 
 def test_after_held_frames_the_level_waits_until_it_is_met_again_but_not_for_ever() -> None:
-    past = replace(PAST, held=2)
+    past = replace(PAST, rejected=2)
     for number in range(1, judge.CATCH_UP + 1):
         past = solve(Fake(met(LEVEL - 3)), given(past))[1]
-        assert (past.held, past.behind, past.level) == (0, number, LEVEL)
+        assert (past.rejected, past.behind, past.level) == (0, number, LEVEL)
     past = solve(Fake(met(LEVEL - 3)), given(past))[1]
     assert past.behind == 0
     assert past.level < LEVEL
-    assert solve(Fake(met(LEVEL)), given(replace(PAST, held=2)))[1].behind == 0
+    assert solve(Fake(met(LEVEL)), given(replace(PAST, rejected=2)))[1].behind == 0
 
 
 def test_patience_ends_and_then_it_is_taken_as_it_is() -> None:
     past, states = PAST, []
-    for _ in range(SETTINGS.patience):
+    for _ in range(SETTINGS.max_rejected_frames):
         outcome, after = solve(Fake(met(LEVEL - 20)), given(past))
         past = after
-        states.append((outcome.gaussians is BEFORE, outcome.outcome.held, past.held))
+        states.append((outcome.gaussians is BEFORE, outcome.outcome.rejected, past.rejected))
     assert states == [(True, True, 1), (True, True, 2), (False, False, 0)]
     assert "for 3 frames" in outcome.reason
     assert past.level == pytest.approx(LEVEL - 20)
@@ -283,9 +283,9 @@ def test_patience_ends_and_then_it_is_taken_as_it_is() -> None:
 
 
 def test_what_is_found_again_as_patience_ends_is_the_scene_as_it_was() -> None:
-    past = replace(PAST, updates=5, held=SETTINGS.patience - 1)
+    past = replace(PAST, updates=5, rejected=SETTINGS.max_rejected_frames - 1)
     outcome, after = solve(Fake(met(LEVEL - 20), met(LEVEL - 4)), given(past))
-    assert not outcome.outcome.held
+    assert not outcome.outcome.rejected
     assert "sought" in outcome.reason
     assert (after.updates, after.level) == (6, LEVEL)
 
@@ -298,47 +298,47 @@ def test_a_frame_whose_pictures_say_nothing_is_not_tried() -> None:
     outcome, _ = solve(fake, given(**DARK))
     assert fake.options == []
     assert outcome.gaussians is BEFORE
-    assert (outcome.outcome, outcome.reason) == (FrameOutcome.HELD_UNUSABLE, "it is dark")
+    assert (outcome.outcome, outcome.reason) == (FrameOutcome.REJECTED_UNUSABLE, "it is dark")
     assert outcome.motion is MOTION
-    assert (outcome.exposure, outcome.trace.kept) == (0.02, "still")
+    assert (outcome.exposure, outcome.trace.kept) == (0.02, "previous")
 
 
 def test_darkness_costs_no_patience_and_what_comes_after_is_caught_up_with() -> None:
     past = PAST
-    for _ in range(3 * SETTINGS.patience):
+    for _ in range(3 * SETTINGS.max_rejected_frames):
         past = solve(Fake(met()), given(past, **DARK))[1]
-    assert (past.held, past.level) == (0, LEVEL)
+    assert (past.rejected, past.level) == (0, LEVEL)
     outcome, after = solve(Fake(met(LEVEL - 20)), given(past))
-    assert (outcome.outcome, after.held) == (FrameOutcome.HELD_UNMET, 1)
+    assert (outcome.outcome, after.rejected) == (FrameOutcome.REJECTED_MISFIT, 1)
     assert solve(Fake(met(LEVEL - 3)), given(past))[1].behind == 2  # its level waits
 
 
 def test_a_held_frame_is_told_as_it_is() -> None:
     outcome, _ = solve(Fake(met(LEVEL - 20)), given())
-    assert (outcome.outcome, outcome.trace.kept) == (FrameOutcome.HELD_UNMET, "still")
+    assert (outcome.outcome, outcome.trace.kept) == (FrameOutcome.REJECTED_MISFIT, "previous")
 
 
 def test_what_is_sought_is_told_with_the_errors_of_the_frame_before(monkeypatch: pytest.MonkeyPatch) -> None:
     fake = Fake(met(LEVEL - 20), met(LEVEL))
     told = iter(
         [
-            {Candidate.STILL: {"c0": 0.5}, Candidate.WARM: {"c0": 0.4}, Candidate.END: {"c0": 0.3}},
-            {Candidate.STILL: {"c0": 0.1}, Candidate.END: {"c0": 0.2}},
+            {Candidate.PREVIOUS: {"c0": 0.5}, Candidate.WARM: {"c0": 0.4}, Candidate.END: {"c0": 0.3}},
+            {Candidate.PREVIOUS: {"c0": 0.1}, Candidate.END: {"c0": 0.2}},
         ]
     )
-    kept = iter([Candidate.END, Candidate.STILL])
+    kept = iter([Candidate.END, Candidate.PREVIOUS])
     changed(fake, monkeypatch, lambda trace: replace(trace, errors=next(told), kept=next(kept)))
     outcome, after = solve(fake, given())
-    assert outcome.trace.errors == {"still": {"c0": 0.5}, "warm": {"c0": 0.4}, "end": {"c0": 0.1}}
+    assert outcome.trace.errors == {"previous": {"c0": 0.5}, "warm": {"c0": 0.4}, "end": {"c0": 0.1}}
     assert (outcome.trace.kept, after.error) == ("end", {"c0": 0.1})
 
 
 def test_without_the_judge_nothing_is_sought_or_held_but_the_ladder_stands() -> None:
     fake = Fake(met(5.0))
-    outcome, _ = solve(fake, given(), judge=False)
+    outcome, _ = solve(fake, given(), reject_outliers=False)
     assert (names(fake), outcome.outcome) == (["as set"], FrameOutcome.UPDATED)
     assert fake.options[0].gate is None
-    assert solve(Fake(broken), given(), judge=False)[0].gaussians is BEFORE
+    assert solve(Fake(broken), given(), reject_outliers=False)[0].gaussians is BEFORE
 
 
 def test_usual_errors_fall_at_once_and_rise_slowly() -> None:
@@ -400,20 +400,20 @@ def _shown(view: TrainingView) -> float:
 
 
 def errors(still: float, end: float) -> Callable[[UpdateTrace], UpdateTrace]:
-    shown = {Candidate.STILL: dict.fromkeys(NAMES[:2], still), Candidate.END: dict.fromkeys(NAMES[:2], end)}
+    shown = {Candidate.PREVIOUS: dict.fromkeys(NAMES[:2], still), Candidate.END: dict.fromkeys(NAMES[:2], end)}
     return lambda trace: replace(trace, errors=shown)
 
 
 @pytest.mark.parametrize(
-    ("still", "end", "tolerance", "looked_at"),
+    ("previous", "end", "tolerance", "looked_at"),
     [(0.021, 0.02, 0.0, CONFIRMING), (0.04, 0.02, 0.0, 0), (0.021, 0.02, -1.0, 0)],
 )
 def test_what_is_committed_is_looked_at_in_whole_where_the_next_frame_may_stand(
-    still: float, end: float, tolerance: float, looked_at: int, monkeypatch: pytest.MonkeyPatch
+    previous: float, end: float, tolerance: float, looked_at: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fake = Fake(met())
-    changed(fake, monkeypatch, errors(still, end))
-    _, past = solve(fake, given(), still=tolerance)
+    changed(fake, monkeypatch, errors(previous, end))
+    _, past = solve(fake, given(), skip_tolerance=tolerance)
     assert sum(name.endswith(COMMITTED) for name in past.error) == looked_at
 
 

@@ -198,11 +198,11 @@ def test_frames_and_cameras_that_are_not_believed_say_nothing(tmp_path: Path, mo
     assert len(seen) == 2  # 60 iterations
     assert noted.looks() is not past
     for silent in (
-        {"outcome": FrameOutcome.HELD_UNMET},
+        {"outcome": FrameOutcome.REJECTED_MISFIT},
         {"outcome": FrameOutcome.RELOCATED},
         {"exposure": 1.1},
         {"attempts": ["as set", "sought again"]},
-        {"trace": replace(result.trace, kept=Candidate.STILL)},
+        {"trace": replace(result.trace, kept=Candidate.PREVIOUS)},
         {"trace": replace(result.trace, shown={})},  # as on a GPU
     ):
         assert noted.looks(**silent) is past

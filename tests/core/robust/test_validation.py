@@ -64,7 +64,7 @@ SPOILS = {
 @pytest.mark.parametrize("kind", SPOILS)
 def test_a_wrong_row_is_held_alone(kind: str) -> None:
     check, fault = checked(spoilt(ROW, by=SPOILS[kind]), RADIUS)
-    assert (check.held, fault) == (1, None)
+    assert (check.frozen, fault) == (1, None)
     for name, array in check.gaussians.arrays().items():
         np.testing.assert_array_equal(array[ROW], BEFORE.arrays()[name][ROW])
         np.testing.assert_array_equal(np.delete(array, ROW, 0), np.delete(AFTER.arrays()[name], ROW, 0))
@@ -82,14 +82,14 @@ def test_too_many_wrong_rows_fail_the_attempt(kind: str) -> None:
 def test_a_wrong_colour_of_what_stands_is_held_too() -> None:
     row = int(np.flatnonzero(~BEFORE.moving)[0])
     check, fault = checked(spoilt(row, by=SPOILS["colour is NaN"]), RADIUS)
-    assert (check.held, fault) == (1, None)
+    assert (check.frozen, fault) == (1, None)
     np.testing.assert_array_equal(check.gaussians.colours[row], BEFORE.colours[row])
 
 
 def test_what_is_plausible_is_passed_on_as_it_is() -> None:
     check, fault = checked(AFTER, RADIUS, axis_lengths(BEFORE))
     assert check.gaussians is AFTER
-    assert (check.held, fault, check.bounded) == (0, None, 0)
+    assert (check.frozen, fault, check.bounded) == (0, None, 0)
 
 
 @pytest.mark.parametrize(("factor", "bound"), [(SHRUNK / 5, SHRUNK), (STRETCHED * 2, STRETCHED)])
@@ -97,7 +97,7 @@ def test_an_axis_stays_in_its_bounds_and_keeps_its_direction(factor: float, boun
     state = spoilt(by=inside_out)
     state.factors[ROW, :, 1] *= factor
     check, fault = checked(state, 100.0, axis_lengths(BEFORE))
-    assert (check.held, fault, check.bounded) == (0, None, 1)
+    assert (check.frozen, fault, check.bounded) == (0, None, 1)
     expected = AFTER.factors.copy()
     expected[ROW, :, 1] *= bound
     np.testing.assert_allclose(check.gaussians.factors, expected, rtol=1e-5)
@@ -108,7 +108,7 @@ def test_an_axis_of_no_length_and_bounds_beside_a_held_row() -> None:
     state.factors[ROW + 1, :, 2] = 0
     state.factors[ROW + 2, :, 0] *= 1e-6
     check, fault = checked(state, RADIUS, axis_lengths(BEFORE))
-    assert (check.held, fault) == (1, None)
+    assert (check.frozen, fault) == (1, None)
     assert np.isfinite(check.gaussians.factors).all()
     assert axis_lengths(check.gaussians)[ROW + 2, 0] == pytest.approx(
         SHRUNK * axis_lengths(BEFORE)[ROW + 2, 0], rel=1e-4

@@ -30,7 +30,7 @@ def grown(seed: int, before: Gaussians, born: int = 0) -> Gaussians:
 
 def fill(history: History) -> History:
     history.append(0, 0.0, state(0))
-    history.append(BORN_AT, 0.1, grown(1, history.newest, 3), joins=np.array([1, -1, 6]))
+    history.append(BORN_AT, 0.1, grown(1, history.newest, 3), parents=np.array([1, -1, 6]))
     history.append(MORE_AT, 0.2, grown(2, history.newest, 2))
     history.append(RETIRED_AT, 0.3, grown(3, history.newest).retire([0, 1, 5, 8]))
     history.append(REVIVED_AT, 0.4, grown(4, history.newest).revive([1, 8]))
@@ -76,7 +76,7 @@ def test_lives(where: str, tmp_path: Path) -> None:
         history.append(0, 0.0, state(0))
         reader = History.load(tmp_path / "states")
         assert reader.count == 7
-        history.append(BORN_AT, 0.1, grown(1, history.newest, 3), joins=np.array([1, -1, 6]))
+        history.append(BORN_AT, 0.1, grown(1, history.newest, 3), parents=np.array([1, -1, 6]))
         reader.refresh((BORN_AT,))
         assert reader.count == 10
         history.cut(0)
@@ -175,10 +175,10 @@ def test_roots_are_kept(tmp_path: Path) -> None:
     history = History(tmp_path)
     history.append(0, 0.0, state(0))
     assert same(history.roots(), history.first)
-    joins = np.array([1, -1, 6])
+    parents = np.array([1, -1, 6])
     now = grown(1, history.newest, 3)
-    roots = grown_roots(history.roots(), now, joins)
-    history.append(1, 0.1, now, joins=joins, roots=roots)
+    roots = grown_roots(history.roots(), now, parents)
+    history.append(1, 0.1, now, parents=parents, roots=roots)
     history.append(2, 0.2, grown(2, history.newest).retire([0]))
     for one in (history, History.load(tmp_path), history.copied([0, 1])):
         for name in ("means", "factors", "rotations", "foreground", "opacities"):
@@ -204,7 +204,7 @@ def test_a_birth_taken_back_has_its_ids_again_and_no_other_gets_them(tmp_path: P
         assert history.ids[-1] == 113
         history.cut(0)
         again = grown(1, history.newest, 3)
-        history.append(BORN_AT, 0.1, again, joins=np.array([1, -1, 6]))
+        history.append(BORN_AT, 0.1, again, parents=np.array([1, -1, 6]))
         assert history.ids[-3:].tolist() == [114, 115, 116]  # another birth was in its place since
         history.append(MORE_AT, 0.2, grown(2, history.newest, 2))
         assert history.ids[-2:].tolist() == [110, 111]
@@ -228,9 +228,9 @@ def test_a_damaged_file_of_the_born_is_read_and_written_from_the_other(how: str,
     history = History.open(tmp_path)
     check(history)
     assert same(history.gaussians(LAST), whole.gaussians(LAST))
-    assert list(history.mend_fixed()) == [file.name]
+    assert list(history.repair_fixed()) == [file.name]
     assert all(np.array_equal(array, before[name]) for name, array in read_npz(file).items())
-    assert history.mend_fixed() == {}
+    assert history.repair_fixed() == {}
 
 
 def test_without_both_files_of_the_born_their_frames_are_damaged(tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ from scas4d_core.effects.presence.entering import NOBODY
 from scas4d_core.effects.switches import kept_of
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.recompute import recompute
 from scas4d_core.reconstruction import Reconstruction
-from scas4d_core.remake import remake
 from scas4d_core.settings import Settings
 from scas4d_core.storage.frame_arrays import packed, unpacked
 from scas4d_core.storage.history import History
@@ -27,7 +27,7 @@ STANDS = np.linalg.norm(BOX.means - BOX.means.min(axis=0), axis=1).argsort() >= 
 STATE = BOX.replace(foreground=np.float32(~STANDS))
 SETTINGS = Settings.model_validate(
     {
-        "update": {"clusters": (2, 12), "iterations": 6, "judge": False, "still": -1},
+        "update": {"clusters": (2, 12), "iterations": 6, "reject_outliers": False, "skip_tolerance": -1},
         "effects": {"camera_gain": "on", "uncovered": "off"},
     }
 )
@@ -73,7 +73,7 @@ def test_a_scene_resumed_without_its_checkpoint_has_them(tmp_path: Path) -> None
 @pytest.mark.parametrize("on_disk", [True, False])
 def test_a_copy_aside_has_them(on_disk: bool, tmp_path: Path) -> None:
     scene = followed(History(tmp_path) if on_disk else History())
-    assert_goes_on(Reconstruction.aside(RIG, SETTINGS, scene.history, 3), scene)
+    assert_goes_on(Reconstruction.fork(RIG, SETTINGS, scene.history, 3), scene)
 
 
 def test_a_file_that_is_written_again_has_them(tmp_path: Path) -> None:
@@ -89,7 +89,7 @@ def test_a_file_that_is_written_again_has_them(tmp_path: Path) -> None:
     assert file.read_bytes() == whole
     (tmp_path / "frame_000002.npz").write_bytes(b"")
     history = History.open(tmp_path)
-    remake(RIG, SETTINGS, history, 1, take_frame(2, 2 / 30, shown(0.2), RIG), {})
+    recompute(RIG, SETTINGS, history, 1, take_frame(2, 2 / 30, shown(0.2), RIG), {})
     assert set(History.load(tmp_path).effects(2)) >= {camera_gain.NAME}
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from scas4d_core.cameras import WorldFrame
-from scas4d_core.compact import Bounds, CompactReader, CompactWriter, Head
+from scas4d_core.compact import Bounds, CompactReader, CompactWriter, FileHeader
 from scas4d_core.compact.columns import Columns
 from scas4d_core.compact.frame_code import errors_of
 from scas4d_core.gaussians import PER_FRAME, UNBORN, Gaussians
@@ -24,8 +24,8 @@ from scas4d_core.storage.history import DamagedFrameError, History, UnreadableFr
 COUNT, EXACT, BORN_AT, RETIRED_AT = 30, 6, 9, 14
 
 
-def head() -> Head:
-    return Head(WorldFrame(np.zeros(3)))
+def head() -> FileHeader:
+    return FileHeader(WorldFrame(np.zeros(3)))
 
 
 def filled(folder: Path, count: int = COUNT) -> History:
@@ -90,7 +90,7 @@ def names(history: History) -> list[str]:
 
 def made_again(history: History, true: History, index: int) -> None:
     arrays = {name: true.gaussians(index).arrays()[name] for name in PER_FRAME}
-    history.replace(index, true.time(index), arrays, {"remade": True})
+    history.replace(index, true.time(index), arrays, {"recomputed": True})
 
 
 def test_older_states_are_read_from_chunks_by_all(tmp_path: Path, true: History) -> None:
@@ -203,7 +203,7 @@ def test_a_damaged_chunk_hides_only_what_needs_it(tmp_path: Path, true: History)
     assert history.files.fault(7)
     made_again(history, true, 7)
     assert np.array_equal(History.load(tmp_path / "states").gaussians(7).means, true.gaussians(7).means)
-    assert History.load(tmp_path / "states").report(7) == {"remade": True}
+    assert History.load(tmp_path / "states").report(7) == {"recomputed": True}
 
 
 def test_a_chunk_that_is_gone_takes_its_frames_and_no_others(tmp_path: Path, true: History) -> None:
@@ -346,7 +346,7 @@ def test_other_bounds_begin_another_chunk(tmp_path: Path) -> None:
     for _ in range(3):
         moving.step()
     moving.close()
-    finer = Compaction(history, lambda: Head(WorldFrame(np.zeros(3)), Bounds(position=0.01)), EXACT)
+    finer = Compaction(history, lambda: FileHeader(WorldFrame(np.zeros(3)), Bounds(position=0.01)), EXACT)
     assert finer.step() == 5
     finer.close()
     chunk = history.files.chunks.of(5)

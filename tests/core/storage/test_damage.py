@@ -119,9 +119,9 @@ def test_what_every_frame_needs_is_read_from_its_copy_and_mended(tmp_path, lost,
     assert lost in reader.take_faults()
     assert reader.take_faults() == {}
     writer = History.open(tmp_path)
-    assert list(writer.mend_fixed()) == [lost]
+    assert list(writer.repair_fixed()) == [lost]
     assert (tmp_path / lost).read_bytes() == whole
-    assert writer.mend_fixed() == {}
+    assert writer.repair_fixed() == {}
     reader.refresh()
     assert same(reader.gaussians(0), state(0))
 
@@ -133,7 +133,7 @@ def test_copies_are_made_again(tmp_path, lost, how):
     whole = (tmp_path / lost).read_bytes()
     damage(tmp_path / lost, how)
     writer = History.open(tmp_path)
-    assert list(writer.mend_fixed()) == [lost]
+    assert list(writer.repair_fixed()) == [lost]
     assert (tmp_path / lost).read_bytes() == whole
 
 
@@ -177,10 +177,10 @@ def test_a_damaged_state_is_left_out_until_another_file_is_there(tmp_path):
     assert not writer.write_again(2)  # too old to be in memory
     damage(tmp_path / "frame_000002.npz", "flipped")
     arrays = state(7).arrays()
-    writer.replace(2, 1 / 30, arrays, {"remade": True})
+    writer.replace(2, 1 / 30, arrays, {"recomputed": True})
     assert reader.refresh((2,)) == ([2], [])
     assert same(reader.gaussians(2), state(7).replace(opacities=state(0).opacities))
-    assert reader.report(2) == {"remade": True}
+    assert reader.report(2) == {"recomputed": True}
     with pytest.raises(HistoryError, match="frame 10 cannot take the place"):
         writer.replace(10, 9.0, arrays, {})
 

@@ -12,7 +12,7 @@ from box_scene import make_box
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.checkpoint import CarryOver, CheckpointError, Checkpoints, find_commit
-from scas4d_core.compact import CompactWriter, FormatError, Head
+from scas4d_core.compact import CompactWriter, FileHeader, FormatError
 from scas4d_core.compact import head as head_module
 from scas4d_core.storage import frame_files
 from scas4d_core.storage.chunks import chunk_file
@@ -78,7 +78,7 @@ def test_the_format_is_read_from_the_copy_where_the_file_is_damaged(tmp_path: Pa
 def test_a_mended_folder_has_its_format(tmp_path: Path) -> None:
     history = written(tmp_path / "states")
     (tmp_path / "states" / frame_files.FIXED_FILE).unlink()
-    assert frame_files.FIXED_FILE in history.mend_fixed()
+    assert frame_files.FIXED_FILE in history.repair_fixed()
     (tmp_path / "states" / frame_files.FIXED_COPY).unlink()
     assert History.load(tmp_path / "states").indices == list(range(FRAMES))
 
@@ -105,9 +105,9 @@ def test_a_compact_file_of_another_version_among_states(tmp_path: Path, monkeypa
     written(folder)
     with monkeypatch.context() as patched:
         patched.setattr(head_module, "VERSION", 4)
-        with CompactWriter(folder / chunk_file(1), Head(WorldFrame(np.zeros(3)))) as writer:
+        with CompactWriter(folder / chunk_file(1), FileHeader(WorldFrame(np.zeros(3)))) as writer:
             writer.add(1, 0.1, make_box())
-        assert json.loads(Head(WorldFrame(np.zeros(3))).text())["version"] == 4
+        assert json.loads(FileHeader(WorldFrame(np.zeros(3))).text())["version"] == 4
     before = contents(folder)
     with pytest.raises(OtherFormatError, match=r"states_000001\.s4d.* version 4; this scas4d reads version 1: use"):
         History.load(folder)
@@ -121,7 +121,7 @@ def test_a_compact_file_of_another_version_is_not_opened(tmp_path: Path, monkeyp
     path = tmp_path / "states.s4d"
     with monkeypatch.context() as patched:
         patched.setattr(head_module, "VERSION", 4)
-        with CompactWriter(path, Head(WorldFrame(np.zeros(3)))) as writer:
+        with CompactWriter(path, FileHeader(WorldFrame(np.zeros(3)))) as writer:
             writer.add(0, 0.0, make_box())
     with pytest.raises(FormatError, match=r"states\.s4d: a compact 4D file of version 4"):
         CompactReader(path)

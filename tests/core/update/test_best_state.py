@@ -82,7 +82,7 @@ def test_an_end_that_whole_pictures_prefer_is_kept_as_it_was() -> None:
     best, engine = ended(probes)
     before = means(engine)
     assert best.end(10, {}) is Candidate.END
-    assert best.errors[Candidate.STILL]["c0"] < best.errors[Candidate.END]["c0"]  # the small ones said otherwise
+    assert best.errors[Candidate.PREVIOUS]["c0"] < best.errors[Candidate.END]["c0"]  # the small ones said otherwise
     np.testing.assert_array_equal(means(engine), before)
     np.testing.assert_array_equal(engine.tables().clusters[0][:, 3], np.float32(WAY))
 
@@ -92,7 +92,7 @@ def test_an_end_that_whole_pictures_prefer_is_kept_as_it_was() -> None:
 )
 def test_else_what_the_small_pictures_prefer_is_committed(probes: Probes) -> None:
     best, engine = ended(probes)
-    assert best.end(10, {}) is Candidate.STILL
+    assert best.end(10, {}) is Candidate.PREVIOUS
     np.testing.assert_array_equal(means(engine), BOX.means)
     assert probes.asked == (0 if probes.whole else 2)
 
@@ -106,7 +106,7 @@ def test_nothing_is_looked_at_twice_where_the_end_is_the_best() -> None:
 def test_an_end_that_is_not_finite_is_left() -> None:
     probes = Probes(lambda off: off, sharp)
     best, engine = ended(probes, at=math.nan)
-    assert best.end(10, {}) is Candidate.STILL
+    assert best.end(10, {}) is Candidate.PREVIOUS
     np.testing.assert_array_equal(means(engine), BOX.means)
 
 

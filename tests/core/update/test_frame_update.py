@@ -38,10 +38,10 @@ from scas4d_core.update.view_factory import ViewFactory
 BEFORE = make_box()
 AFTER = moved(BEFORE)
 RIG = make_rig()
-SETTINGS = UpdateSettings(clusters=(2, 12, 48), rate_end=1.0, cold_start=1.0)
+SETTINGS = UpdateSettings(clusters=(2, 12, 48), final_rate=1.0, cold_start_rates=1.0)
 NEIGHBOURS, FALLOFF = 20, 200.0
 """The box has few Gaussians, far apart."""
-CALM = SETTINGS.model_copy(update={"rate_end": 0.1})
+CALM = SETTINGS.model_copy(update={"final_rate": 0.1})
 """Rates that fall: what is found is not blurred by the last steps."""
 
 
@@ -426,7 +426,7 @@ def test_deformation_starts_from_what_it_is_given() -> None:
 
 def test_a_layer_that_begins_late_stays_where_it_was_before(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rates, "LAYER_STARTS", (0.0, 0.5, 0.5))
-    settings = SETTINGS.model_copy(update={"own_start": 0.5, "iterations": 3})
+    settings = SETTINGS.model_copy(update={"deltas_start": 0.5, "iterations": 3})
     engine = CpuEngine()
     updater, views = prepare(settings, engine=engine)
     seen: list[list[np.ndarray]] = []

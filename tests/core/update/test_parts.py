@@ -9,7 +9,7 @@ from effect_cases import BEFORE, RIG, UPDATE, builder, updater_of
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.checkpoint import CarryOver
-from scas4d_core.effects.switches import first_switches, joined
+from scas4d_core.effects.switches import first_switches, register_effects
 from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.engine import UpdateEngine
@@ -17,10 +17,10 @@ from scas4d_core.engines.torch.engine import TorchEngine
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import Preparation
 from scas4d_core.settings import Settings
-from scas4d_core.update.parts import Attempt, Part, PlanBuilder
+from scas4d_core.update.parts import Attempt, PlanBuilder, UpdatePart
 
 
-class Moves(Part):
+class Moves(UpdatePart):
     """Starts the coarsest clusters with a shift, and leaves an array."""
 
     def begin(self, attempt: Attempt) -> None:
@@ -33,7 +33,7 @@ class Moves(Part):
 
 def one_iteration() -> PlanBuilder:
     names = ["cluster_translation", "rigidity", "moving_colour"]
-    return joined(builder(update=UPDATE.model_copy(update={"iterations": 1})), names)
+    return register_effects(builder(update=UPDATE.model_copy(update={"iterations": 1})), names)
 
 
 @pytest.mark.parametrize("kind", [CpuEngine, TorchEngine])
@@ -54,7 +54,7 @@ def test_a_part_that_overrides_nothing_changes_nothing() -> None:
     built = one_iteration()
     views = built.factory.views(take_frame(1, 1.0, moved(BEFORE), RIG, True), {})
     without = updater_of(built).run(BEFORE, views, None, 1.0, seed=3).gaussians.arrays()
-    built.parts.append(Part())
+    built.parts.append(UpdatePart())
     found = updater_of(built).run(BEFORE, views, None, 1.0, seed=3).gaussians.arrays()
     assert all(np.array_equal(without[name], found[name]) for name in without)
 
@@ -64,7 +64,7 @@ def test_a_scene_that_goes_on_with_other_settings_leaves_what_they_refuse(rate: 
     settings = Settings(update=UPDATE.model_copy(update={"rate_colour": rate}))
     made = Preparation(builder().factory, settings, WorldFrame(np.zeros(3)), CpuRenderer((0, 0, 0)))
     before = first_switches(Settings(effects={"moving_colour": "on", "entering": "on"}), 0)
-    prepared = made.again(BEFORE, CarryOver(switches=before))
+    prepared = made.rebuild(BEFORE, CarryOver(switches=before))
     switches = prepared.carried.switches
     assert (switches["moving_colour"].on, switches["entering"].on) == (on, True)
     assert (prepared.plan.colours is not None) == on

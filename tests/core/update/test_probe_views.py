@@ -8,7 +8,7 @@ from box_scene import make_box, make_rig, moved, take_frame
 from effect_cases import builder
 from scipy.spatial.transform import Rotation
 
-from scas4d_core.effects.switches import joined
+from scas4d_core.effects.switches import register_effects
 from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.update import best_state
@@ -22,7 +22,7 @@ BOX = make_box()
 
 def probes(shown: Gaussians) -> tuple[ProbeViews, CpuEngine, list[int]]:
     """Those of a frame in which a state is seen, what compares, and the widths at which it is rendered for them."""
-    factory, widths, built = ViewFactory(RIG), list[int](), joined(builder())
+    factory, widths, built = ViewFactory(RIG), list[int](), register_effects(builder())
     engine = CpuEngine()
     engine.bind(built.plan, structure_of(built.hierarchy, None, BOX))
     measure = engine.renderer.measure

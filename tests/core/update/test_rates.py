@@ -80,7 +80,7 @@ def test_without_a_motion_before_layers_are_faster_and_none_rests() -> None:
 
 
 @pytest.mark.parametrize(
-    ("still", "warm", "usual", "share"),
+    ("previous", "warm", "usual", "share"),
     [
         (0.5, 0.2, 0.1, 0.25),
         (0.5, 0.6, 0.1, 1.25),
@@ -91,11 +91,11 @@ def test_without_a_motion_before_layers_are_faster_and_none_rests() -> None:
     ],
 )
 def test_what_the_motion_before_leaves_is_a_share_of_what_changed(
-    still: float, warm: float | None, usual: float | None, share: float
+    previous: float, warm: float | None, usual: float | None, share: float
 ) -> None:
     probes: Any = SimpleNamespace(whole=False)
     best = BestState(probes, *[None] * 3, 1.0, 0.0)  # type: ignore[arg-type]
-    best.errors = {Candidate.STILL: {"a": still, "b": still}}
+    best.errors = {Candidate.PREVIOUS: {"a": previous, "b": previous}}
     if warm is not None:
         best.errors[Candidate.WARM] = {"a": warm, "b": warm}
     known = None if usual is None else {"a": usual, "b": usual, "c": 9.0}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from box_scene import make_box, make_rig, moved, take_frame
 
-from scas4d_core.effects.switches import first_switches, joined, names_on
+from scas4d_core.effects.switches import first_switches, names_on, register_effects
 from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.engine import UpdateEngine
 from scas4d_core.gaussians import Gaussians
@@ -31,8 +31,8 @@ def of_whole_pictures(
     factory: ViewFactory, update: UpdateSettings, hierarchy: Hierarchy, first: Gaussians
 ) -> PlanBuilder:
     """The plan with which every Gaussian of a scene without evidence learns from every pixel."""
-    settings = Settings.model_validate({"effects": {"standing_colour": "on"}}).model_copy(update={"update": update})
-    return joined(
+    settings = Settings.model_validate({"effects": {"static_colour": "on"}}).model_copy(update={"update": update})
+    return register_effects(
         PlanBuilder(SceneSettings(), update, factory, hierarchy, first), names_on(first_switches(settings, 0))
     )
 
@@ -46,7 +46,7 @@ def updater_of(built: PlanBuilder, engine: UpdateEngine | None = None) -> FrameU
 
 def updated(effects: list[str], update: UpdateSettings = UPDATE) -> dict[str, np.ndarray]:
     """The arrays after an update of the box with these effects."""
-    built = joined(builder(update=update), effects)
+    built = register_effects(builder(update=update), effects)
     views = built.factory.views(take_frame(1, 1.0, moved(BEFORE), RIG, True), {})
     return updater_of(built).run(BEFORE, views, None, 1.0, seed=3).gaussians.arrays()
 

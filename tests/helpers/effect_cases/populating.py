@@ -12,12 +12,12 @@ import pytest
 
 from scas4d_core.effect_names import EFFECTS
 from scas4d_core.effects import effect as effect_module
-from scas4d_core.effects.effect import Effect, Group
-from scas4d_core.effects.evidence import Seen
+from scas4d_core.effects.effect import Effect, EffectGroup
+from scas4d_core.effects.evidence import FrameObservation
 from scas4d_core.update.result import UpdateResult
 
 NAME, MODULE = "planned", "planned_population"
-Plan = Callable[[Seen], UpdateResult]
+Plan = Callable[[FrameObservation], UpdateResult]
 
 
 class Planned(Effect):
@@ -25,7 +25,7 @@ class Planned(Effect):
 
     plan: Plan
 
-    def populated(self, seen: Seen) -> UpdateResult:
+    def add_and_retire_gaussians(self, seen: FrameObservation) -> UpdateResult:
         return type(self).plan(seen)
 
     def join(self, builder: object) -> None:
@@ -40,7 +40,7 @@ def install(monkeypatch: pytest.MonkeyPatch, plan: Plan) -> None:
 
     Own.plan = staticmethod(plan)  # type: ignore[assignment]
     module = ModuleType(MODULE)
-    module.EFFECT = Own(NAME, Group.PRESENCE, "says", "gauge", "cost")  # type: ignore[attr-defined]
+    module.EFFECT = Own(NAME, EffectGroup.PRESENCE, "says", "gauge", "cost")  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, MODULE, module)
     monkeypatch.setitem(EFFECTS, NAME, MODULE)
     effect_module.effect.cache_clear()
@@ -51,21 +51,21 @@ def plan(
     retired: dict[int, list[int]] | None = None,
     revived: dict[int, list[int]] | None = None,
 ) -> Plan:
-    """A plan by frame: the rows that are copied, shifted a little, with the founders; rows retired; rows revived."""
+    """A plan by frame: the rows that are copied, shifted a little, with the parents; rows retired; rows revived."""
 
-    def populated(seen: Seen) -> UpdateResult:
-        state, joins = seen.result.gaussians, seen.result.joins
+    def add_and_retire_gaussians(seen: FrameObservation) -> UpdateResult:
+        state, parents = seen.result.gaussians, seen.result.parents
         carried = dict(seen.result.carried)
         if seen.index in (births or {}):
-            rows, founders = (births or {})[seen.index]
+            rows, parents = (births or {})[seen.index]
             born = state.rows(rows)
             born = born.replace(means=born.means + np.float32([0.01, 0, 0]))
-            state, joins = state.joined(born), np.array(founders, np.int64)
+            state, parents = state.joined(born), np.array(parents, np.int64)
         if seen.index in (retired or {}):
             state = state.retire((retired or {})[seen.index])
         if seen.index in (revived or {}):
             state = state.revive((revived or {})[seen.index])
         carried[NAME] = {"rows": np.arange(len(seen.result.gaussians), dtype=np.float32), "seen": np.int64(seen.index)}
-        return replace(seen.result, gaussians=state, joins=joins, carried=carried)
+        return replace(seen.result, gaussians=state, parents=parents, carried=carried)
 
-    return populated
+    return add_and_retire_gaussians

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Rig
-from scas4d_core.effects.evidence import Seen
+from scas4d_core.effects.evidence import FrameObservation
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.limits import scene_limits
 from scas4d_core.gaussians import Gaussians
@@ -85,15 +85,17 @@ def known(centre: np.ndarray = BOX) -> Gaussians:
 
 def seen(
     state: Gaussians, true: Gaussians, index: int = 5, masks: bool = True, carried: dict[str, Any] | None = None
-) -> Seen:
+) -> FrameObservation:
     """A frame that shows ``true``, updated to ``state``."""
     rig = make_rig()
     factory = ViewFactory(rig)
     views = factory.views(take_frame(index, float(index), true, rig, masks), {})
     renderer = CpuRenderer((0.0, 0.0, 0.0), limits=scene_limits("auto", rig.radius))
-    return Seen(index, state, UpdateResult(state, None, UpdateTrace(), carried=carried or {}), rig, views, renderer)
+    return FrameObservation(
+        index, state, UpdateResult(state, None, UpdateTrace(), carried=carried or {}), rig, views, renderer
+    )
 
 
-def psnr(state: Gaussians, frame: Seen) -> float:
+def psnr(state: Gaussians, frame: FrameObservation) -> float:
     """DB of a state, mean over the views of a frame."""
     return float(np.mean([frame.renderer.compare(state, view).psnr for view in frame.views]))

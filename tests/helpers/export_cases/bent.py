@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from scas4d_core.cameras import Rig
-from scas4d_core.compact import CompactWriter, Head
+from scas4d_core.compact import CompactWriter, FileHeader
 from scas4d_core.gaussians import Gaussians, quaternion_products
 
 FRAMES = 7
@@ -63,7 +63,9 @@ def _bent(state, draw):
 
 def write(path, rig: Rig, key_every=3):
     """The compact file of these states, of which frame 14 and the last tell parts."""
-    with CompactWriter(path, Head(rig.world_frame(2.0), rig=rig, background=(0.1, 0.2, 0.3)), key_every) as writer:
+    with CompactWriter(
+        path, FileHeader(rig.world_frame(2.0), rig=rig, background=(0.1, 0.2, 0.3)), key_every
+    ) as writer:
         for index, time, state in states():
             writer.add(index, time, state)
             if index in (14, 22):

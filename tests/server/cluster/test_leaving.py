@@ -20,7 +20,7 @@ ray_placement = pytest.importorskip(
 from server.cluster import membership  # noqa: E402
 from server.cluster.host import Started  # noqa: E402
 from server.cluster.needs import Needs  # noqa: E402
-from server.processes.placement import Ended  # noqa: E402
+from server.processes.placement import ProcessExit  # noqa: E402
 from server.settings import ServerSettings  # noqa: E402
 from tests.server.cluster.losing import LosableCluster  # noqa: E402
 from tests.server.cluster.others import others_have_called  # noqa: E402
@@ -61,7 +61,7 @@ class Cluster(LosableCluster):
         monkeypatch.setattr(ray_placement, "needs_of", lambda *arguments: Needs("worker", "scene", 1, 1))
         self.placement = ray_placement.RayPlacement(None, None, ServerSettings(data=Path("data")))
         monkeypatch.setattr(self.placement, "host", self._host)
-        self.ends: list[Ended] = []
+        self.ends: list[ProcessExit] = []
 
     def _shutdown(self) -> None:
         self.looks()
@@ -81,7 +81,7 @@ class Cluster(LosableCluster):
         self.pending.append(weakref.ref(answer))
         return answer
 
-    async def started(self, on_end: Callable[[Ended], None] | None = None) -> Any:
+    async def started(self, on_end: Callable[[ProcessExit], None] | None = None) -> Any:
         class Spec:
             class folder:
                 epoch = 0
@@ -186,7 +186,7 @@ def test_what_ray_has_begun_is_waited_for_and_a_fault_of_one_scene_keeps_nobody(
     when: list[bool] = []
     cluster.looks = lambda: when.append(over.is_set())
 
-    def fails(end: Ended) -> None:
+    def fails(end: ProcessExit) -> None:
         raise KeyError("a fault of the scene's")
 
     async def test() -> None:

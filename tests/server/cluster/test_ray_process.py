@@ -19,10 +19,10 @@ ray_placement = pytest.importorskip(
 from ray.exceptions import RayActorError, RayError  # noqa: E402
 
 from server.cluster.calls import Calls  # noqa: E402
-from server.cluster.host import Gone, Started  # noqa: E402
+from server.cluster.host import NodeGone, Started  # noqa: E402
 from server.cluster.needs import Needs  # noqa: E402
 from server.cluster.nodes import is_lost, own_node_is_lost  # noqa: E402
-from server.processes.placement import Ended  # noqa: E402
+from server.processes.placement import ProcessExit  # noqa: E402
 from server.settings import ServerSettings  # noqa: E402
 from tests.server.cluster.others import others_have_called  # noqa: E402
 
@@ -88,7 +88,7 @@ class Running:
     def __init__(self, placement: FakePlacement) -> None:
         self.placement, self.actor = placement, placement.actor
         self.messages: list[Any] = []
-        self.ends: list[Ended] = []
+        self.ends: list[ProcessExit] = []
         self.raises: Exception | None = None
         runs = (lambda: None, None)
         made = ray_placement.RayProcess
@@ -264,7 +264,7 @@ def test_a_message_that_cannot_be_taken_in_does_not_end_the_others(killed: list[
     async def test(placement: FakePlacement) -> None:
         running = Running(placement)
         running.raises = KeyError("x")
-        for message in ("a", "b", Gone(3)):
+        for message in ("a", "b", NodeGone(3)):
             placement.actor.said.put_nowait(message)
         await wait_for_soon(lambda: running.ends)
         assert running.messages == ["a", "b"]

@@ -38,7 +38,7 @@ def test_what_happens_to_frames_and_questions_is_counted(http, sdk, scene):
 
     assert risen("scas4d_frames_total", "acknowledged") == 2
     assert risen("scas4d_frames_total", "committed") == 2
-    assert risen("scas4d_frames_total", "set_aside") == 0
+    assert risen("scas4d_frames_total", "failed") == 0
     sent = sum(map(len, pictures().values()))
     assert 2 * sent <= risen("scas4d_ingest_bytes_total") <= 2 * sent + 4096
     assert risen("scas4d_update_seconds_count", "update") == 2

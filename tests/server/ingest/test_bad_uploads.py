@@ -77,7 +77,7 @@ def test_a_bad_picture_is_refused_at_every_door(http, service, quiet_scene, name
     assert value in document["value"]
     assert remedy in document["remedy"]
     status = http.get(f"/v1/scenes/{quiet_scene}").json()
-    assert (status["next_frame"], status["open_frames"], status["frames_held"]) == (0, [], 0)
+    assert (status["next_frame"], status["open_frames"], status["frames_kept"]) == (0, [], 0)
 
 
 @pytest.mark.parametrize("door", ["form", "frame", "camera"])

@@ -42,7 +42,7 @@ def test_framed_bytes_that_are_none_are_refused_by_name(http, make):
     assert problem(http.put(url, content=framed(1), headers=FRAMED), 422)["field"] == "head.index"
     assert problem(put(http, id, 0, {"c0": picture()}), 422)["field"] == "c1"
     assert status(http, id)["next_frame"] == 0
-    assert status(http, id)["frames_held"] == 0
+    assert status(http, id)["frames_kept"] == 0
 
 
 def test_a_refused_upload_leaves_no_file(http, make, service):
@@ -147,7 +147,7 @@ def test_fewer_cameras_than_the_minimum_set_the_frame_aside(http, make):
     put_camera(http, id, 0, "c1", picture())
     report = finished(http, id, 0)
     assert (report["state"], report["error"]) == (
-        "set_aside",
+        "failed",
         "1 cameras' pictures are left, the scene's minimum is 2",
     )
     assert put(http, id, 1).status_code == 202  # and the next one starts the scene
@@ -222,9 +222,9 @@ def test_retention_deletes_pictures_and_states_and_says_so(http, make, service):
     for index in range(7):
         receipts.append(put(http, id, index).json())
         finished(http, id, index)
-    wait_for(lambda: status(http, id)["frames_held"] == 3 and status(http, id)["states_deleted"] == 4)
+    wait_for(lambda: status(http, id)["frames_kept"] == 3 and status(http, id)["states_deleted"] == 4)
     reports = [http.get(f"/v1/scenes/{id}/frames/{index}").json() for index in range(7)]
-    assert [report["held"] for report in reports] == [False] * 4 + [True] * 3
+    assert [report["pictures_kept"] for report in reports] == [False] * 4 + [True] * 3
     assert [report["deleted"] for report in reports] == [False, True, True, True, True, False, False]
     assert len(list(service.app.state.scenes[id].spec.folder.frames.iterdir())) == 3
     # What a frame was is known for ever.
@@ -242,11 +242,11 @@ def test_nothing_uncommitted_is_deleted(http, make):
     for index in range(4):
         put(http, other, index)
     finished(http, other, 3)
-    wait_for(lambda: status(http, other)["frames_held"] == 1)  # sent later, and deleted
-    assert status(http, id)["frames_held"] == 4
+    wait_for(lambda: status(http, other)["frames_kept"] == 1)  # sent later, and deleted
+    assert status(http, id)["frames_kept"] == 4
     http.post(f"/v1/scenes/{id}/resume")
     finished(http, id, 3)
-    wait_for(lambda: status(http, id)["frames_held"] == 1)  # the newest may have to be done again
+    wait_for(lambda: status(http, id)["frames_kept"] == 1)  # the newest may have to be done again
     assert status(http, id)["frame_bytes"] > 0
 
 
@@ -358,7 +358,7 @@ def test_messages_that_do_not_wait_are_taken_and_answered_in_order(http, make, s
     assert [answer["index"] for answer in answers] == expected
     assert [answer["status"] for answer in answers] == [202] * 6 + [409] + [202] * 3 + [422, 409, 202]
     assert status(http, id)["next_frame"] == 8
-    assert status(http, id)["frames_held"] == 8
+    assert status(http, id)["frames_kept"] == 8
 
 
 def test_a_sender_that_goes_away_loses_nothing_that_it_sent_whole(http, make, service):
@@ -380,4 +380,4 @@ def test_a_frame_that_raises_keeps_its_reason(http, make):
     finished(http, id, 0)
     put(http, id, 1, pictures(fakes.RAISES))
     assert "told to raise" in finished(http, id, 1)["error"]
-    assert status(http, id)["set_aside"] == 1
+    assert status(http, id)["failed"] == 1

@@ -15,7 +15,7 @@ from waiting import HANG_S, wait_for_soon
 from client.wire import FRAME_MEDIA_TYPE
 from server.ingest import camera_files, receive
 from server.scene import scene
-from server.storage.events import FrameAccepted, FrameSetAside
+from server.storage.events import FrameAccepted, FrameFailed
 from server.storage.journal import Journal
 from server.storage.layout import SceneFolder
 from server.storage.recovery import recover
@@ -98,8 +98,8 @@ def test_a_frame_accepted_while_the_first_one_fails_does_not_wait_for_ever(http,
     scene = service.app.state.scenes[id]
 
     async def race():
-        event = FrameSetAside(index=0, reason="told to", fatal=True)
-        setting = asyncio.ensure_future(scene.updates._set_aside(event))
+        event = FrameFailed(index=0, reason="told to", fatal=True)
+        setting = asyncio.ensure_future(scene.updates._record_failure(event))
         await wait_for_soon(journal.writes.is_set)
 
         async def body():
@@ -115,7 +115,7 @@ def test_a_frame_accepted_while_the_first_one_fails_does_not_wait_for_ever(http,
     journal = HeldJournal(monkeypatch)
     on_the_loop(scene, race()).result(HANG_S)
     wait_for(lambda: status(http, id)["queued"] == 0)
-    assert http.get(f"/v1/scenes/{id}/frames/1").json()["state"] == "set_aside"
+    assert http.get(f"/v1/scenes/{id}/frames/1").json()["state"] == "failed"
 
 
 def test_a_scene_that_failed_is_found_with_nothing_waiting(tmp_path):
@@ -125,13 +125,13 @@ def test_a_scene_that_failed_is_found_with_nothing_waiting(tmp_path):
             FrameAccepted(index=index, time=index / 10, identity="ab" * 32, files=(f"{index:010d}-{0:012x}.frame",))
             for index in (0, 1)
         ]
-        await journal.append(taken[0], FrameSetAside(index=0, reason="told to", fatal=True), taken[1])
+        await journal.append(taken[0], FrameFailed(index=0, reason="told to", fatal=True), taken[1])
         await journal.close()
 
     asyncio.run(write())
     found = recover(SceneFolder(tmp_path), "s")
     assert found.ledger.waiting() == []
-    assert [(event.index, event.fact) for event in found.events] == [(1, "set_aside")]
+    assert [(event.index, event.fact) for event in found.events] == [(1, "failed")]
     assert "told to" in found.ledger.frames[1].report.error
 
 
@@ -182,6 +182,6 @@ def test_parts_again_after_retention_get_the_same_answer(http, make):
         put_camera(http, id, index, "c0", picture(index))
         first.append(put_camera(http, id, index, "c1", picture(index + 20)).json())
         finished(http, id, index)
-    wait_for(lambda: status(http, id)["frames_held"] == 1)
+    wait_for(lambda: status(http, id)["frames_kept"] == 1)
     assert put_camera(http, id, 0, "c1", picture(20)).json() == first[0]
     assert problem(put_camera(http, id, 0, "c1", picture(9)), 409)["field"] == "c1"

@@ -21,7 +21,7 @@ from waiting import HANG_S, wait_for
 from client.sdk import Client
 from client.wire import CameraModel, part_colour
 from server.processes import query_queue, renderer
-from server.processes.placement import Ended
+from server.processes.placement import ProcessExit
 from server.processes.queries import Answer
 
 
@@ -333,7 +333,7 @@ def test_a_query_whose_reader_is_lost_with_its_machine_goes_to_the_next(monkeypa
         for number in range(1, times + 1):
             while len(placement.started) < number or not placement.started[-1].asked:
                 await asyncio.sleep(0.005)
-            placement.started[-1].on_end(Ended(None, "the node of its views is lost", lost=lost))
+            placement.started[-1].on_end(ProcessExit(None, "the node of its views is lost", lost=lost))
         if status is None:
             while len(placement.started) < 2 or not placement.started[-1].asked:
                 await asyncio.sleep(0.005)

@@ -12,7 +12,7 @@ from running import HEIGHT, WIDTH, make_rig
 
 from client.wire import Budget
 from scas4d_core.captures import Frame
-from scas4d_core.compilation.manifest import Group
+from scas4d_core.compilation.manifest import KernelGroup
 from scas4d_core.presets import preset
 from server.messages import Progressed, SceneSpec
 from server.processes.kernels import STAGE
@@ -25,9 +25,9 @@ from server.storage.layout import SceneFolder
 def test_kernels_are_compiled_before_they_are_called(tmp_path, monkeypatch, points, covariance):
     asked = []
 
-    def elsewhere(wanted, *, then=(), told=None):
+    def elsewhere(wanted, *, then=(), on_progress=None):
         asked.append((set(wanted), set(then)))
-        told(1, 2)
+        on_progress(1, 2)
 
     monkeypatch.setattr("scas4d_core.warm_up.warm_up_elsewhere", elsewhere)
     monkeypatch.setattr("scas4d_core.reconstruction.Reconstruction", fakes.FakeReconstruction)
@@ -49,11 +49,11 @@ def test_kernels_are_compiled_before_they_are_called(tmp_path, monkeypatch, poin
         while ours.poll():
             said.append(ours.recv())
     waits = [(one.done, one.total) for one in said if isinstance(one, Progressed) and one.stage == STAGE]
-    of_updates = {Group.UPDATE, Group.SEPARATE if covariance == "separate" else Group.ENTANGLED}
-    of_first = {Group.FIRST_FRAME} if points else {Group.FIRST_FRAME, Group.STEREO}
+    of_updates = {KernelGroup.UPDATE, KernelGroup.SEPARATE if covariance == "separate" else KernelGroup.ENTANGLED}
+    of_first = {KernelGroup.FIRST_FRAME} if points else {KernelGroup.FIRST_FRAME, KernelGroup.STEREO}
     assert asked == [
         (of_first, of_updates),  # these while frame 0 is fitted
-        ({Group.FIRST_FRAME} | of_updates, set()),
-        ({Group.FIRST_FRAME} | of_updates, set()),
+        ({KernelGroup.FIRST_FRAME} | of_updates, set()),
+        ({KernelGroup.FIRST_FRAME} | of_updates, set()),
     ]
     assert waits == [(1, 2)] * 2

@@ -15,7 +15,7 @@ from waiting import HANG_S, wait_for
 
 from client.sdk import Client
 from scas4d_core.captures import open_capture
-from server.repair.mending import SENTENCES_KEPT, DamageKind, DamageLog
+from server.repair.repair_queue import SENTENCES_KEPT, DamageKind, DamageLog
 from server.repair.scrub import Scrub
 from studies.running import study as of
 from studies.service import faults
@@ -82,7 +82,7 @@ def test_what_is_in_memory_or_has_a_copy_is_written_again_with_the_same_bits(tmp
     with serving(tmp_path, **FAST) as (http, sdk):
         id = filled(http, sdk)
 
-        def mended(file, whole, before):
+        def repaired(file, whole, before):
             status = http.get(f"/v1/scenes/{id}").json()
             told = status["damage"] != before and not status["degraded"]
             return status if told and file.exists() and file.read_bytes() == whole else None
@@ -93,7 +93,7 @@ def test_what_is_in_memory_or_has_a_copy_is_written_again_with_the_same_bits(tmp
                 whole = file.read_bytes()
                 before = http.get(f"/v1/scenes/{id}").json()["damage"]
                 flip(file) if how == "flipped" else file.unlink()
-                status = eventually(lambda: mended(file, whole, before))  # noqa: B023 (it is called here)
+                status = eventually(lambda: repaired(file, whole, before))  # noqa: B023 (it is called here)
                 assert status["state"] == "ready"
                 assert name in status["damage"][-1]
                 assert len(status["damage"]) == len(before) + 1
@@ -143,9 +143,9 @@ def test_a_state_in_the_middle_is_made_again_from_its_pictures(tmp_path, found_b
         status_with(http, id, "made again from its pictures")
         eventually(lambda: view(http, id, 2).status_code == 200)
         report = http.get(f"/v1/scenes/{id}/frames/2").json()
-        assert report["remade"] is True
+        assert report["recomputed"] is True
         assert (report["state"], report["deleted"]) == ("committed", False)
-        assert http.get(f"/v1/scenes/{id}/frames/3").json()["remade"] is False
+        assert http.get(f"/v1/scenes/{id}/frames/3").json()["recomputed"] is False
         assert http.get(f"/v1/scenes/{id}").json()["committed"] == 8
         after = colours(tmp_path, id)
         assert {i: d for i, d in after.items() if i != 2} == {i: d for i, d in before.items() if i != 2}
@@ -346,7 +346,7 @@ def test_where_the_report_alone_is_damaged_the_state_stays(tmp_path, restart):
             http.get(f"/v1/scenes/{id}/frames/2")  # reads the report
         status_with(http, id, "its report is lost" if restart else "nothing is lost")
         after = http.get(f"/v1/scenes/{id}/frames/2").json()
-        assert after["remade"] is False
+        assert after["recomputed"] is False
         assert after["psnr"] == (None if restart else before["psnr"])
         assert restart or file.read_bytes() == whole
         assert view(http, id, 2).status_code == 200
@@ -361,4 +361,4 @@ def test_neighbours_that_are_damaged_are_all_made_again(tmp_path):
         assert view(http, id, 3).status_code in (404, 503)  # nobody has looked at 2
         eventually(lambda: all(view(http, id, index).status_code == 200 for index in (2, 3)))
         assert colours(tmp_path, id) == before  # the fake's depend on the state before alone
-        assert all(http.get(f"/v1/scenes/{id}/frames/{index}").json()["remade"] for index in (2, 3))
+        assert all(http.get(f"/v1/scenes/{id}/frames/{index}").json()["recomputed"] for index in (2, 3))

@@ -99,7 +99,7 @@ def test_a_frame_that_fails_is_set_aside_and_the_scene_goes_on(sdk, scene):
     sdk.put_frame(scene, 0, pictures())
     sdk.put_frame(scene, 1, pictures(fakes.RAISES))
     report = sdk.wait(scene, 1)
-    assert report.state == "set_aside"
+    assert report.state == "failed"
     assert "told to raise" in report.error
     assert sdk.scene(scene).state == "degraded"
     sdk.put_frame(scene, 2, pictures())
@@ -109,7 +109,7 @@ def test_a_frame_that_fails_is_set_aside_and_the_scene_goes_on(sdk, scene):
 
 def test_a_first_frame_that_fails_fails_the_scene(http, sdk, scene):
     sdk.put_frame(scene, 0, pictures(fakes.RAISES))
-    assert sdk.wait(scene, 0).state == "set_aside"
+    assert sdk.wait(scene, 0).state == "failed"
     assert sdk.scene(scene).state == "failed"
     assert "told to raise" in problem(put(http, scene, 1, pictures()), 409)["detail"]
 
@@ -118,7 +118,7 @@ def test_frames_that_waited_behind_a_failed_first_one_do_not_bring_the_scene_bac
     sdk.put_frame(scene, 0, pictures(fakes.SLOW_RAISES))
     sdk.put_frame(scene, 1, pictures())  # is taken: frame 0 is still at work
     until = time.monotonic() + HANG_S
-    while sdk.frame(scene, 1).state != "set_aside":
+    while sdk.frame(scene, 1).state != "failed":
         assert time.monotonic() < until
         time.sleep(0.05)
     status = sdk.scene(scene)
@@ -131,7 +131,7 @@ def test_a_frame_that_kills_its_worker_twice_is_set_aside_and_the_scene_goes_on(
     sdk.wait(scene, 0)
     sdk.put_frame(scene, 1, pictures(fakes.DIES))
     report = sdk.wait(scene, 1)
-    assert (report.state, report.attempts) == ("set_aside", 2)
+    assert (report.state, report.attempts) == ("failed", 2)
     assert "exit code 7" in report.error
     status = sdk.scene(scene)
     assert (status.state, status.worker_deaths) == ("degraded", 2)

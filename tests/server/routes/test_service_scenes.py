@@ -132,7 +132,7 @@ BAD = {
     "layers": (set_setting("update", "clusters", list(range(1, 18))), "settings.update.clusters"),
     "Gaussians": (set_setting("static", "max_gaussians", 10**9), "settings.static.max_gaussians"),
     "milliseconds": (set_setting("update", "budget_ms", 1e12), "settings.update.budget_ms"),
-    "patience": (set_setting("update", "patience", 10**9), "settings.update.patience"),
+    "max rejected frames": (set_setting("update", "max_rejected_frames", 10**9), "settings.update.max_rejected_frames"),
     "unit": (set_setting("scene", "metres_per_unit", 1e-30), "settings.scene.metres_per_unit"),
     "short focal length": (set_camera("intrinsics", [[1.0, 0, 12], [0, 20, 8], [0, 0, 1]]), "rig.cameras.0.intrinsics"),
     "long focal length": (set_camera("intrinsics", [[20, 0, 12], [0, 1e6, 8], [0, 0, 1]]), "rig.cameras.0.intrinsics"),
@@ -283,7 +283,7 @@ def test_points_behind_all_cameras_are_refused(http, quiet_scene):
 
 
 def test_poses_the_wrong_way_round_are_a_warning(http, sdk):
-    """Seen from the right way round: two cameras left and right of z, 3 away, looking at the origin."""
+    """FrameObservation from the right way round: two cameras left and right of z, 3 away, looking at the origin."""
     body = {"rig": rig_json()}
     for camera, angle in zip(body["rig"]["cameras"], (0.5, -0.5), strict=True):
         c, s = np.cos(angle), np.sin(angle)

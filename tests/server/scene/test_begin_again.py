@@ -71,7 +71,7 @@ def test_a_first_frame_that_failed_is_tried_again_with_other_settings(http, sdk,
     for index, red in enumerate((fakes.PICKY, 20, 30)):
         put_form(http, id, index, pictures(red))
     failed = settled(http, id)
-    assert (failed["state"], failed["committed"], failed["set_aside"]) == ("failed", 0, 3)
+    assert (failed["state"], failed["committed"], failed["failed"]) == ("failed", 0, 3)
     assert f"PUT /v1/scenes/{id}/reconstructions/1" in failed["error"]
     assert "PUT …/reconstructions/1" in problem(put_form(http, id, 3), 409)["remedy"]
 
@@ -152,7 +152,7 @@ def test_committed_frames_are_dropped_only_if_the_request_says_so(http, sdk, mak
     begun(http, id, 1, frame=2, discard=True)
     assert sdk.wait(id, 3).state == "committed"
     found = reports(http, id)
-    assert [found[index]["state"] for index in range(4)] == ["set_aside", "set_aside", "committed", "committed"]
+    assert [found[index]["state"] for index in range(4)] == ["failed", "failed", "committed", "committed"]
     assert found[0]["error"] == found[1]["error"] == "the reconstruction begins with frame 2"
     after = settled(http, id)
     assert (after["first_frame"], after["first_committed"], after["committed"]) == (2, 2, 2)
@@ -198,7 +198,7 @@ def test_pictures_that_are_deleted_cannot_be_begun_with(http, sdk, make):
     for index in range(6):
         put_form(http, id, index)
         sdk.wait(id, index)
-    wait_for(lambda: status(http, id)["frames_held"] == 2)
+    wait_for(lambda: status(http, id)["frames_kept"] == 2)
     refused = problem(begin(http, id, 1, discard=True), 409)
     assert (refused["detail"], refused["expected"]) == ("the pictures of frame 0 are deleted", 4)
     assert "begin with frame 4" in refused["remedy"]
@@ -258,7 +258,7 @@ def test_a_first_frame_at_work_is_stopped(http, sdk, make):
     put_form(http, id, 1)
     begun(http, id, 1, frame=1)
     assert sdk.wait(id, 1).state == "committed"
-    assert sdk.frame(id, 0).state == "set_aside"
+    assert sdk.frame(id, 0).state == "failed"
     assert status(http, id)["worker_deaths"] == 0
 
 

@@ -14,7 +14,7 @@ from sending import create, put_form, serving, settled, status, wait_for
 from client.wire import ReconstructionRequest
 from scas4d_core.storage.history import History
 from server.scene import beginning, found
-from server.storage.events import FrameAccepted, FrameSetAside, PicturesDeleted, ReconstructionBegun, StatesDeleted
+from server.storage.events import FrameAccepted, FrameFailed, PicturesDeleted, ReconstructionBegun, StatesDeleted
 from server.storage.journal import Journal, bytes_of, read_journal
 from server.storage.layout import DataFolder
 from server.storage.ledger import Ledger
@@ -22,7 +22,7 @@ from server.storage.recovery import NO_STATE, recover
 
 CHANGED = {"static": {"iterations": fakes.PICKED}}
 FRAMES = 3
-AFTER = ["set_aside", "set_aside", "committed", "set_aside", "committed"]
+AFTER = ["failed", "failed", "committed", "failed", "committed"]
 """Frames of a reconstruction that begins with frame 2, the one after which fails."""
 
 
@@ -111,7 +111,7 @@ def test_a_crash_at_any_step_ends_before_or_after(tmp_path, crashes):
             sdk.wait(id, FRAMES - 1)
             assert committed(crashed, id) == {"states_1": after[id]}, step
             assert not list(DataFolder(crashed).scene(id).path.glob("parts"))
-            assert http.get(f"/v1/scenes/{id}/frames/1").json()["state"] == "set_aside"
+            assert http.get(f"/v1/scenes/{id}/frames/1").json()["state"] == "failed"
     with serving(crashed) as (http, _):  # and once more: all is found again
         assert [status(http, id)["damage"] for id in ids] == [[]] * len(ids)
         assert [status(http, id)["reconstruction"] for id in ids] == [1] * len(ids)
@@ -216,7 +216,7 @@ def begun(number, index):
 def test_what_happened_to_frames_before_is_forgotten_and_frames_of_old_states_are_no_commits():
     ledger = Ledger("abc")
     events = [taken(0), taken(1), PicturesDeleted(frames=(0,)), taken(2), StatesDeleted(frames=(0, 1))]
-    events += [FrameSetAside(index=2, reason="fault", dropped={"c0": "dark"}, fatal=True), taken(3)]
+    events += [FrameFailed(index=2, reason="fault", dropped={"c0": "dark"}, fatal=True), taken(3)]
     for event in [*events, begun(1, 1), begun(1, 1)]:
         ledger.apply(event)
     assert ledger.waiting() == [1, 2, 3]

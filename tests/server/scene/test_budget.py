@@ -40,13 +40,18 @@ def iterations(sdk, id):
 
 
 def test_a_scene_has_the_budget_of_its_settings_until_another_is_put(sdk):
-    id = sdk.create_scene(make_rig(), settings={"update": {"iterations": 70, "still": 0.5}}).id
+    id = sdk.create_scene(make_rig(), settings={"update": {"iterations": 70, "skip_tolerance": 0.5}}).id
     found = sdk.budget(id)
     assert (found.asked, found.since) == (Budget(), 0)
-    assert found.effective.model_dump() == {"iterations": 70, "budget_ms": None, "stop_gain": 0.0, "still": 0.5}
-    put = sdk.set_budget(id, budget_ms=400, still=-1)
+    assert found.effective.model_dump() == {
+        "iterations": 70,
+        "budget_ms": None,
+        "stop_gain": 0.0,
+        "skip_tolerance": 0.5,
+    }
+    put = sdk.set_budget(id, budget_ms=400, skip_tolerance=-1)
     assert put == sdk.budget(id)
-    assert put.effective.model_dump() == {"iterations": 70, "budget_ms": 400, "stop_gain": 0.0, "still": -1}
+    assert put.effective.model_dump() == {"iterations": 70, "budget_ms": 400, "stop_gain": 0.0, "skip_tolerance": -1}
     assert sdk.scene(id).budget == put.asked
     assert sdk.set_budget(id).effective == found.effective  # nothing put: as it was made
     sdk.delete_scene(id)
@@ -109,7 +114,7 @@ def test_frames_that_wait_get_the_budget_that_held_for_them_after_kill_9(tmp_pat
         ({"budget_ms": -5}, "budget_ms"),
         ({"budget_ms": 1e300}, "budget_ms"),
         ({"stop_gain": 1}, "stop_gain"),
-        ({"still": -2}, "still"),
+        ({"skip_tolerance": -2}, "skip_tolerance"),
         ({"milliseconds": 500}, "milliseconds"),
         ([], "body"),
     ],
@@ -122,7 +127,7 @@ def test_what_is_no_budget_is_refused_and_changes_nothing(http, quiet_scene, bod
 
 
 def test_numbers_that_are_none_are_refused(http, quiet_scene):
-    for text in (b'{"budget_ms": NaN}', b'{"still": Infinity}', b'{"budget_ms": 1e999}'):
+    for text in (b'{"budget_ms": NaN}', b'{"previous": Infinity}', b'{"budget_ms": 1e999}'):
         answer = http.put(
             f"/v1/scenes/{quiet_scene}/budget", content=text, headers={"Content-Type": "application/json"}
         )

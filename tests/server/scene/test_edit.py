@@ -55,8 +55,8 @@ def test_states_beyond_the_rule_go_at_once(tmp_path):
 def test_pictures_beyond_the_rule_go_at_once(tmp_path):
     with serving_with(tmp_path) as (_, http, _sdk):
         id = filled(http, 6)
-        assert status(http, id)["frames_held"] == 6
-        assert edit(http, id, keep_frames={"last": 1}).json()["frames_held"] < 6
+        assert status(http, id)["frames_kept"] == 6
+        assert edit(http, id, keep_frames={"last": 1}).json()["frames_kept"] < 6
 
 
 def test_an_archived_scene_takes_no_frames_until_that_is_taken_back(tmp_path):

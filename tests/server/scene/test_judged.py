@@ -21,7 +21,7 @@ from server.settings import ServerSettings
 BOX, RIG = make_box(), make_rig()
 SETTINGS = {
     "static": {"iterations": 200, "max_gaussians": 800},
-    "update": {"iterations": 20, "clusters": [2, 12], "still": -1},
+    "update": {"iterations": 20, "clusters": [2, 12], "skip_tolerance": -1},
     "effects": {"rotation": "off"},
 }
 
@@ -71,7 +71,7 @@ def test_a_frame_that_is_met_carries_its_report(served):
     _, sdk, id, _ = served
     report = sdk.frame(id, 3)
     assert (report.degraded, report.dropped_cameras, report.kept, report.tries) == (None, {}, "end", ["as set"])
-    assert report.errors["end"] < report.errors["still"]
+    assert report.errors["end"] < report.errors["previous"]
     assert report.curve[-1].iterations == report.iterations == 20
     assert report.planned == [(0, 20)]
     assert set(report.cameras) == set(RIG.names)
@@ -87,7 +87,7 @@ def test_a_frame_that_is_met_carries_its_report(served):
 
 def test_a_black_frame_is_held_explained_and_over_with_the_next_good_one(served):
     _, sdk, id, states = served
-    held = metric(sdk, 'scas4d_degraded_frames_total{how="held"}')
+    held = metric(sdk, 'scas4d_degraded_frames_total{how="rejected"}')
     index = sdk.scene(id).next_frame
     report = put(sdk, id, index, RIG.names)
     assert report.state == "committed"
@@ -100,7 +100,7 @@ def test_a_black_frame_is_held_explained_and_over_with_the_next_good_one(served)
     status = sdk.scene(id)
     assert status.degraded
     assert f"frame {index} was held as it was" in status.error
-    assert metric(sdk, 'scas4d_degraded_frames_total{how="held"}') == held + 1
+    assert metric(sdk, 'scas4d_degraded_frames_total{how="rejected"}') == held + 1
     good = put(sdk, id, index + 1)
     assert good.degraded is None
     assert good.psnr > sdk.frame(id, 3).psnr - 3

@@ -14,7 +14,7 @@ from waiting import HANG_S
 
 from scas4d_core.storage.history import History
 from server.processes import worker
-from server.processes.placement import Ended, Placement
+from server.processes.placement import Placement, ProcessExit
 from server.storage.fencing import epoch_read
 from server.storage.layout import DataFolder
 from server.updates import worker_process
@@ -28,7 +28,7 @@ class Machines(Placement):
 
     def start(self, entry, spec, on_message, on_end):
         def lost(why):
-            on_end(Ended(None, "the node of its worker is lost", lost=True) if entry is worker.main else why)
+            on_end(ProcessExit(None, "the node of its worker is lost", lost=True) if entry is worker.main else why)
 
         return super().start(entry, spec, on_message, lost)
 
@@ -116,8 +116,8 @@ def test_states_go_to_other_machines_and_back(tmp_path):
 def test_machines_that_are_lost_one_after_another_are_given_more_and_more_time():
     """A frame may be what takes them down."""
     deaths = WorkerDeaths()
-    pauses = [deaths.died(Ended(None, lost=True))[1] for _ in range(12)]
+    pauses = [deaths.died(ProcessExit(None, lost=True))[1] for _ in range(12)]
     assert pauses[:4] == [0.5, 0.5, 0.5, 1.0]
     assert pauses[-1] == LONGEST_AFTER_LOST_S
     deaths.committed()
-    assert deaths.died(Ended(None, lost=True)) == (False, 0.5)
+    assert deaths.died(ProcessExit(None, lost=True)) == (False, 0.5)

@@ -145,7 +145,7 @@ def test_deaths_at_a_frame_are_counted_over_restarts(tmp_path):
             time.sleep(0.02)
     with serving(tmp_path) as (http, sdk):
         report = sdk.wait(id, 1)
-        assert (report.state, report.attempts) == ("set_aside", 2)
+        assert (report.state, report.attempts) == ("failed", 2)
 
 
 def test_a_deletion_that_was_cut_short_is_finished_and_half_a_scene_is_none(tmp_path):

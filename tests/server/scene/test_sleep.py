@@ -260,7 +260,7 @@ def doubt(folder, how):
 
 @pytest.mark.parametrize("how", ["flipped", "cut", "another scene's", "journal", "state", "points"])
 def test_a_card_that_cannot_be_believed_is_left_aside(tmp_path, how):
-    from server.scene.card import read_card
+    from server.scene.status_cache import read_card
     from server.storage.layout import SceneFolder
 
     with serving_with(tmp_path) as (_, http, _sdk):

@@ -8,7 +8,7 @@ import pytest
 from running import make_rig
 
 from scas4d_core.presets import preset
-from server.messages import Mend, SceneSpec, Stop
+from server.messages import RepairFiles, SceneSpec, Stop
 from server.processes.worker import Worker, _Stopped
 from server.storage.layout import SceneFolder
 
@@ -24,15 +24,15 @@ def worker(tmp_path):
 
 
 def test_other_messages_are_kept_for_later(worker):
-    worker.service.send(Mend(("frame_000001.npz",)))
-    worker.service.send(Mend(("frame_000002.npz",)))
+    worker.service.send(RepairFiles(("frame_000001.npz",)))
+    worker.service.send(RepairFiles(("frame_000002.npz",)))
     worker._await_room(0.05)
-    worker.service.send(Mend(("frame_000003.npz",)))
+    worker.service.send(RepairFiles(("frame_000003.npz",)))
     assert [worker.next().names[0][-5] for _ in range(3)] == ["1", "2", "3"]
 
 
 def test_stop_ends_it_at_once(worker):
-    worker.service.send(Mend(("frame_000001.npz",)))
+    worker.service.send(RepairFiles(("frame_000001.npz",)))
     worker.service.send(Stop())
     with pytest.raises(_Stopped):
         worker._await_room(60)

@@ -171,7 +171,7 @@ def test_what_cannot_be_replayed_says_what_would_help(http, sdk):
     document = problem(http.post(f"/v1/scenes/{id}/tradeoff"), 409)
     assert document["field"] == "frames"
     push(sdk, id, range(7))
-    wait_for(lambda: not sdk.frame(id, 4).held)
+    wait_for(lambda: not sdk.frame(id, 4).pictures_kept)
     document = problem(http.post(f"/v1/scenes/{id}/tradeoff", json={"frames": 4}), 409)
     assert "not held" in document["detail"]
     assert "at most 1 frame" in document["remedy"]

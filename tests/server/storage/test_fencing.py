@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from scas4d_core.cameras import WorldFrame
-from scas4d_core.compact import CompactWriter, Head
+from scas4d_core.compact import CompactWriter, FileHeader
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.storage.history import History
 from server.storage import fencing
@@ -81,7 +81,7 @@ def test_a_reader_goes_on_over_the_change(states: Path, lock: Path) -> None:
 
 def test_a_compact_file_that_is_written_is_copied_and_a_whole_one_linked(states: Path, lock: Path) -> None:
     old = epoch_folder(states, 0)
-    head = Head(WorldFrame(np.zeros(3)))
+    head = FileHeader(WorldFrame(np.zeros(3)))
     with CompactWriter(old / "states_000000.s4d", head) as writer:
         writer.add(0, 0.0, STATE)
     growing = CompactWriter(old / "states_000120.s4d", head)

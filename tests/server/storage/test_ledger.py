@@ -12,8 +12,8 @@ from scas4d_core.frame_report import CurvePoint, FrameReport
 from scas4d_core.update.result import CameraFit
 from server.storage.events import (
     FrameAccepted,
+    FrameFailed,
     FrameMissing,
-    FrameSetAside,
     FramesSkipped,
     PartAccepted,
     PicturesDeleted,
@@ -48,17 +48,17 @@ def test_an_entry_says_what_the_events_said():
     events = [taken(0), FrameMissing(index=1, reason="cable"), taken(2), FramesSkipped(frames=(2,), by=3), taken(3)]
     events += [WorkerDied(index=3, reason="x", own=True), WorkerDied(index=3, reason="x", own=False)]
     events += [
-        FrameSetAside(index=3, reason="two deaths", dropped={"c0": "torn"}),
+        FrameFailed(index=3, reason="two deaths", dropped={"c0": "torn"}),
         taken(4),
         PicturesDeleted(frames=(0, 4)),
     ]
     ledger = ledger_of(*events)
     reports_ = [ledger.frames[index].report for index in range(5)]
-    states = [FrameState.QUEUED, FrameState.MISSING, FrameState.SKIPPED, FrameState.SET_ASIDE, FrameState.QUEUED]
+    states = [FrameState.QUEUED, FrameState.MISSING, FrameState.SKIPPED, FrameState.FAILED, FrameState.QUEUED]
     assert [report.state for report in reports_] == states
     assert [report.time for report in reports_] == [0.0, None, 0.2, 0.3, 0.4]
     assert [report.identity for report in reports_] == [identity(0), None, identity(2), identity(3), identity(4)]
-    assert [report.held for report in reports_] == [False, False, True, True, False]
+    assert [report.pictures_kept for report in reports_] == [False, False, True, True, False]
     assert [report.error for report in reports_[:2]] == [None, "cable"]
     assert "frame 3 came" in reports_[2].error
     assert (reports_[3].error, reports_[3].attempts) == ("two deaths", 2)
@@ -79,7 +79,7 @@ def test_what_is_lost_before_an_event_is_set_aside():
     assert ledger.open == {}
     ledger.apply(taken(1))  # found in the frame log
     assert (ledger.frames[1].state, ledger.frames[1].error) == (FrameState.QUEUED, None)
-    assert ledger.counts[FrameState.SET_ASIDE] == 1
+    assert ledger.counts[FrameState.FAILED] == 1
 
 
 def test_states_that_are_there_commit_and_those_that_are_gone_are_told():
@@ -93,8 +93,8 @@ def test_states_that_are_there_commit_and_those_that_are_gone_are_told():
     assert ledger.reconcile([0, 2], {4: "torn"}) == []
     assert (list(ledger.committed), ledger.waiting()) == ([0, 2], [3, 4, 5])
     gone = "its state is damaged, and its pictures are deleted"
-    assert ledger.reconcile([0], {}) == [FrameSetAside(index=1, reason=gone), FrameSetAside(index=2, reason=gone)]
-    assert ledger.frames[2].state == FrameState.SET_ASIDE
+    assert ledger.reconcile([0], {}) == [FrameFailed(index=1, reason=gone), FrameFailed(index=2, reason=gone)]
+    assert ledger.frames[2].state == FrameState.FAILED
 
 
 def test_a_state_whose_event_is_lost_is_committed():
@@ -141,7 +141,7 @@ def test_every_field_of_a_commit_reaches_the_wire_or_is_named_as_left_out():
         "write_seconds",
         "publish_seconds",
         "threads",
-        "remade",
+        "recomputed",
         "resumed",
     }  # the worker adds them to the record
     committed = {field.name for field in fields(FrameReport)} | noted

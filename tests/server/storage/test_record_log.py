@@ -16,10 +16,10 @@ from server.storage import record_log
 from server.storage.events import FrameAccepted, FrameMissing, PauseChanged
 from server.storage.frame_store import FrameDamage, Upload, read_pictures, stored
 from server.storage.journal import Journal, read_journal
-from server.storage.record_log import Damage, Kind, Record, encoded, records
+from server.storage.record_log import Damage, LogRecord, LogRecordKind, encoded, records
 
 PARTS = [
-    encoded(Kind.EVENT, index, {"fact": "missing", "index": index, "reason": "é" * index}, b"S4DR" * index)
+    encoded(LogRecordKind.EVENT, index, {"fact": "missing", "index": index, "reason": "é" * index}, b"S4DR" * index)
     for index in range(4)
 ]
 LOG = b"".join(PARTS)
@@ -27,7 +27,7 @@ STARTS = [sum(map(len, PARTS[:index])) for index in range(5)]
 
 
 def whole(data):
-    return [found.index for found in records(data) if isinstance(found, Record)]
+    return [found.index for found in records(data) if isinstance(found, LogRecord)]
 
 
 def covered(data):
@@ -79,7 +79,7 @@ def test_rubbish_between_records_is_stepped_over():
 
 
 def test_a_length_that_was_made_up_reads_no_further_than_the_file():
-    big = encoded(Kind.PICTURES, 5, {}, b"x" * 100)
+    big = encoded(LogRecordKind.PICTURES, 5, {}, b"x" * 100)
     assert [type(found) for found in records(big[:-50])] == [Damage]
 
 
@@ -131,7 +131,8 @@ def test_a_log_that_is_read_piece_by_piece_says_the_same(monkeypatch):
     """Wherever a piece ends: of a log that is whole, cut, damaged by flipped bits, or has rubbish in it."""
     rng = np.random.default_rng(0)
     events = [
-        encoded(Kind.EVENT, index, {"fact": "missing", "index": index, "reason": "é" * index}) for index in range(9)
+        encoded(LogRecordKind.EVENT, index, {"fact": "missing", "index": index, "reason": "é" * index})
+        for index in range(9)
     ]
     log = b"".join(events)
     logs = [log, log[:-1], log[: len(log) // 2], b"", b"S4DR", events[0] + b"S4DR" * 40 + events[1], bytes(300) + log]

@@ -16,8 +16,8 @@ from client.wire import Budget, FileKind, FrameState, ReconstructionRequest
 from server.storage.events import (
     BudgetChanged,
     FrameAccepted,
+    FrameFailed,
     FrameMissing,
-    FrameSetAside,
     FramesSkipped,
     PartAccepted,
     PauseChanged,
@@ -85,7 +85,7 @@ def lives(draw):
             events.append(WorkerDied(index=index, reason="x", own=own))
         end = draw(st.sampled_from(["committed", "set aside", "skipped", "waits"]))
         if end == "set aside":
-            events.append(FrameSetAside(index=index, reason=f"fault {index}", dropped={"c0": "dark"}))
+            events.append(FrameFailed(index=index, reason=f"fault {index}", dropped={"c0": "dark"}))
         elif end == "skipped":
             events.append(FramesSkipped(frames=(index,), by=index + 1))
         elif end == "committed":
@@ -154,7 +154,7 @@ def test_a_fatal_frame_stays_fatal():
     ledger = fold(
         [
             FrameAccepted(index=0, time=0.0, identity=identity(0), files=("a",)),
-            FrameSetAside(index=0, reason="x", fatal=True),
+            FrameFailed(index=0, reason="x", fatal=True),
         ]
     )
     assert fold(events_of(ledger)).fatal == "x"

@@ -72,7 +72,7 @@ def test_a_frame_that_was_set_aside_is_told_too(sdk, scene, stream):
     push(sdk, scene, [0])
     sdk.put_frame(scene, 1, pictures(250))  # the fake raises
     told = until(stream, lambda e: e.report.index == 1)[-1].report
-    assert told.state == "set_aside"
+    assert told.state == "failed"
     assert "told to raise" in told.error
 
 

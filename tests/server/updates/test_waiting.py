@@ -9,7 +9,7 @@ from running import make_rig
 
 from scas4d_core.presets import preset
 from server.messages import SceneSpec
-from server.processes.placement import Ended
+from server.processes.placement import ProcessExit
 from server.storage.layout import SceneFolder
 from server.updates.work_clock import FIRST_GUESS_S, OVERDUE, SHORTEST_S, UPDATES_KEPT, WorkClock
 from server.updates.worker_process import WorkerProcess
@@ -133,7 +133,7 @@ def test_nothing_starts_a_worker_before_the_pause_after_its_end_is_over(tmp_path
         process.listen(lambda message: None, lambda why: None)
         process.start()
         for seconds in (1, 30):
-            there.ends[-1](Ended(-9))
+            there.ends[-1](ProcessExit(-9))
             process.start()
             assert not process.starts_again
             process.start_in(seconds)
@@ -146,7 +146,7 @@ def test_nothing_starts_a_worker_before_the_pause_after_its_end_is_over(tmp_path
             assert len(there.ends) == count + 1
             assert not process.starts_again
         process.close()
-        there.ends[-1](Ended(-9))
+        there.ends[-1](ProcessExit(-9))
         process.start_in(0)
         await asyncio.sleep(60)
         assert len(there.ends) == 3

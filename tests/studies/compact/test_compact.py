@@ -6,7 +6,7 @@ from pathlib import Path
 
 from client.cli.reconstruct import reconstruct
 from client.importers.open_source import open_source
-from studies.compact.compact import back_and_forth, measure, told
+from studies.compact.compact import back_and_forth, measure, summarize
 
 SAMPLE = Path(__file__).parents[3] / "samples" / "robot"
 CHANGES = {
@@ -32,6 +32,6 @@ def test_a_compact_file_of_the_sample_is_measured(tmp_path: Path) -> None:
     assert abs(tight.psnr) < 0.01
     assert abs(loose.psnr) < 0.5
     assert tight.errors["position"] <= 0.0011 < loose.errors["position"]
-    assert f"{loose.size / 1e3:.1f} |" in told(loose)
+    assert f"{loose.size / 1e3:.1f} |" in summarize(loose)
     assert loose.write > 0
     assert loose.read > 0

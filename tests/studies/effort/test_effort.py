@@ -50,7 +50,11 @@ def test_two_settings_take_turns(tmp_path: Path) -> None:
     """Every frame of every seed is counted, and its repeats apart."""
     capture = open_capture(SAMPLE)
     effects = dict.fromkeys(("entering", "uncovered", "direction"), "off")  # what is so rough seems to call for them
-    rough = {"static": {"iterations": 20}, "update": {"still": 0.02, "judge": False}, "effects": effects}
+    rough = {
+        "static": {"iterations": 20},
+        "update": {"skip_tolerance": 0.02, "reject_outliers": False},
+        "effects": effects,
+    }
     many, few = (
         Settings.model_validate({**rough, "update": {**rough["update"], "iterations": count}}) for count in (8, 2)
     )

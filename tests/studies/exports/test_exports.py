@@ -8,7 +8,7 @@ import pytest
 
 from client.cli.reconstruct import reconstruct
 from client.importers.open_source import open_source
-from studies.exports.exports import READERS, measure, sheet, told
+from studies.exports.exports import READERS, measure, sheet, summarize
 from studies.exports.part_truth import measure_asset
 
 for package in ("gsply", "pxr", "pygltflib"):
@@ -31,4 +31,4 @@ def test_each_format_shows_the_state(tmp_path: Path) -> None:
     assert sheet(found, columns=2).width > 2 * found[0].picture.shape[1]
     by_rule, as_many = measure_asset(SAMPLE, tmp_path / "states")
     assert as_many.nodes == len(as_many.parts) == len(by_rule.parts) == 6
-    assert told(found).count("|\n") >= len(READERS)
+    assert summarize(found).count("|\n") >= len(READERS)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from export_cases import corner, moving
 
-from scas4d_core.captures.ground_truth import Part
+from scas4d_core.captures.ground_truth import TruePart
 from scas4d_core.exports import export_sequence
 from studies.exports.part_truth import AssetFigures, compare, read_asset, told_asset
 
@@ -37,13 +37,16 @@ def test_a_known_motion_has_no_error_and_another_has_its_own(tmp_path: Path) -> 
     off[:3, 3] = [7, -2, 1]
     points = corner.wanted(moving.state(0)).means
     ids = np.where(moving.LABELS < 0, 9, moving.LABELS + 1)
-    truth = [Part(k + 1, f"arm {k}", True, False, True, poses(k, off)) for k in (0, 1)]
+    truth = [TruePart(k + 1, f"arm {k}", True, False, True, poses(k, off)) for k in (0, 1)]
     found = compare(nodes, truth, points, ids, list(range(FRAMES)), 100.0)
     for one, node in zip(found, ("part 0", "part 1"), strict=True):
         assert (one.node, one.share, one.covered) == (node, 1.0, True)
         assert one.degrees.max() < 0.1
         assert one.percent.max() < 0.01
-    swapped = [Part(1, "arm", True, False, True, poses(1, off)), Part(5, "absent", True, False, True, poses(0, off))]
+    swapped = [
+        TruePart(1, "arm", True, False, True, poses(1, off)),
+        TruePart(5, "absent", True, False, True, poses(0, off)),
+    ]
     wrong, absent = compare(nodes, swapped, points, ids, list(range(FRAMES)), 100.0)
     assert wrong.degrees.min() > 10
     assert wrong.percent.max() > 10

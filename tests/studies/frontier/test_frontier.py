@@ -80,7 +80,7 @@ def test_every_setting_is_another_and_the_default_comes_first():
     assert [(v.settings.update.iterations, v.settings.update.views) for v in (DEFAULT, *AXES["views"])] == [
         (100, 1), (100, 2), (100, 4), (50, 2),
     ]  # fmt: skip
-    assert [(v.settings.update.covariance, v.settings.update.own_start) for v in (DEFAULT, *AXES["covariance"])] == [
+    assert [(v.settings.update.covariance, v.settings.update.deltas_start) for v in (DEFAULT, *AXES["covariance"])] == [
         ("entangled", 0.4), ("separate", 0.0),
     ]  # fmt: skip
     seeds = AXES["seeds"]

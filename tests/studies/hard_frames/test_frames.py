@@ -36,7 +36,9 @@ def test_the_undisturbed_run_follows(study: FrameStudy) -> None:
 def unjudged() -> SyntheticFootage:
     """The same footage with the judge off: what the cases are for."""
     settings = FOOTAGE.settings
-    return SyntheticFootage(settings.model_copy(update={"update": settings.update.model_copy(update={"judge": False})}))
+    return SyntheticFootage(
+        settings.model_copy(update={"update": settings.update.model_copy(update={"reject_outliers": False})})
+    )
 
 
 @pytest.mark.parametrize("name", ["all black", "two cameras swapped", "a camera is bumped", "saturated noise"])

@@ -63,7 +63,7 @@ def test_the_registry_is_as_it_was():
 
 
 def test_only_variants_that_the_settings_allow():
-    dull = Settings.model_validate({"update": {"rate_colour_standing": 0.0}})
+    dull = Settings.model_validate({"update": {"rate_static_colour": 0.0}})
     assert effects.variants(["shadows"], dull) == [{"shadows": "removed"}]
     assert {"floor": "on"} not in effects.variants(["floor"], Settings())  # no floor is named
     with pytest.raises(ValueError, match="effect 'flour' is unknown"):

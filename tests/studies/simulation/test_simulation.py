@@ -13,7 +13,7 @@ from studies.simulation import cluster, process
 from studies.simulation.clock import StandstillError, run_virtual
 from studies.simulation.failures import Failure
 from studies.simulation.simulate import Sizes, simulate
-from studies.simulation.targets import rows, told
+from studies.simulation.targets import rows, summarize
 
 SMALL = Sizes(scenes=40, nodes=8, failures=60, frames=20)
 
@@ -32,7 +32,7 @@ def test_nothing_is_lost_or_run_twice(seed: int) -> None:
     assert outcome.adrift > 100  # workers went on after they were given up
     assert outcome.frames.again > 0  # and committed in the midst of a takeover
     assert len(outcome.waited) >= SMALL.more // 2  # scenes beyond the room
-    assert "| acknowledged frames lost | 0 | 0 of 920 | reached |" in told(outcome)
+    assert "| acknowledged frames lost | 0 | 0 of 920 | reached |" in summarize(outcome)
 
 
 def test_the_same_seed_gives_the_same_outcome() -> None:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from scas4d_core.captures.frame import Frame
 from scas4d_core.effects.appearance.camera_gain import NAME, POWER, known_gains
-from scas4d_core.effects.switches import joined
+from scas4d_core.effects.switches import register_effects
 from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.exposure import FOOT, exposure_of, measured_gain
 from scas4d_core.first_frame.static_result import StaticResult
@@ -128,7 +128,7 @@ def test_an_attempt_starts_from_the_exposures_of_the_frame_and_not_from_those_of
     settings = UpdateSettings(clusters=(2, 12), iterations=24)
     factory = ViewFactory(RIG)
     hierarchy = build_hierarchy(BOX.means, BOX.moving, settings.clusters, SMALLEST_CLUSTER)
-    built = joined(PlanBuilder(SceneSettings(), settings, factory, hierarchy, BOX), [NAME])
+    built = register_effects(PlanBuilder(SceneSettings(), settings, factory, hierarchy, BOX), [NAME])
     updater = FrameUpdate(CpuEngine(), built, None)
     views = factory.views(shot(1, GAINS), {})
     first, second = (updater.run(BOX, views, None, 1 / 30, seed=1) for _ in range(2))

@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.effects.appearance.direction import EFFECT, neighbourhood_turns, neighbourhoods
-from scas4d_core.effects.evidence import Evidence, Seen
-from scas4d_core.effects.switches import first_switches, joined, names_on
+from scas4d_core.effects.evidence import Evidence, FrameObservation
+from scas4d_core.effects.switches import first_switches, names_on, register_effects
 from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.cpu.gloss import (
     GLOSS,
-    Shading,
+    GlossShading,
     colours_seen,
     gloss_rate,
     without_turn,
@@ -62,10 +62,10 @@ def after(before: Gaussians, truth: Gaussians, effects: list[str]) -> tuple[Gaus
     views = factory.views(frame(truth, 1), {}, use_masks=False)
     hierarchy = build_hierarchy(before.means, before.moving, (2, 12), SMALLEST_CLUSTER)
     settings = UPDATE.model_copy(update={"iterations": 24})
-    built = joined(PlanBuilder(SceneSettings(), settings, factory, hierarchy, before), effects)
+    built = register_effects(PlanBuilder(SceneSettings(), settings, factory, hierarchy, before), effects)
     updater = FrameUpdate(CpuEngine(), built, None)
     result = updater.run(before, views, None, 1.0, seed=1)
-    return result.gaussians, EFFECT.evidence(Seen(1, before, result, rig(), views, CpuRenderer((0, 0, 0))))
+    return result.gaussians, EFFECT.evidence(FrameObservation(1, before, result, rig(), views, CpuRenderer((0, 0, 0))))
 
 
 @pytest.mark.slow
@@ -148,7 +148,7 @@ def test_normals_turn_as_fast_whatever_the_strength_that_frame_0_came_out_with()
     for factor in (0.2, 1.0):
         gloss, environment = np.float32(factor) * state.gloss, state.environment.copy()
         environment[: CELLS + 1] /= np.float32(factor)  # the sheen as well
-        shading = Shading.fresh(gloss.copy(), state.means, environment)
+        shading = GlossShading.fresh(gloss.copy(), state.means, environment)
         shading.saw(state.means, without_turn(COUNT), 0 * state.colours, camera, pull.copy())
         shading.step()
         turned.append((shading.gloss - gloss) / factor)
@@ -161,7 +161,7 @@ def test_normals_turn_as_fast_whatever_the_strength_that_frame_0_came_out_with()
 def test_what_is_seen_from_everywhere_is_colour_and_not_environment() -> None:
     state, rng = sphere(), np.random.default_rng(0)
     assert state.gloss is not None
-    shading, camera = Shading.fresh(state.gloss.copy(), state.means), CameraArrays.of(rig().cameras[0])
+    shading, camera = GlossShading.fresh(state.gloss.copy(), state.means), CameraArrays.of(rig().cameras[0])
     for _ in range(5):
         pull = rng.normal(1, 1, (COUNT, 4)).astype(np.float32)
         shading.saw(state.means, without_turn(COUNT), state.colours, camera, pull)

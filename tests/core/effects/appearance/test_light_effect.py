@@ -8,7 +8,7 @@ from box_scene import MOVING, make_box, make_rig, take_frame
 from effect_cases import builder, same, updated
 
 from scas4d_core.effects.appearance.light import change_of_light, orientation_and_place
-from scas4d_core.effects.switches import contradictions, first_switches, joined, names_on
+from scas4d_core.effects.switches import contradictions, first_switches, names_on, register_effects
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
@@ -48,8 +48,8 @@ def test_what_changes_together_is_light_and_noise_is_not() -> None:
 
 
 def test_colours_are_freer_while_the_light_changes() -> None:
-    colours = joined(builder(), ["moving_colour", "standing_colour", "light"]).plan.colours
-    rates = Rates.of(UpdateSettings(rate_colour=0.002, rate_colour_standing=0.01), 2, 4.0)
+    colours = register_effects(builder(), ["moving_colour", "static_colour", "light"]).plan.colours
+    rates = Rates.of(UpdateSettings(rate_colour=0.002, rate_static_colour=0.01), 2, 4.0)
     assert colours is not None
     assert rates.of_colours(colours) == (FASTER_IN_CHANGING_LIGHT * 0.01, FASTER_IN_CHANGING_LIGHT * 0.01)
     colours.changing_light = False
@@ -68,7 +68,7 @@ def test_it_frees_no_colours_that_are_held() -> None:
 def followed(mode: str, lamp: float) -> tuple[float, Reconstruction]:
     """Mean error of the box's colours after frames in which a lamp goes from one side of the box to the other."""
     # The judge keeps the state before the last frame with 1 of 5 seeds, by chance.
-    update = {"clusters": (2, 12), "iterations": 40, "judge": False, "cold_longer": 1.0}
+    update = {"clusters": (2, 12), "iterations": 40, "reject_outliers": False, "cold_start_iterations": 1.0}
     effects = {"light": mode, "shading": "off"}  # it follows what moves by itself
     settings = Settings.model_validate({"update": update, "effects": effects})
     scene = Reconstruction.start(RIG, take_frame(0, 0, BOX, RIG), settings, static=StaticResult(BOX, {}, []))

@@ -67,7 +67,9 @@ def test_it_is_on_unless_it_is_pinned_or_the_colours_are_held() -> None:
     assert [name for name, *_ in contradictions(pinned)] == ["shading"]
 
 
-@pytest.mark.parametrize(("kept", "stepped"), [(Candidate.END, True), (Candidate.WARM, True), (Candidate.STILL, False)])
+@pytest.mark.parametrize(
+    ("kept", "stepped"), [(Candidate.END, True), (Candidate.WARM, True), (Candidate.PREVIOUS, False)]
+)
 def test_a_state_that_did_not_move_keeps_its_colours(
     kept: Candidate, stepped: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

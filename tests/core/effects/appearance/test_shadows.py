@@ -32,7 +32,7 @@ def shaded(by: float) -> Gaussians:
 
 
 def settings(mode: str, **more: str) -> Settings:
-    update = {"clusters": (2, 12), "iterations": 10, "judge": False, "still": -1}
+    update = {"clusters": (2, 12), "iterations": 10, "reject_outliers": False, "skip_tolerance": -1}
     return Settings.model_validate({"update": update, "effects": {NAME: mode, "uncovered": "off", **more}})
 
 
@@ -91,14 +91,14 @@ def test_a_scene_in_which_all_moves_has_none() -> None:
 
 
 def test_colours_of_what_stands_follow_in_every_iteration_only_where_that_is_pinned() -> None:
-    assert not first_switches(Settings(), 0)["standing_colour"].on
-    assert first_switches(Settings(effects={"standing_colour": "on"}), 0)["standing_colour"].on
+    assert not first_switches(Settings(), 0)["static_colour"].on
+    assert first_switches(Settings(effects={"static_colour": "on"}), 0)["static_colour"].on
 
 
 def test_an_update_that_is_not_kept_teaches_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     truth = shaded(0.3)
     monkeypatch.setattr(
-        "scas4d_core.update.best_state.BestState.end", lambda self, iterations, left_out: Candidate.STILL
+        "scas4d_core.update.best_state.BestState.end", lambda self, iterations, left_out: Candidate.PREVIOUS
     )
     np.testing.assert_array_equal(followed("on", truth, frames=1).history.newest.colours, STATE.colours)
 

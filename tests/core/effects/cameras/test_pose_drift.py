@@ -267,7 +267,7 @@ def test_poses_that_are_not_known_are_those_of_the_calibration() -> None:
 
 def test_a_few_cameras_teach_nothing() -> None:
     seen: Any = SimpleNamespace(views=[1, 2, 3], rig=RIG)
-    assert effect(NAME).noted(seen, on=True) is None
+    assert effect(NAME).record(seen, on=True) is None
 
 
 def test_a_frame_of_few_cameras_is_no_evidence() -> None:

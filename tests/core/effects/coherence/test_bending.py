@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Rig
 from scas4d_core.effects.coherence.bending import EFFECT, PATCH, bend, turns_of
-from scas4d_core.effects.switches import contradictions, first_switches, joined, names_on
+from scas4d_core.effects.switches import contradictions, first_switches, names_on, register_effects
 from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.engine import StepScalars
 from scas4d_core.first_frame.static_result import StaticResult
@@ -136,11 +136,11 @@ def test_too_little_says_nothing_and_what_is_not_finite_is_left_out() -> None:
 @pytest.mark.parametrize("pin", ["on", "off"])
 def test_a_pin_of_rotation_is_kept(pin: str) -> None:
     settings = Settings.model_validate({"effects": {"rotation": pin}})
-    assert EFFECT.refused(settings) is not None
+    assert EFFECT.refusal(settings) is not None
     both = Settings.model_validate({"effects": {"rotation": pin, "bending": "on"}})
     assert [name for name, *_ in contradictions(both)] == ["bending"]
-    assert EFFECT.refused(Settings.model_validate({"update": {"weights": {"rotation": 0}}})) is not None
-    assert EFFECT.refused(Settings()) is None
+    assert EFFECT.refusal(Settings.model_validate({"update": {"weights": {"rotation": 0}}})) is not None
+    assert EFFECT.refusal(Settings()) is None
 
 
 def test_presets_contradict_nothing() -> None:
@@ -151,7 +151,7 @@ def test_presets_contradict_nothing() -> None:
 
 def test_it_leaves_rotation_out_and_lets_rigidity_fall() -> None:
     usual = list(names_on(first_switches(Settings(), 0)))
-    built = joined(builder(update=UPDATE.model_copy(update={"iterations": 4})), [*usual, "bending"])
+    built = register_effects(builder(update=UPDATE.model_copy(update={"iterations": 4})), [*usual, "bending"])
     plan = built.plan
     assert (plan.rigidity, plan.isometry, plan.rotation) == (4.0, 6.0, 0.0)
     engine = Weighing()
@@ -161,7 +161,7 @@ def test_it_leaves_rotation_out_and_lets_rigidity_fall() -> None:
         engine.rigidity.clear()
         updater.run(BEFORE, views, None, 1.0, seed=3)
         np.testing.assert_allclose(engine.rigidity, [2 + 2 * np.cos(np.pi * k / 4) for k in range(4)], atol=1e-12)
-    loose = joined(builder(), [name for name in usual if name != "rigidity"] + ["bending"])
+    loose = register_effects(builder(), [name for name in usual if name != "rigidity"] + ["bending"])
     assert not loose.plan.rigidity_fades
 
 

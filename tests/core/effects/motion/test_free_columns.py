@@ -12,7 +12,7 @@ from effect_cases import BEFORE, RIG, UPDATE, builder, same, updater_of
 
 from scas4d_core.checkpoint import CarryOver
 from scas4d_core.effects.motion.free_columns import MOVES
-from scas4d_core.effects.switches import first_switches, joined, names_on
+from scas4d_core.effects.switches import first_switches, names_on, register_effects
 from scas4d_core.engines.cpu import engine as cpu_engine
 from scas4d_core.engines.cpu.adam import Adam
 from scas4d_core.engines.cpu.engine import CpuEngine
@@ -45,7 +45,7 @@ def without(*names: str) -> list[str]:
 
 
 def updater(effects: Sequence[str], update: UpdateSettings = UPDATE, engine: UpdateEngine | None = None) -> FrameUpdate:
-    return updater_of(joined(builder(update=update), effects), engine)
+    return updater_of(register_effects(builder(update=update), effects), engine)
 
 
 def run(made: FrameUpdate, motion: Motion | None = None, options: AttemptOptions = AS_SET) -> UpdateResult:
@@ -79,7 +79,7 @@ def test_the_state_is_that_of_steps_over_all_columns(
 ) -> None:
     motion = None if cold else found_motion()
     found = run(updater(without(*off)), motion).gaussians.arrays()
-    monkeypatch.setattr(cpu_engine, "FreeColumns", PlainTable)
+    monkeypatch.setattr(cpu_engine, "AdamColumns", PlainTable)
     assert same(found, run(updater(without(*off)), motion).gaussians.arrays())
     assert same(found, run(updater(usual()), motion).gaussians.arrays()) == (not off)
 
@@ -87,7 +87,7 @@ def test_the_state_is_that_of_steps_over_all_columns(
 @pytest.mark.parametrize("name", MOVES)
 @pytest.mark.parametrize("kind", [CpuEngine, TorchEngine])
 def test_columns_that_are_off_stay_exactly_0_and_no_others(name: str, kind: type[UpdateEngine]) -> None:
-    short = UPDATE.model_copy(update={"iterations": 3, "own_start": 0.0, "momentum": 0.5})
+    short = UPDATE.model_copy(update={"iterations": 3, "deltas_start": 0.0, "momentum": 0.5})
     engine = kind()
     run(updater(without(name), short, engine), found_motion())
     tables = engine.tables()
@@ -120,7 +120,7 @@ def test_a_rigid_motion_is_found_by_clusters_that_turn_and_shift_alone() -> None
 
 def test_torch_obeys_the_same_freedoms() -> None:
     """The first steps, before rounding decides: the terms between neighbours have a kink at the start."""
-    update = UPDATE.model_copy(update={"iterations": 3, "own_start": 0.0})
+    update = UPDATE.model_copy(update={"iterations": 3, "deltas_start": 0.0})
     ties = ("rigidity", "isometry", "rotation")
     off = without("cluster_rotation", "own_position", *ties)
     on_cpu, in_torch = (run(updater(off, update, engine)) for engine in (CpuEngine(), TorchEngine()))
@@ -134,7 +134,7 @@ def test_torch_obeys_the_same_freedoms() -> None:
 def test_without_prediction_an_update_starts_where_the_frame_before_ended(kind: type[UpdateEngine]) -> None:
     short = UPDATE.model_copy(update={"iterations": 2})
     still = run(updater(without("prediction"), short, kind()), found_motion(), COMPARED)
-    assert set(still.trace.errors) == {Candidate.STILL, Candidate.END}
+    assert set(still.trace.errors) == {Candidate.PREVIOUS, Candidate.END}
     assert same(still.gaussians.arrays(), run(updater(usual(), short, kind()), None, COMPARED).gaussians.arrays())
     warm = run(updater(usual(), short, kind()), found_motion(), COMPARED)
     assert Candidate.WARM in warm.trace.errors
@@ -184,8 +184,8 @@ def test_each_may_be_off_and_they_are_on_where_the_settings_allow_them() -> None
 
 def test_without_motion_of_clusters_there_is_no_cascade(preparation) -> None:  # type: ignore[no-untyped-def]
     settings = Settings(update=UPDATE, effects=dict.fromkeys(MOVES[:3], "off"))
-    made = preparation(settings).again(BEFORE, CarryOver(switches=first_switches(settings, 0)))
-    other = preparation(Settings(update=UPDATE)).again(BEFORE, CarryOver(switches=first_switches(Settings(), 0)))
+    made = preparation(settings).rebuild(BEFORE, CarryOver(switches=first_switches(settings, 0)))
+    other = preparation(Settings(update=UPDATE)).rebuild(BEFORE, CarryOver(switches=first_switches(Settings(), 0)))
     assert (made.updater.hierarchy.sizes, other.updater.hierarchy.sizes) == ((), (2, 12))
     assert np.array_equal(made.updater.hierarchy.rows, other.updater.hierarchy.rows)
     assert made.carried.structure != other.carried.structure  # a motion of the one is none of the other
@@ -195,5 +195,5 @@ def test_switches_of_an_earlier_version_are_joined_by_those_of_new_effects(prepa
     settings = Settings(update=UPDATE, effects={"own_scale": "off"})
     switches = first_switches(settings, 0)
     before = {name: switches[name] for name in ("isometry", "rigidity")}
-    prepared = preparation(settings).again(BEFORE, CarryOver(switches=before))
+    prepared = preparation(settings).rebuild(BEFORE, CarryOver(switches=before))
     assert dict(prepared.carried.switches) == switches

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from scas4d_core.effects.evidence import FitTime, Seen
+from scas4d_core.effects.evidence import FitTime, FrameObservation
 from scas4d_core.effects.presence import entering
 from scas4d_core.effects.presence.carving import carve_new
 from scas4d_core.effects.presence.entering import EFFECT, NOBODY, SETTLED, entered
@@ -35,13 +35,13 @@ def test_a_thing_that_is_new_is_found_where_it_is() -> None:
 def test_what_is_born_shows_it() -> None:
     before = scene(known())
     frame = seen(before, scene(known(), visitor()))
-    result = EFFECT.populated(frame)
+    result = EFFECT.add_and_retire_gaussians(frame)
     born = result.gaussians.rows(np.arange(len(before), len(result.gaussians)))
     assert len(born) > 50
     assert born.moving.all()
     assert (born.ids == -1).all()
-    assert result.joins is not None
-    assert result.joins.tolist() == [-1] * len(born)
+    assert result.parents is not None
+    assert result.parents.tolist() == [-1] * len(born)
     assert np.median(np.abs(np.linalg.norm(born.means - CENTRE, axis=1) - BALL)) < 0.02
     assert psnr(result.gaussians, frame) > psnr(before, frame) + 8
     for name in ("means", "colours", "factors", "ids"):  # the others stay as they are
@@ -51,7 +51,7 @@ def test_what_is_born_shows_it() -> None:
 
 
 def test_the_same_frame_bears_the_same_bits() -> None:
-    first, second = (EFFECT.populated(seen(scene(known()), scene(known(), visitor()))) for _ in range(2))
+    first, second = (EFFECT.add_and_retire_gaussians(seen(scene(known()), scene(known(), visitor()))) for _ in range(2))
     for name, array in first.gaussians.arrays().items():
         assert np.array_equal(array, second.gaussians.arrays()[name]), name
 
@@ -60,7 +60,7 @@ def test_nothing_enters_where_the_state_shows_the_frame() -> None:
     state = scene(known(), visitor())
     frame = seen(state, state)
     assert entered(frame) is None
-    assert EFFECT.populated(frame) is frame.result
+    assert EFFECT.add_and_retire_gaussians(frame) is frame.result
     assert EFFECT.evidence(frame) == entering.Evidence(0.0, "")
 
 
@@ -84,7 +84,7 @@ def test_evidence_says_how_many_cameras_agree_and_outlives_the_birth() -> None:
     assert found is not None
     assert found.share >= EFFECT.on_above
     assert "cameras agree" in found.text
-    result = EFFECT.populated(frame)
+    result = EFFECT.add_and_retire_gaussians(frame)
     later = seen(result.gaussians, scene(known(), visitor()), 6, carried=dict(result.carried))
     after = EFFECT.evidence(later)
     assert after is not None
@@ -93,17 +93,17 @@ def test_evidence_says_how_many_cameras_agree_and_outlives_the_birth() -> None:
 
 def test_the_young_are_settled_and_then_left_alone() -> None:
     true = scene(known(), visitor())
-    result = EFFECT.populated(seen(scene(known()), true))
+    result = EFFECT.add_and_retire_gaussians(seen(scene(known()), true))
     count, state, carried = len(scene(known())), result.gaussians, dict(result.carried)
     off = state.means.copy()
     off[count:] += np.float32([0.01, 0.0, 0.0])
     frame = seen(state.replace(means=off), true, 6, carried=carried)
-    settled = EFFECT.populated(frame)
+    settled = EFFECT.add_and_retire_gaussians(frame)
     assert psnr(settled.gaussians, frame) > psnr(frame.result.gaussians, frame) + 1
     assert np.array_equal(settled.gaussians.opacities, state.opacities)
     grown_up = {**carried, "entering": {**carried["entering"], "age": np.full(len(state) - count, SETTLED)}}
     later = seen(state.replace(means=off), true, 7, carried=grown_up)
-    assert np.array_equal(EFFECT.populated(later).gaussians.means, off)
+    assert np.array_equal(EFFECT.add_and_retire_gaussians(later).gaussians.means, off)
 
 
 def test_no_voxel_is_free_to_a_camera() -> None:
@@ -121,18 +121,18 @@ def test_what_comes_back_is_revived_as_itself() -> None:
     gone = scene(known(), visitor([0.1, -3.0, 0.0]))
     rows = np.arange(len(gone) - 300, len(gone))
     frame = seen(gone.retire(rows), scene(known(), visitor()))
-    result = EFFECT.populated(frame)
+    result = EFFECT.add_and_retire_gaussians(frame)
     assert len(result.gaussians) == len(gone)  # none is born
     assert not result.gaussians.retired.any()
     assert np.array_equal(result.gaussians.ids, gone.ids)
     assert np.abs(result.gaussians.means[rows].mean(axis=0) - CENTRE).max() < 0.03
-    assert result.carried["entering"]["young"].tolist() == rows.tolist()  # it is looked for in the next frame
+    assert result.carried["entering"]["newborn"].tolist() == rows.tolist()  # it is looked for in the next frame
 
 
 def test_another_thing_is_not_taken_for_what_has_left() -> None:
     gone = scene(known(), sphere(np.array([0.1, -3.0, 0.0]), BALL, phase=0.0))
     frame = seen(gone.retire(np.arange(len(gone) - 300, len(gone))), scene(known(), visitor()))
-    result = EFFECT.populated(frame)
+    result = EFFECT.add_and_retire_gaussians(frame)
     assert len(result.gaussians) > len(gone)
     assert result.gaussians.retired.sum() == 300
 
@@ -140,10 +140,10 @@ def test_another_thing_is_not_taken_for_what_has_left() -> None:
 def test_what_no_camera_confirms_is_retired() -> None:
     count, state = len(scene(known())), scene(known(), visitor())
     carried = {"entering": NOBODY | {"rows": np.arange(count, len(state)), "age": np.full(300, SETTLED)}}
-    gone = EFFECT.populated(seen(state, scene(known()), 9, carried=carried)).gaussians
+    gone = EFFECT.add_and_retire_gaussians(seen(state, scene(known()), 9, carried=carried)).gaussians
     assert gone.retired[count:].mean() > 0.8
     assert not gone.retired[:count].any()
-    assert not EFFECT.populated(seen(state, state, 9, carried=carried)).gaussians.retired.any()
+    assert not EFFECT.add_and_retire_gaussians(seen(state, state, 9, carried=carried)).gaussians.retired.any()
 
 
 class Ticks:
@@ -156,13 +156,13 @@ class Ticks:
         return self.now
 
 
-def timed(monkeypatch: pytest.MonkeyPatch, end: float) -> tuple[Seen, UpdateResult]:
+def timed(monkeypatch: pytest.MonkeyPatch, end: float) -> tuple[FrameObservation, UpdateResult]:
     """A frame with a thing that is new and what comes of it, by a clock that ticks."""
     clock = Ticks()
     monkeypatch.setattr("scas4d_core.update.schedule.Stopping", partial(Stopping, clock=clock))
     monkeypatch.setattr("scas4d_core.effects.presence.growing.perf_counter", clock)
     frame = replace(seen(scene(known()), scene(known(), visitor())), time=FitTime(end))
-    return frame, EFFECT.populated(frame)
+    return frame, EFFECT.add_and_retire_gaussians(frame)
 
 
 def test_what_there_is_no_time_for_is_not_born_and_the_frame_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -186,5 +186,5 @@ def test_without_time_the_young_stay_as_they_are() -> None:
     rows = np.arange(len(scene(known())), len(true))
     carried = {"entering": NOBODY | {"rows": rows, "age": np.zeros(len(rows), np.int64)}}
     frame = replace(seen(true, true, 6, carried=carried), time=FitTime(0.0))
-    assert EFFECT.populated(frame).gaussians is true
-    assert frame.time.put_off == [f"{len(rows)} young Gaussians were not settled"]
+    assert EFFECT.add_and_retire_gaussians(frame).gaussians is true
+    assert frame.time.put_off == [f"{len(rows)} newborn Gaussians were not settled"]

@@ -8,7 +8,7 @@ import pytest
 from box_scene import make_rig, moved, take_frame
 from effect_cases import BEFORE, UPDATE, builder, same, updated
 
-from scas4d_core.effects.switches import first_switches, joined, names_on
+from scas4d_core.effects.switches import first_switches, names_on, register_effects
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.presets import SettingError, preset
 from scas4d_core.reconstruction import Reconstruction
@@ -21,7 +21,7 @@ def usual() -> list[str]:
 
 def test_without_the_mask_term_masks_pull_at_nothing() -> None:
     without = [name for name in usual() if name != "mask_term"]
-    assert joined(builder(), without).plan.mask == 0 < joined(builder(), usual()).plan.mask
+    assert register_effects(builder(), without).plan.mask == 0 < register_effects(builder(), usual()).plan.mask
     off = UPDATE.weights.model_copy(update={"mask": 0.0, "mask_alone": 0.0})
     weightless = UPDATE.model_copy(update={"weights": off})
     assert same(updated(without), updated(usual(), weightless.model_copy(update={"use_masks": False})))

@@ -11,10 +11,10 @@ import pytest
 from box_scene import moved, take_frame
 from effect_cases import BEFORE, RIG, UPDATE, builder, updater_of
 
-from scas4d_core.effects.evidence import Seen
+from scas4d_core.effects.evidence import FrameObservation
 from scas4d_core.effects.presence import entering, novelty, uncovered
 from scas4d_core.effects.presence.novelty import GLANCE, glance
-from scas4d_core.effects.switches import joined
+from scas4d_core.effects.switches import register_effects
 from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.engine import KEPT_PICTURES, KEPT_ROWS, IterationLog, StepScalars, Thinned
@@ -28,7 +28,7 @@ from tests.helpers.effect_cases.visited_room import known, make_rig, scene, seen
 ROOM = make_rig()
 
 
-def shown(frame: Seen, kept: Candidate = Candidate.END, most: int = KEPT_PICTURES) -> Seen:
+def shown(frame: FrameObservation, kept: Candidate = Candidate.END, most: int = KEPT_PICTURES) -> FrameObservation:
     """The frame with the renderings that an update leaves, of every other camera."""
     log, state = IterationLog(), frame.result.gaussians
     for number in range(0, len(frame.views), 2)[:most]:
@@ -144,7 +144,7 @@ def test_a_trace_keeps_the_last_views_and_thins_large_pictures() -> None:
 
 
 def test_an_update_keeps_the_renderings_of_its_last_iterations() -> None:
-    built = joined(builder(update=UPDATE.model_copy(update={"iterations": KEPT_PICTURES + 2})))
+    built = register_effects(builder(update=UPDATE.model_copy(update={"iterations": KEPT_PICTURES + 2})))
     views = built.factory.views(take_frame(1, 1.0, moved(BEFORE), RIG, True), {})
     engine = Noting()
     found = updater_of(built, engine).run(BEFORE, views, None, 1.0, seed=3)

@@ -20,7 +20,7 @@ def test_it_is_retired_after_some_frames() -> None:
     state, carried = scene(known(), visitor(AWAY)), {}
     for index in range(FRAMES):
         assert not state.retired.any()
-        result = EFFECT.populated(seen(state, scene(known()), index, carried=carried))
+        result = EFFECT.add_and_retire_gaussians(seen(state, scene(known()), index, carried=carried))
         state, carried = result.gaussians, dict(result.carried)
     assert np.flatnonzero(state.retired).tolist() == list(range(len(state) - 300, len(state)))
     evidence = EFFECT.evidence(seen(state, scene(known()), 9, carried=carried))
@@ -30,9 +30,9 @@ def test_it_is_retired_after_some_frames() -> None:
 
 def test_what_came_back_in_time_is_not_retired() -> None:
     away, here = scene(known(), visitor(AWAY)), scene(known(), visitor())
-    carried = dict(EFFECT.populated(seen(away, scene(known()), 0)).carried)
-    carried = dict(EFFECT.populated(seen(here, here, 1, carried=carried)).carried)
-    assert not EFFECT.populated(seen(away, scene(known()), 2, carried=carried)).gaussians.retired.any()
+    carried = dict(EFFECT.add_and_retire_gaussians(seen(away, scene(known()), 0)).carried)
+    carried = dict(EFFECT.add_and_retire_gaussians(seen(here, here, 1, carried=carried)).carried)
+    assert not EFFECT.add_and_retire_gaussians(seen(away, scene(known()), 2, carried=carried)).gaussians.retired.any()
 
 
 def test_a_thing_that_is_half_in_view_keeps_its_other_half() -> None:
@@ -40,7 +40,7 @@ def test_a_thing_that_is_half_in_view_keeps_its_other_half() -> None:
     out = outside(state, make_rig())
     assert 0 < out.sum() < 300
     carried = {"leaving": {"frames": np.where(out, FRAMES, 0), "share": np.array(0.0)}}
-    gone = EFFECT.populated(seen(state, state, 3, carried=carried)).gaussians.retired
+    gone = EFFECT.add_and_retire_gaussians(seen(state, state, 3, carried=carried)).gaussians.retired
     assert gone.sum() < out.sum()
 
 

@@ -70,7 +70,7 @@ def noisy(index: int, state: Gaussians = BOX, *, knocked: str = "") -> Frame:
 def test_until_something_is_seen_to_move_nothing_does() -> None:
     scene = start()
     reports = [scene.step(noisy(index)) for index in (1, 2)]
-    assert [report.outcome for report in reports] == 2 * [FrameOutcome.STOOD]
+    assert [report.outcome for report in reports] == 2 * [FrameOutcome.UNCHANGED]
     assert [report.attempts for report in reports] == 2 * [["nothing is seen to move"]]
     np.testing.assert_array_equal(scene.history.newest.means, BOX.means)
     assert len(scene._prepared.carried.seen) == len(RIG)
@@ -78,9 +78,9 @@ def test_until_something_is_seen_to_move_nothing_does() -> None:
 
 def test_a_camera_that_is_off_ends_the_rest() -> None:
     scene = start()
-    assert scene.step(noisy(1)).outcome is FrameOutcome.STOOD
+    assert scene.step(noisy(1)).outcome is FrameOutcome.UNCHANGED
     report = scene.step(noisy(2, knocked="c2"))
-    assert report.outcome is not FrameOutcome.STOOD
+    assert report.outcome is not FrameOutcome.UNCHANGED
     assert "c2" in [alarm.camera for alarm in report.alarms]
 
 
@@ -89,7 +89,7 @@ def test_a_rest_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("scas4d_core.reconstruction.RESTING", 2)
     scene = start()
     found = [scene.step(noisy(index)).outcome for index in (1, 2, 3)]
-    assert found == [FrameOutcome.STOOD, FrameOutcome.STOOD, FrameOutcome.UPDATED]
+    assert found == [FrameOutcome.UNCHANGED, FrameOutcome.UNCHANGED, FrameOutcome.UPDATED]
 
 
 def test_what_is_too_slow_to_be_seen_from_frame_to_frame_adds_up() -> None:
@@ -97,7 +97,7 @@ def test_what_is_too_slow_to_be_seen_from_frame_to_frame_adds_up() -> None:
     for index in range(1, 11):
         creep = moved(BOX, Rotation.identity(), np.array([0.002 * index, 0.0, 0.0]))
         seen.append(scene.step(take_frame(index, float(index), creep, RIG, False)).outcome)
-    assert seen[0] is FrameOutcome.STOOD
+    assert seen[0] is FrameOutcome.UNCHANGED
     assert seen[-1] is FrameOutcome.UPDATED
     assert scene.history.newest.moving[MOVING:].mean() < 0.1
     went = (scene.history.newest.means - BOX.means)[scene.history.newest.moving]
@@ -112,7 +112,7 @@ def test_pictures_that_are_met_much_worse_are_no_rest() -> None:
     for number, (name, image) in enumerate(frame.images.items()):
         images[name] = image.copy()
         images[name][number * 3 : number * 3 + 14] = 255 - images[name][number * 3 : number * 3 + 14]
-    assert scene.step(replace(frame, images=images)).outcome is not FrameOutcome.STOOD
+    assert scene.step(replace(frame, images=images)).outcome is not FrameOutcome.UNCHANGED
 
 
 @pytest.mark.parametrize(

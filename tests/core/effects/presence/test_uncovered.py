@@ -35,7 +35,7 @@ def test_what_is_born_stands_and_shows_the_floor() -> None:
     evidence = EFFECT.evidence(frame)
     assert evidence is not None
     assert evidence.share > EFFECT.on_above
-    result = EFFECT.populated(frame)
+    result = EFFECT.add_and_retire_gaussians(frame)
     born = result.gaussians.rows(np.arange(len(before), len(result.gaussians)))
     assert len(born) > 20
     assert not born.moving.any()
@@ -45,7 +45,7 @@ def test_what_is_born_stands_and_shows_the_floor() -> None:
 def test_nothing_is_born_where_nothing_is_bare() -> None:
     state = scene(known(ASIDE))
     frame = seen(state, state)
-    assert EFFECT.populated(frame) is frame.result
+    assert EFFECT.add_and_retire_gaussians(frame) is frame.result
     evidence = EFFECT.evidence(frame)
     assert evidence is not None
     assert evidence.share == 0
@@ -63,7 +63,7 @@ def test_it_goes_off_where_nothing_more_is_uncovered_and_no_sooner() -> None:
     first = seen(before, true)
     switches = decided(switches, Settings(), first)
     assert switches[NAME].on
-    born = EFFECT.populated(first)
+    born = EFFECT.add_and_retire_gaussians(first)
     on = []
     for index in range(IDLE):
         later = seen(true, true, 6 + index, carried=dict(born.carried))
@@ -84,5 +84,5 @@ def test_evidence_and_births_look_once(monkeypatch: pytest.MonkeyPatch) -> None:
     evidence = EFFECT.evidence(frame)
     assert evidence is not None
     assert evidence.share > EFFECT.on_above
-    assert len(EFFECT.populated(frame).gaussians) > len(frame.before)
+    assert len(EFFECT.add_and_retire_gaussians(frame).gaussians) > len(frame.before)
     assert len(asked) == 1

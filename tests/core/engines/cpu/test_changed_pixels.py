@@ -10,7 +10,7 @@ from box_scene import make_box, make_rig, moved, take_frame
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Camera, Rig
-from scas4d_core.effects.switches import joined
+from scas4d_core.effects.switches import register_effects
 from scas4d_core.engines.cpu import changed_pixels
 from scas4d_core.engines.cpu import engine as cpu_engine
 from scas4d_core.engines.cpu.blocks import as_blocks, as_grid
@@ -54,7 +54,7 @@ def updater(state: Gaussians, most: float, monkeypatch: pytest.MonkeyPatch) -> t
     factory = ViewFactory(RIG)
     hierarchy = build_hierarchy(state.means, state.moving, SETTINGS.clusters, SMALLEST_CLUSTER)
     neighbours = build_neighbours(state.means[hierarchy.rows], 6, 200.0)
-    built = joined(PlanBuilder(SceneSettings(), SETTINGS, factory, hierarchy, state))
+    built = register_effects(PlanBuilder(SceneSettings(), SETTINGS, factory, hierarchy, state))
     return FrameUpdate(CpuEngine(), built, neighbours), factory
 
 

@@ -82,7 +82,7 @@ def test_derivatives_are_those_of_the_residuals():
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.5, 0.5, (4, 3))
     who, what = np.array([0, 1, 1, 2]), np.array([0, 1, 2, 3])
-    seen = bundle.Observed(who, what, rng.uniform(0, 200, (4, 2)))
+    seen = bundle.Observations(who, what, rng.uniform(0, 200, (4, 2)))
     problem = bundle._Bundle(RING, seen, True, bundle.TRUST)
     _, by_camera, by_point = problem._residuals(RING, points)
     step = 1e-6
@@ -100,7 +100,9 @@ def test_derivatives_are_those_of_the_residuals():
 
 def test_the_pull_grows_as_the_camera_moves_what_it_sees():
     """A turn by 3 px and a shift by as much pull by 3 px."""
-    problem = bundle._Bundle(RING, bundle.Observed(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2))), False, 0.5)
+    problem = bundle._Bundle(
+        RING, bundle.Observations(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2))), False, 0.5
+    )
     depth = np.full(len(RING), 3.0)
     given = [made_matches.turned(RING[0], 3), *RING[1:]]
     np.testing.assert_allclose(np.linalg.norm(problem._pulls(given, depth)[0], axis=1), [3] + [0] * 8, atol=1e-6)

@@ -146,7 +146,7 @@ def test_a_scene_goes_on_with_the_rig_that_frame_0_refined(sample, disturbed, tm
     assert not np.array_equal(scene.calibrated[third].world_to_camera, disturbed[third].world_to_camera)
     report = scene.step(sample.frame(1))
     again = Reconstruction.resume(disturbed, Settings.model_validate(FEW), History.open(tmp_path / "states"))
-    aside = Reconstruction.aside(disturbed, ASKED, History.open(tmp_path / "states"), 0)
+    aside = Reconstruction.fork(disturbed, ASKED, History.open(tmp_path / "states"), 0)
     for other in (again, aside):
         assert np.array_equal(other.world.origin, scene.world.origin)
         for ours, theirs in zip(scene.rig.cameras, other.rig.cameras, strict=True):

@@ -14,7 +14,7 @@ import pytest
 from histories import filled, same, state
 
 from scas4d_core.gaussians import PER_FRAME
-from scas4d_core.storage import frame_aside
+from scas4d_core.storage import scratch_frames
 from scas4d_core.storage.history import History
 
 FRAME_BYTES = 4 * (3 + 9 + 4 + 3 + 1)
@@ -72,7 +72,7 @@ def test_without_room_states_stay_in_memory_and_room_is_asked_for_once(
         asked.append(1)
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(frame_aside, "TemporaryFile", full)
+    monkeypatch.setattr(scratch_frames, "TemporaryFile", full)
     for _ in range(3):
         history.put_aside(tmp_path)
     assert same(history.gaussians(6), state(3))
@@ -84,7 +84,7 @@ def test_empty_arrays_and_many_readers(tmp_path: Path) -> None:
     frames = [
         {"a": rng.normal(size=(50, 3)), "none": np.zeros((0, 4), np.float32), "one": np.array(k)} for k in range(40)
     ]
-    scratch = frame_aside.ScratchFile(tmp_path)
+    scratch = scratch_frames.ScratchFile(tmp_path)
     aside = [scratch.moved(frame) for frame in frames]
     with ThreadPoolExecutor(8) as pool:
         found = list(pool.map(lambda k: dict(aside[k % 40]), range(400)))
@@ -102,7 +102,7 @@ def test_a_history_on_disk_has_no_use_for_it(tmp_path: Path) -> None:
 
 def test_the_older_states_of_a_long_history_are_aside_by_themselves() -> None:
     """A run of any length in one process takes no more memory than a short one."""
-    count, frames = 5_000, 4 * frame_aside.IN_MEMORY
+    count, frames = 5_000, 4 * scratch_frames.IN_MEMORY
     one, report = state(0, count), {"loss": [0.5] * 200}
     history = History()
     tracemalloc.start()
@@ -113,7 +113,7 @@ def test_the_older_states_of_a_long_history_are_aside_by_themselves() -> None:
             sizes[index] = tracemalloc.get_traced_memory()[0] / (count * FRAME_BYTES)
     finally:
         tracemalloc.stop()
-    assert sizes[frames - 1] - sizes[frame_aside.IN_MEMORY] < 2
+    assert sizes[frames - 1] - sizes[scratch_frames.IN_MEMORY] < 2
     assert [history.report(index)["index"] for index in (0, 1, 20, frames - 1)] == [0, 1, 20, frames - 1]
     assert same(history.gaussians(5), one)
     assert history.cut(5) == list(range(6, frames))
@@ -132,12 +132,12 @@ def test_a_disk_that_fills_up_loses_no_state(tmp_path: Path, monkeypatch: pytest
         room[0] -= count
         return count
 
-    monkeypatch.setattr(frame_aside.os, "pwrite", little)
+    monkeypatch.setattr(scratch_frames.os, "pwrite", little)
     history = History()
-    for index in range(3 * frame_aside.IN_MEMORY):
+    for index in range(3 * scratch_frames.IN_MEMORY):
         history.append(index, index / 30, state(index), {"index": index})
     assert room[0] <= 0
-    for index in range(3 * frame_aside.IN_MEMORY):
+    for index in range(3 * scratch_frames.IN_MEMORY):
         assert same(history.gaussians(index), state(index))
         assert history.report(index) == {"index": index}
 
@@ -154,7 +154,7 @@ def test_places_of_states_that_are_deleted_are_used_again(tmp_path: Path) -> Non
 
 
 def test_a_file_that_was_cut_is_an_error() -> None:
-    scratch = frame_aside.ScratchFile(None)
+    scratch = scratch_frames.ScratchFile(None)
     aside = scratch.moved({"a": np.arange(4000.0)})
     os.ftruncate(scratch._file.fileno(), 8000)
     with pytest.raises(OSError, match="ends at byte 8000"):

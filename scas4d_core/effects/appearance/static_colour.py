@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from scas4d_core.effects.effect import Effect, Group, refused_at_zero
+from scas4d_core.effects.effect import Effect, EffectGroup, refusal_at_zero
 from scas4d_core.update.parts import PlanBuilder
 
 if TYPE_CHECKING:
@@ -13,12 +13,12 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class StandingColour(Effect):
-    """RGB of the Gaussians that stand, at the rate ``rate_colour_standing``."""
+class StaticColour(Effect):
+    """RGB of the Gaussians that stand, at the rate ``rate_static_colour``."""
 
-    def refused(self, settings: Settings) -> tuple[str, str] | None:
+    def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Refused with a rate of 0."""
-        return refused_at_zero(settings, "rate_colour_standing")
+        return refusal_at_zero(settings, "rate_static_colour")
 
     def join(self, builder: PlanBuilder) -> None:
         """Frees their colours."""
@@ -26,9 +26,9 @@ class StandingColour(Effect):
         builder.plan.whole_pictures = True
 
 
-EFFECT = StandingColour(
-    name="standing_colour",
-    group=Group.APPEARANCE,
+EFFECT = StaticColour(
+    name="static_colour",
+    group=EffectGroup.APPEARANCE,
     says="The colours of static Gaussians follow the pictures in every iteration; only where it is pinned on.",
     gauge="The mean absolute colour change is a loss term: motion and gains are not absorbed by colours.",
     cost="full pictures are rendered, and one Adam step over RGB per iteration",

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.effects.presence.carving import Hull, carve_new
 from scas4d_core.effects.presence.novelty import novelties
-from scas4d_core.update.parts import Attempt, Part, PlanBuilder
+from scas4d_core.update.parts import Attempt, PlanBuilder, UpdatePart
 
 if TYPE_CHECKING:
     from scas4d_core.gaussians import Gaussians
@@ -27,11 +27,11 @@ OWN = 0.5
 """Share of a cluster's Gaussians that must belong to the thing for the cluster to start with its way."""
 
 
-class Catching(Part):
+class NewbornTracking(UpdatePart):
     """Sets the shift of the coarsest clusters of what was born in the frame before.
 
     Args:
-        name: of the effect, whose arrays name the rows ("young"), the thing of each ("thing"), and for each thing its
+        name: of the effect, whose arrays name the rows ("newborn"), the thing of each ("thing"), and for each thing its
             hull's centre ("centres", [T, 3] metres) and volume ("volumes", cubic metres), and the mean of its Gaussians
             ("places", [T, 3] metres).
     """
@@ -42,31 +42,31 @@ class Catching(Part):
     def begin(self, attempt: Attempt) -> None:
         """Locates each thing that was born in the frame before in the pictures of this frame."""
         arrays = attempt.carried.get(self._name)
-        if arrays is None or not len(arrays["young"]) or not attempt.tables.clusters:
+        if arrays is None or not len(arrays["newborn"]) or not attempt.tables.clusters:
             return
-        rest = attempt.previous.retire(arrays["young"])
+        rest = attempt.previous.retire(arrays["newborn"])
         hull = carve_new(novelties(rest, rest.colours, attempt.views, self._factory.posed, attempt.renderer))
         thing = np.full(len(attempt.previous), -1)
-        thing[arrays["young"]] = arrays["thing"]
+        thing[arrays["newborn"]] = arrays["thing"]
         of_entries, labels = thing[self._hierarchy.rows], self._hierarchy.labels[0]
         counts = np.bincount(labels)
-        for number, way in _ways(hull, arrays).items():
-            way = way - _gone(attempt.previous, arrays, number)
+        for number, way in _displacements(hull, arrays).items():
+            way = way - _displacement(attempt.previous, arrays, number)
             own = np.bincount(labels, weights=of_entries == number, minlength=len(counts)) > OWN * counts
             attempt.tables.clusters[0][own, 3:6] = way
 
 
-def _gone(state: Gaussians, arrays: Arrays, number: int) -> Float:
-    """[3] metres that a young thing has gone since its frame: an attempt may start from where another ended."""
-    rows = arrays["young"][arrays["thing"] == number]
+def _displacement(state: Gaussians, arrays: Arrays, number: int) -> Float:
+    """[3] metres that a newborn thing has gone since its frame: an attempt may start from where another ended."""
+    rows = arrays["newborn"][arrays["thing"] == number]
     if not len(rows):
         return np.zeros(3)
     gone: Float = state.means[rows].mean(axis=0) - arrays["places"][number]
     return gone
 
 
-def _ways(hull: Hull, arrays: Arrays) -> dict[int, Float]:
-    """By number of a young thing, [3] metres to the nearest hull of about its size."""
+def _displacements(hull: Hull, arrays: Arrays) -> dict[int, Float]:
+    """By number of a newborn thing, [3] metres to the nearest hull of about its size."""
     displacements: dict[int, Float] = {}
     numbers = np.unique(hull.things)
     centres = np.array([hull.points[hull.things == number].mean(axis=0) for number in numbers]).reshape(-1, 3)

@@ -38,10 +38,10 @@ class ScratchFile:
 
     def moved(self, frame: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
         """The arrays of a frame, in the file; as they were once there is no room, which is asked for once."""
-        if isinstance(frame, FrameAside) or self._full:
+        if isinstance(frame, ScratchFrame) or self._full:
             return frame
         try:
-            return FrameAside(self, {name: self.put(array) for name, array in frame.items()}, frame)
+            return ScratchFrame(self, {name: self.put(array) for name, array in frame.items()}, frame)
         except OSError:
             self._full = True
             return frame
@@ -93,7 +93,7 @@ def _room(size: int) -> int:
     return -(-size // ROUNDED) * ROUNDED
 
 
-class FrameAside(Mapping[str, NDArray[Any]]):
+class ScratchFrame(Mapping[str, NDArray[Any]]):
     """The arrays of one frame, in a scratch file.
 
     Args:

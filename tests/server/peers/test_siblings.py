@@ -23,10 +23,10 @@ from websockets.sync.client import connect
 from client.sdk import Client
 from client.wire.stream import STREAM_PROTOCOL
 from server.http.permissions import ALL, PERMISSION, Permission
+from server.peers import peers as module
+from server.peers.peers import Peers
+from server.peers.proxy import ProxyMiddleware
 from server.processes.placement import Placement
-from server.siblings import siblings as module
-from server.siblings.passing import PassOn
-from server.siblings.siblings import Siblings
 
 TOKEN = "the token of all services 0123456789".replace(" ", "-")
 NOBODYS = "0123456789ab"
@@ -42,7 +42,7 @@ class Together(Placement):
 
     has_siblings = True
 
-    async def siblings(self):
+    async def peers(self):
         return [one.url for one in RUNNING if one.app.state.placement is not self] + GONE
 
 
@@ -229,13 +229,13 @@ def test_a_service_that_does_not_answer_is_no_scene_that_is_not_there(services, 
 
 
 def asked(handler, secret=None):
-    """A service with one sibling, which is a function."""
+    """A service with one peer, which is a function."""
 
     async def listed():
         return ["http://other"]
 
     client = httpx.AsyncClient(transport=httpx.MockTransport(handler))
-    return Siblings(listed, secret, client)
+    return Peers(listed, secret, client)
 
 
 def test_ids_that_nobody_has_are_asked_for_once_in_a_while(monkeypatch):
@@ -246,13 +246,13 @@ def test_ids_that_nobody_has_are_asked_for_once_in_a_while(monkeypatch):
         return httpx.Response(404)
 
     async def test():
-        siblings = asked(handler)
-        assert [await siblings.owner("x") for _ in range(5)] == [None] * 5
+        peers = asked(handler)
+        assert [await peers.owner("x") for _ in range(5)] == [None] * 5
         assert len(calls) == 1
         monkeypatch.setattr(module, "MOST_UNKNOWN", 2)
         for name in ("a", "b", "c"):
-            await siblings.owner(name)
-        await siblings.owner("x")
+            await peers.owner(name)
+        await peers.owner("x")
         assert len(calls) == 5
 
     asyncio.run(test())
@@ -277,13 +277,13 @@ def test_one_that_was_known_and_is_gone_is_waited_for(monkeypatch):
 
     async def test():
         client = httpx.AsyncClient(transport=httpx.MockTransport(lambda request: httpx.Response(200)))
-        siblings = Siblings(listed, None, client)
-        assert await siblings.owner("x") == "http://other"
+        peers = Peers(listed, None, client)
+        assert await peers.owner("x") == "http://other"
         there.clear()
         with pytest.raises(module.Problem):
-            await siblings.owner("x")
+            await peers.owner("x")
         monkeypatch.setattr(module, "REMEMBERED_S", 0.0)
-        assert await siblings.owner("x") is None
+        assert await peers.owner("x") is None
 
     asyncio.run(test())
 
@@ -298,15 +298,15 @@ def test_it_is_seen_among_the_siblings_that_counts_not_when_its_scene_was_asked_
 
     async def test():
         client = httpx.AsyncClient(transport=httpx.MockTransport(lambda request: httpx.Response(200)))
-        siblings = Siblings(listed, None, client)
-        assert await siblings.owner("x") == "http://other"
+        peers = Peers(listed, None, client)
+        assert await peers.owner("x") == "http://other"
         now[0] = 700.0
-        assert await siblings.owner("y") == "http://other"
+        assert await peers.owner("y") == "http://other"
         await asyncio.sleep(0.01)
         there.clear()
         now[0] = 701.0
         with pytest.raises(module.Problem):
-            await siblings.owner("x")
+            await peers.owner("x")
 
     asyncio.run(test())
 
@@ -322,12 +322,12 @@ def test_before_anybody_is_known_no_scene_is_known_not_to_be_there(monkeypatch, 
         await asyncio.Event().wait()
 
     async def test():
-        siblings = Siblings(listed, None)
+        peers = Peers(listed, None)
         for _ in range(2):
             with pytest.raises(module.Problem) as refused:
-                await siblings.owner("x")
+                await peers.owner("x")
             assert refused.value.document.status == 503
-        await siblings.close()
+        await peers.close()
 
     asyncio.run(test())
 
@@ -337,11 +337,11 @@ def test_one_that_does_not_tell_its_address_may_have_the_scene():
         return ["service.a1b2c3"]
 
     async def test():
-        siblings = Siblings(listed, None)
+        peers = Peers(listed, None)
         with pytest.raises(module.Problem):
-            await siblings.owner("x")
-        assert await siblings.scenes(ALL) == ([], ["service.a1b2c3"])
-        await siblings.close()
+            await peers.owner("x")
+        assert await peers.scenes(ALL) == ([], ["service.a1b2c3"])
+        await peers.close()
 
     asyncio.run(test())
 
@@ -353,7 +353,7 @@ class Nothing(httpx.AsyncByteStream):
         yield b""
 
 
-async def passed_on(siblings, method, path, *headers):
+async def passed_on(peers, method, path, *headers):
     """What the service sends that passes a request on; the client waits, and sends no more."""
     sent = []
 
@@ -361,7 +361,7 @@ async def passed_on(siblings, method, path, *headers):
         sent.append(message)
 
     scope = {"type": "http", "method": method, "path": path, "headers": list(headers), PERMISSION: ALL}
-    await PassOn(None, lambda: siblings, lambda scene: False, 1000)(scope, lambda: asyncio.Event().wait(), send)
+    await ProxyMiddleware(None, lambda: peers, lambda scene: False, 1000)(scope, lambda: asyncio.Event().wait(), send)
     return sent
 
 
@@ -378,8 +378,8 @@ def test_nothing_is_left_of_a_request_whose_sibling_goes():
         return ["http://other"]
 
     async def test():
-        siblings = Siblings(listed, None, httpx.AsyncClient(transport=Gone()))
-        sent = await passed_on(siblings, "PUT", f"/v1/scenes/{NOBODYS}/frames/0", (b"content-length", b"5"))
+        peers = Peers(listed, None, httpx.AsyncClient(transport=Gone()))
+        sent = await passed_on(peers, "PUT", f"/v1/scenes/{NOBODYS}/frames/0", (b"content-length", b"5"))
         assert sent[0]["status"] == 503
         assert asyncio.all_tasks() == {asyncio.current_task()}
 
@@ -391,9 +391,9 @@ def test_an_owner_that_has_a_scene_no_more_is_forgotten():
     answers = iter([200, 404, 404])
 
     async def test():
-        siblings = asked(lambda request: httpx.Response(next(answers), stream=Nothing()))
-        await passed_on(siblings, "GET", f"/v1/scenes/{NOBODYS}/frames/0")
-        assert NOBODYS not in siblings._owners
+        peers = asked(lambda request: httpx.Response(next(answers), stream=Nothing()))
+        await passed_on(peers, "GET", f"/v1/scenes/{NOBODYS}/frames/0")
+        assert NOBODYS not in peers._owners
 
     asyncio.run(test())
 
@@ -407,11 +407,11 @@ def test_a_frame_that_has_not_come_is_no_scene_that_is_gone():
         return httpx.Response(404 if "frames" in request.url.path else 200, stream=Nothing())
 
     async def test():
-        siblings = asked(handler)
+        peers = asked(handler)
         path = f"/v1/scenes/{NOBODYS}/frames/7"
         for _ in range(4):
-            await passed_on(siblings, "GET", path)
-        assert siblings._owners == {NOBODYS: "http://other"}
+            await passed_on(peers, "GET", path)
+        assert peers._owners == {NOBODYS: "http://other"}
         assert [found for found in calls if found != path] == [f"/v1/scenes/{NOBODYS}"] * 2
 
     asyncio.run(test())
@@ -429,13 +429,13 @@ def test_known_siblings_are_asked_while_the_head_of_the_cluster_does_not_answer(
             return ["http://other"]
 
         client = httpx.AsyncClient(transport=httpx.MockTransport(lambda request: httpx.Response(200)))
-        siblings = Siblings(listed, None, client)
-        assert await siblings.owner("x") == "http://other"
+        peers = Peers(listed, None, client)
+        assert await peers.owner("x") == "http://other"
         head.clear()
         for _ in range(3):
-            assert await asyncio.wait_for(siblings.owner("x"), HANG_S) == "http://other"
+            assert await asyncio.wait_for(peers.owner("x"), HANG_S) == "http://other"
             await asyncio.sleep(0)
-        await siblings.close()
+        await peers.close()
 
     asyncio.run(test())
 
@@ -480,7 +480,7 @@ def test_a_slash_too_many_leads_back_to_the_same_service(services, other):
 
 
 class Slow:
-    """A sibling that has every scene, and answers slowly; it notes what it was told."""
+    """A peer that has every scene, and answers slowly; it notes what it was told."""
 
     def __init__(self):
         self.given, self.cut = 0, threading.Event()
@@ -527,8 +527,8 @@ def test_a_client_that_hangs_up_is_noticed(services, fresh):
 
 
 def test_a_sibling_is_asked_with_as_much_as_the_client_may():
-    siblings = asked(lambda request: httpx.Response(404), secret=TOKEN)
-    assert siblings.headers(ALL)["authorization"] == f"Bearer {TOKEN}"
-    read = siblings.headers(Permission(scene="x", end=2_000_000_000))["authorization"]
+    peers = asked(lambda request: httpx.Response(404), secret=TOKEN)
+    assert peers.headers(ALL)["authorization"] == f"Bearer {TOKEN}"
+    read = peers.headers(Permission(scene="x", end=2_000_000_000))["authorization"]
     assert read.startswith("Bearer scas4d.read.x.2000000000.")
-    assert np.isclose(int(siblings.headers(Permission())["authorization"].split(".")[3]), time.time(), rtol=0.5)
+    assert np.isclose(int(peers.headers(Permission())["authorization"].split(".")[3]), time.time(), rtol=0.5)

@@ -42,7 +42,7 @@ def looks(state: Columns) -> tuple[str, ...]:
     return ("colours", "foreground") if state.gloss is None else ("colours", "foreground", "gloss")
 
 
-def told_shape(state: Columns, name: str) -> tuple[int, int]:
+def coded_shape(state: Columns, name: str) -> tuple[int, int]:
     """Components and rows of what is told of an attribute."""
     if name == "gloss" and state.gloss is not None:
         return 3, state.gloss.shape[1]
@@ -50,7 +50,7 @@ def told_shape(state: Columns, name: str) -> tuple[int, int]:
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
+class DecodedState:
     """A state as far as it is told: what clusters foretell, and attributes one after the other.
 
     What comes first helps the next: axes turn with the rotation, and steps are parts of the told size.
@@ -62,7 +62,7 @@ class Told:
     """[N] metres, as they are told so far."""
 
     @classmethod
-    def of(cls, bounds: Bounds, state: Columns) -> Told:
+    def of(cls, bounds: Bounds, state: Columns) -> DecodedState:
         """A state of which nothing is told but what its clusters foretell."""
         return cls(bounds, state, state.sizes())
 
@@ -89,7 +89,7 @@ class Told:
             levels = np.rint((getattr(state, name) - getattr(self.state, name)) / self._step(name))
         return np.asarray(by_green(levels) if name == "colours" else levels)
 
-    def having(self, name: str, residual: Ints) -> Told:
+    def having(self, name: str, residual: Ints) -> DecodedState:
         """The same with another attribute."""
         if not residual.any():
             return self
@@ -108,7 +108,7 @@ class Told:
         changed = getattr(self.state, name) + residual.astype(np.float32) * self._step(name)
         return replace(self, state=self.state.having(**{name: changed}))
 
-    def _turned(self, vectors: Array) -> Told:
+    def _turned(self, vectors: Array) -> DecodedState:
         turns = turns_of(vectors)
         factors = np.stack(mapped(rotation_rows(turns), self.state.factors))
         rotations = products(turns, self.state.rotations)

@@ -20,7 +20,7 @@ PLACE_S = 1.0
 """For so long a process tries to get a place: somebody may just look whether it is taken."""
 
 
-def here() -> Marks | None:
+def here() -> CompiledMarkers | None:
     """Returns the marks for this process; None where there is no cache."""
     import numba
     from llvmlite import binding
@@ -34,10 +34,10 @@ def here() -> Marks | None:
     if not folder:
         return None
     digest = hashlib.sha256(target.encode()).hexdigest()[:8]  # features of a processor make a name too long for a file
-    return Marks(Path(folder) / f"compiled-{digest}-{where}")
+    return CompiledMarkers(Path(folder) / f"compiled-{digest}-{where}")
 
 
-class Marks:
+class CompiledMarkers:
     """The marks in a folder, which is made.
 
     Args:
@@ -57,7 +57,7 @@ class Marks:
         return [kernel for kernel in kernels if kernel.key not in there]
 
     def add(self, kernel: Kernel) -> None:
-        """Marks a kernel as compiled."""
+        """CompiledMarkers a kernel as compiled."""
         with suppress(OSError):  # for want of room: it is compiled all the same
             (self.folder / kernel.key).touch()
 

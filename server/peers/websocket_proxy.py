@@ -1,4 +1,4 @@
-"""Relays a WebSocket to the sibling that has its scene: messages both ways, and how either end closes."""
+"""Relays a WebSocket to the peer that has its scene: messages both ways, and how either end closes."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from websockets.typing import Subprotocol
 
 from server import problems
 from server.connections.websocket import limit_messages
+from server.peers.peers import CONNECT_S, SILENT_S, unreachable
 from server.problems import Problem
-from server.siblings.siblings import CONNECT_S, SILENT_S, unreachable
 
 SWITCHED = 101
 """Of a handshake that is accepted."""
@@ -24,7 +24,7 @@ RESTARTS, ABNORMAL = 1012, 1006
 """The service restarts; what stands for a connection that ended without a word, and is never sent."""
 
 
-async def relay(
+async def proxy_websocket(
     address: str,
     scene: str,
     headers: Mapping[str, str],
@@ -33,16 +33,16 @@ async def relay(
     receive: Receive,
     send: Send,
 ) -> int:
-    """Relays until either end closes; returns the status with which the sibling answered the handshake.
+    """Relays until either end closes; returns the status with which the peer answered the handshake.
 
     Args:
-        address: at the sibling, `http://…`. headers: for it. most_bytes: of a message of the client.
+        address: at the peer, `http://…`. headers: for it. most_bytes: of a message of the client.
 
     Raises:
-        Problem: 503, the sibling does not answer.
+        Problem: 503, the peer does not answer.
     """
     try:
-        sibling = await connect(
+        peer = await connect(
             f"ws{address.removeprefix('http')}",
             sock=await asyncio.wait_for(_connected(address), CONNECT_S),
             subprotocols=[Subprotocol(name) for name in scope["subprotocols"]] or None,
@@ -50,7 +50,7 @@ async def relay(
             user_agent_header=None,
             compression=None,
             max_size=None,  # what a service sends is bounded by what was asked
-            max_queue=1,  # the sibling notices a client that reads slowly, and sends it the newest only
+            max_queue=1,  # the peer notices a client that reads slowly, and sends it the newest only
             open_timeout=SILENT_S,  # it may wake the scene first
             proxy=None,
         )
@@ -60,10 +60,10 @@ async def relay(
     except (OSError, TimeoutError, WebSocketException):
         raise unreachable(scene) from None
     limit_messages(scope, most_bytes)
-    async with sibling:
+    async with peer:
         assert (await receive())["type"] == "websocket.connect"
-        await send({"type": "websocket.accept", "subprotocol": sibling.subprotocol})
-        ends = {asyncio.ensure_future(_to_sibling(sibling, receive)), asyncio.ensure_future(_from(sibling, send))}
+        await send({"type": "websocket.accept", "subprotocol": peer.subprotocol})
+        ends = {asyncio.ensure_future(_to_sibling(peer, receive)), asyncio.ensure_future(_from(peer, send))}
         try:
             await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
         finally:
@@ -89,22 +89,22 @@ async def _connected(address: str) -> socket.socket:
     return made
 
 
-async def _to_sibling(sibling: ClientConnection, receive: Receive) -> None:
+async def _to_sibling(peer: ClientConnection, receive: Receive) -> None:
     while (message := await receive())["type"] == "websocket.receive":
         text = message.get("text")
         with contextlib.suppress(ConnectionClosed):  # `_from` tells the client
-            await sibling.send(message["bytes"] if text is None else text)
+            await peer.send(message["bytes"] if text is None else text)
     code = message.get("code") or RESTARTS
-    await sibling.close(code if _may_be_sent(code) else RESTARTS, message.get("reason") or "")
+    await peer.close(code if _may_be_sent(code) else RESTARTS, message.get("reason") or "")
 
 
-async def _from(sibling: ClientConnection, send: Send) -> None:
+async def _from(peer: ClientConnection, send: Send) -> None:
     with contextlib.suppress(ConnectionClosed):
         while True:
-            message = await sibling.recv()
+            message = await peer.recv()
             await send({"type": "websocket.send", "text" if isinstance(message, str) else "bytes": message})
-    code = sibling.close_code or ABNORMAL
-    reason = sibling.close_reason or ""
+    code = peer.close_code or ABNORMAL
+    reason = peer.close_reason or ""
     await send({"type": "websocket.close", "code": code if _may_be_sent(code) else RESTARTS, "reason": reason})
 
 
@@ -114,7 +114,7 @@ def _may_be_sent(code: int) -> bool:
 
 
 async def _refused(refused: InvalidStatus, scope: Scope, receive: Receive, send: Send) -> None:
-    """Answers the handshake as the sibling has answered it."""
+    """Answers the handshake as the peer has answered it."""
     answer = refused.response
     if "websocket.http.response" not in scope.get("extensions", {}):
         problem = Problem(

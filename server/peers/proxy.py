@@ -1,4 +1,4 @@
-"""Passes requests and WebSockets of a scene that a sibling has on to it; the client does not notice."""
+"""Passes requests and WebSockets of a scene that a peer has on to it; the client does not notice."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from server import problems
 from server.http.permissions import PERMISSION
+from server.peers.peers import PASSED, Peers, unreachable
+from server.peers.websocket_proxy import proxy_websocket
 from server.problems import Problem
-from server.siblings.relay import relay
-from server.siblings.siblings import PASSED, Siblings, unreachable
 
 OF_A_SCENE = re.compile(r"/v1/scenes/([0-9a-f]{12})(?:/.*)?")
-"""Addresses that are passed on. Others are answered here: no sibling is asked for what cannot be a scene."""
+"""Addresses that are passed on. Others are answered here: no peer is asked for what cannot be a scene."""
 HOP_BY_HOP = frozenset(
     {b"connection", b"keep-alive", b"proxy-authenticate", b"proxy-authorization", b"proxy-connection", b"te"}
     | {b"trailer", b"transfer-encoding", b"upgrade"}
 )
 """Headers between two ends of one connection (RFC 9110, 7.6.1)."""
 KEPT_HERE = HOP_BY_HOP | {b"authorization", b"cookie", b"expect", b"forwarded", b"host", b"origin", b"referer"}
-"""Headers of a request that this service has looked at: it asks the sibling in its own name."""
+"""Headers of a request that this service has looked at: it asks the peer in its own name."""
 OF_THE_SERVER = frozenset({b"date", b"server"})
 """Headers of an answer that the server of this service writes itself."""
 
@@ -34,40 +34,40 @@ NOT_FOUND = 404
 log = logging.getLogger("scas4d.server")
 
 
-class PassOn:
+class ProxyMiddleware:
     """Middleware; behind authentication, and before all that looks at bodies.
 
     Args:
-        siblings: once the service has them. has: whether this service has a scene.
+        peers: once the service has them. has: whether this service has a scene.
         most_bytes: of a message that a client sends over a WebSocket.
     """
 
-    def __init__(
-        self, app: ASGIApp, siblings: Callable[[], Siblings], has: Callable[[str], bool], most_bytes: int
-    ) -> None:
+    def __init__(self, app: ASGIApp, peers: Callable[[], Peers], has: Callable[[str], bool], most_bytes: int) -> None:
         self.app = app
-        self._siblings = siblings
+        self._siblings = peers
         self._has = has
         self._most_bytes = most_bytes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Answers from a sibling where that has the scene, else by this service."""
+        """Answers from a peer where that has the scene, else by this service."""
         scene = self._scene_elsewhere(scope)
         if scene is None:
             await self.app(scope, receive, send)
             return
-        siblings = self._siblings()
+        peers = self._siblings()
         try:
-            owner = await siblings.owner(scene)
+            owner = await peers.owner(scene)
             if owner is None:
                 await self.app(scope, receive, send)
             elif scope["type"] == "websocket":
-                headers = siblings.headers(scope[PERMISSION])
-                status = await relay(address(owner, scope), scene, headers, self._most_bytes, scope, receive, send)
+                headers = peers.headers(scope[PERMISSION])
+                status = await proxy_websocket(
+                    address(owner, scope), scene, headers, self._most_bytes, scope, receive, send
+                )
                 if status == NOT_FOUND:
-                    await siblings.check(owner, scene)
+                    await peers.check(owner, scene)
             else:
-                await self._pass(siblings, owner, scene, scope, receive, send)
+                await self._pass(peers, owner, scene, scope, receive, send)
         except Problem as problem:
             await problems.refuse(problem, scope, receive, send)
 
@@ -79,24 +79,22 @@ class PassOn:
         dots = any(part in (".", "..") for part in scope["path"].split("/"))  # a client of HTTP takes them out
         return None if dots else of[1]
 
-    async def _pass(
-        self, siblings: Siblings, owner: str, scene: str, scope: Scope, receive: Receive, send: Send
-    ) -> None:
+    async def _pass(self, peers: Peers, owner: str, scene: str, scope: Scope, receive: Receive, send: Send) -> None:
         names = Headers(scope=scope)
         body = _Body(receive, there="content-length" in names or "transfer-encoding" in names)
-        headers = [*_passed(scope), *((n.encode(), v.encode()) for n, v in siblings.headers(scope[PERMISSION]).items())]
+        headers = [*_passed(scope), *((n.encode(), v.encode()) for n, v in peers.headers(scope[PERMISSION]).items())]
         request = httpx.Request(
             scope["method"],
             address(owner, scope),
             headers=headers,
             content=body.parts() if body.there else None,
         )
-        answering = asyncio.ensure_future(_answer(siblings.client, request, owner, scene, send))
+        answering = asyncio.ensure_future(_answer(peers.client, request, owner, scene, send))
         leaving = asyncio.ensure_future(body.hung_up())
         try:
             await asyncio.wait({answering, leaving}, return_when=asyncio.FIRST_COMPLETED)
             if answering.done() and answering.result() == NOT_FOUND:  # the scene, or something in it
-                await siblings.check(owner, scene)
+                await peers.check(owner, scene)
         finally:
             for task in (answering, leaving):
                 task.cancel()
@@ -115,7 +113,7 @@ class _Body:
         """Yields the body.
 
         Raises:
-            httpx.RequestError: the client has hung up; the sibling sees a body that ends early.
+            httpx.RequestError: the client has hung up; the peer sees a body that ends early.
         """
         while True:
             message = await self._receive()
@@ -138,7 +136,7 @@ async def _answer(client: httpx.AsyncClient, request: httpx.Request, owner: str,
     """Sends a request and hands its answer on; returns the status.
 
     Raises:
-        Problem: 503, the sibling does not answer.
+        Problem: 503, the peer does not answer.
     """
     try:
         answer = await client.send(request, stream=True)
@@ -174,8 +172,8 @@ def _passed(scope: Scope) -> Iterator[tuple[bytes, bytes]]:
         yield b"accept-encoding", b"identity"
 
 
-def address(sibling: str, scope: Scope) -> str:
-    """Returns what was asked, at a sibling; percent-encoded as it was sent."""
+def address(peer: str, scope: Scope) -> str:
+    """Returns what was asked, at a peer; percent-encoded as it was sent."""
     path = scope.get("raw_path", scope["path"].encode()).decode("latin-1").partition("?")[0]
     query = scope.get("query_string", b"").decode("latin-1")
-    return f"{sibling}{path}?{query}" if query else f"{sibling}{path}"
+    return f"{peer}{path}?{query}" if query else f"{peer}{path}"

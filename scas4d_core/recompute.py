@@ -1,7 +1,7 @@
-"""Remakes a committed state that was damaged on disk, from the pictures of its frame.
+"""Recomputes a committed state that was damaged on disk, from the pictures of its frame.
 
-The remade state starts from the state before it, cold: it shows the same, but not with the same bits, and its report
-says ``remade``. The states after it were made from the state as it was, and stay.
+The recomputed state starts cold from the state before it. It shows the same with other bits, and its report says
+``recomputed``. Later states were made from the original and stay as they are.
 """
 
 from __future__ import annotations
@@ -11,17 +11,17 @@ from typing import Any
 
 from scas4d_core.cameras import Rig
 from scas4d_core.captures.frame import Frame
-from scas4d_core.effects.effect import Group, effect
+from scas4d_core.effects.effect import EffectGroup, effect
 from scas4d_core.gaussians import PER_FRAME, WHOLES
 from scas4d_core.reconstruction import Reconstruction, StepError
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 
-REMADE = "remade"
+RECOMPUTED = "recomputed"
 """In the report of a state that was made again: true."""
 
 
-def remake(
+def recompute(
     rig: Rig,
     settings: Settings,
     history: History,
@@ -48,17 +48,17 @@ def remake(
         HistoryError: the first frame or ``base`` cannot be read.
         StepError: the frame does not follow ``base``, or does not fit it.
     """
-    aside = Reconstruction.aside(rig, settings, history, base)
-    aside.populates = False  # what came and went in it is known, and states after it have it
-    aside.set_budget(**budget)
-    made = aside.step(frame, dropped=dropped, notes={**(notes or {}), REMADE: True})
-    if made.outcome.held:  # nothing was learnt from the pictures
+    scratch = Reconstruction.fork(rig, settings, history, base)
+    scratch.populates = False  # what came and went in it is known, and states after it have it
+    scratch.set_budget(**budget)
+    made = scratch.step(frame, dropped=dropped, notes={**(notes or {}), RECOMPUTED: True})
+    if made.outcome.rejected:  # nothing was learnt from the pictures
         raise StepError(f"frame {frame.index} does not fit the frame before it: {made.degraded}")
-    report = aside.history.report(frame.index)
-    arrays = history.completed(frame.index, aside.history.gaussians(frame.index)).arrays()
+    report = scratch.history.report(frame.index)
+    arrays = history.completed(frame.index, scratch.history.gaussians(frame.index)).arrays()
     kept = {name: arrays[name] for name in (*PER_FRAME, *WHOLES) if name in arrays}
-    # Who was young in it is not known: its births are those of the history, not of this update.
-    left = aside.history.effects(frame.index)
-    left = {name: given for name, given in left.items() if effect(name).group is not Group.PRESENCE}
+    # Who was newborn in it is not known: its births are those of the history, not of this update.
+    left = scratch.history.effects(frame.index)
+    left = {name: given for name, given in left.items() if effect(name).group is not EffectGroup.PRESENCE}
     history.replace(frame.index, frame.time, kept, report, left)
     return report

@@ -1,4 +1,4 @@
-"""Siblings, the other services of the cluster: which of them has a scene, and which scenes they have."""
+"""Peers, the other services of the cluster: which of them has a scene, and which scenes they have."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from server.problems import Problem
 PASSED = "x-scas4d-passed"
 """Header of what a service asks of another: that one answers for its own scenes alone, and passes nothing on."""
 FRESH_S = 3.0
-"""A list of the siblings is good for so long, and so is the answer that none has a scene."""
+"""A list of the peers is good for so long, and so is the answer that none has a scene."""
 LIST_S = 2.0
 """A request waits for the first list for so long; later ones get the list before."""
 ASK_S = 5.0
-"""A sibling has so long to answer a question about its scenes."""
+"""A peer has so long to answer a question about its scenes."""
 CONNECT_S = 3.0
 SILENT_S = 130.0
-"""A sibling may be silent for so long over a request: longer than it allows a query."""
+"""A peer may be silent for so long over a request: longer than it allows a query."""
 REMEMBERED_S = 600.0
 """A service that is gone is waited for, for so long after it was there: clients of its scenes are told to ask again."""
 MOST_KNOWN = 100_000
 MOST_UNKNOWN = 1_000
-"""Ids that nobody has, remembered for a moment: whoever tries out ids does not reach every sibling with each."""
+"""Ids that nobody has, remembered for a moment: whoever tries out ids does not reach every peer with each."""
 
 T = TypeVar("T")
 M = TypeVar("M", bound=BaseModel)
@@ -40,11 +40,11 @@ M = TypeVar("M", bound=BaseModel)
 log = logging.getLogger("scas4d.server")
 
 
-class Siblings:
+class Peers:
     """The other services of the cluster. On the event loop.
 
     Args:
-        listed: returns the addresses of the siblings, as `http://10.0.0.2:8000`; it may take long.
+        listed: returns the addresses of the peers, as `http://10.0.0.2:8000`; it may take long.
         secret: the token, which all services of a cluster share; None: there is none.
         client: of HTTP; by default one of its own.
 
@@ -69,20 +69,20 @@ class Siblings:
         self._owners: OrderedDict[str, str] = OrderedDict()
         """Addresses by scene."""
         self._seen: dict[str, float] = {}
-        """When an address was last among the siblings."""
+        """When an address was last among the peers."""
         self._unknown: OrderedDict[str, float] = OrderedDict()
         self._refusing: set[str] = set()
         """Addresses of those that refuse the token."""
         self._checked: OrderedDict[str, float] = OrderedDict()
 
     async def close(self) -> None:
-        """Ends connections to siblings."""
+        """Ends connections to peers."""
         if self._listing is not None:
             self._listing.cancel()
         await self.client.aclose()
 
     async def addresses(self) -> Sequence[str]:
-        """Addresses of the siblings, as they were listed last."""
+        """Addresses of the peers, as they were listed last."""
         if self._listing is None and time.monotonic() - self._asked >= FRESH_S:
             self._listing = asyncio.get_running_loop().create_task(self._list())
         if self._listing is not None:
@@ -96,38 +96,38 @@ class Siblings:
             seen = {address: when for address, when in self._seen.items() if now - when < REMEMBERED_S}
             self._seen = seen | dict.fromkeys((*before, *self._addresses), now)  # those before were there until now
         except Exception:  # the cluster's head does not answer, or in words that nobody expects
-            log.exception("siblings cannot be listed; those before are asked")
+            log.exception("peers cannot be listed; those before are asked")
         finally:
             self._asked, self._listing = time.monotonic(), None
 
     def headers(self, permission: Permission) -> dict[str, str]:
-        """Headers with which a sibling is asked, for somebody who may do so much."""
+        """Headers with which a peer is asked, for somebody who may do so much."""
         forwarded = {PASSED: "1"}
         if self._secret is not None:
             forwarded["authorization"] = f"Bearer {_bearer(permission, self._secret)}"
         return forwarded
 
     async def owner(self, scene: str) -> str | None:
-        """Returns the address of the sibling that has a scene; None: none of them has it.
+        """Returns the address of the peer that has a scene; None: none of them has it.
 
         Raises:
             Problem: 503, the one that had it, or one that may have it, does not answer.
         """
-        siblings, now = await self.addresses(), time.monotonic()
+        peers, now = await self.addresses(), time.monotonic()
         known = self._owners.get(scene)
-        if known in siblings:
+        if known in peers:
             return known
         if self._addresses is None:  # it is not known yet whom to ask
             raise unreachable(scene)
         if now - self._unknown.get(scene, -FRESH_S) < FRESH_S:
             return None
-        answers = await asyncio.gather(*(self._has(address, scene) for address in siblings))
-        for address, has in zip(siblings, answers, strict=True):
+        answers = await asyncio.gather(*(self._has(address, scene) for address in peers))
+        for address, has in zip(peers, answers, strict=True):
             if has:
                 _keep(self._owners, scene, address, MOST_KNOWN)
                 return address
         if None in answers or (known in self._seen and now - self._seen[known] < REMEMBERED_S):
-            raise unreachable(scene, refused=not self._refusing.isdisjoint(siblings))
+            raise unreachable(scene, refused=not self._refusing.isdisjoint(peers))
         self.forget(scene)
         _keep(self._unknown, scene, now, MOST_UNKNOWN)
         return None
@@ -145,19 +145,19 @@ class Siblings:
                 self.forget(scene)
 
     async def scenes(self, permission: Permission) -> tuple[list[SceneStatus], list[str]]:
-        """Returns the scenes of all siblings, and the addresses of those that do not answer."""
+        """Returns the scenes of all peers, and the addresses of those that do not answer."""
         lists, silent = await self._every("/v1/scenes", permission, SceneList)
         return list({status.id: status for listing in lists for status in listing.scenes}.values()), silent
 
     async def clusters(self) -> tuple[list[Cluster], list[str]]:
-        """Returns what the siblings' scenes take of nodes, and the addresses of those that do not answer."""
+        """Returns what the peers' scenes take of nodes, and the addresses of those that do not answer."""
         return await self._every("/v1/cluster", ALL, Cluster)
 
     async def _every(self, path: str, permission: Permission, model: type[M]) -> tuple[list[M], list[str]]:
-        siblings = await self.addresses()
-        answers = await asyncio.gather(*(self._get(address, path, permission) for address in siblings))
+        peers = await self.addresses()
+        answers = await asyncio.gather(*(self._get(address, path, permission) for address in peers))
         replies, silent = [], []
-        for address, answer in zip(siblings, answers, strict=True):
+        for address, answer in zip(peers, answers, strict=True):
             try:
                 if answer is None or answer.status_code != 200:
                     raise ValueError(answer)
@@ -167,7 +167,7 @@ class Siblings:
         return replies, silent
 
     async def _has(self, address: str, scene: str) -> bool | None:
-        """Returns whether a sibling has a scene; None: it does not say."""
+        """Returns whether a peer has a scene; None: it does not say."""
         answer = await self._get(address, f"/v1/scenes/{scene}", ALL)
         if answer is None:
             return None

@@ -19,15 +19,15 @@ from scas4d_core.errors import without_paths
 from scas4d_core.storage.frame_files import checkpoint_of, frame_file, frame_of
 from server import counters
 from server.background import Background
-from server.messages import FrameReady, Mend, Mended, MendOutcome, Remake
+from server.messages import FrameReady, RecomputeState, RepairFiles, RepairOutcome, RepairResult
 from server.storage.events import StatesDeleted
 from server.storage.ledger import SceneLog
 
 SENTENCES_KEPT = 100
 """Sentences about damage that are kept: the newest."""
 AGAIN_S = 5.0
-"""Mending for which the disk had no room is tried again after so long."""
-OF_REMAKE = frozenset({MendOutcome.REMADE, MendOutcome.LOST, MendOutcome.LATER, MendOutcome.NO_ROOM})
+"""RepairQueue for which the disk had no room is tried again after so long."""
+OF_RECOMPUTE = frozenset({RepairOutcome.RECOMPUTED, RepairOutcome.LOST, RepairOutcome.LATER, RepairOutcome.NO_ROOM})
 """Outcomes that end the remaking of a state; others may be of the same file, asked about before."""
 DEATHS = 2
 """A state is given up after so many deaths of the worker while it made it again."""
@@ -83,13 +83,13 @@ class DamageLog:
         return [*before, *(text if count == 1 else f"{text} ({count} times)" for text, count in self._counts.items())]
 
 
-class Mending:
+class RepairQueue:
     """Mends the damage of one scene. On the event loop.
 
     Args:
         log, damage, background: of the scene.
         to_worker: posts a message; returns False where no worker can receive one.
-        remake: frames whose states were found damaged at the start, with the reason.
+        recompute: frames whose states were found damaged at the start, with the reason.
 
     Attributes:
         at_work: the frame whose state the worker is making again, or None.
@@ -103,7 +103,7 @@ class Mending:
         background: Background,
         *,
         to_worker: Callable[[Any], bool],
-        remake: Mapping[int, str],
+        recompute: Mapping[int, str],
     ) -> None:
         self._log = log
         self._ledger = log.ledger
@@ -117,7 +117,7 @@ class Mending:
         self._full_until = 0.0
         self._stopped = False
         self.at_work: int | None = None
-        for index, reason in remake.items():
+        for index, reason in recompute.items():
             self._decide(index, reason)
 
     @property
@@ -161,7 +161,7 @@ class Mending:
                 if (record := entry.record) is not None:
                     known[index] = dict(record)
         if message := tuple(names):
-            self._to_worker(Mend(message, times, known))
+            self._to_worker(RepairFiles(message, times, known))
 
     def begin(self) -> float:
         """Gives an idle worker the next state to make again, if one waits.
@@ -182,33 +182,33 @@ class Mending:
                 self._lost(index, "its pictures are no longer held")
                 continue
             frame = FrameReady(index, receipt.time, entry.files, receipt.identity, self._ledger.budget_of(index))
-            if self._to_worker(Remake(frame, base)):
+            if self._to_worker(RecomputeState(frame, base)):
                 self.at_work = index
             break
         return 0.0
 
-    def mended(self, message: Mended) -> tuple[int, ...]:
+    def handle_result(self, message: RepairResult) -> tuple[int, ...]:
         """Acts on the worker's answer about a file or a state; returns the frames that readers have to read again."""
         index = frame_of(message.name)
         reason = self._asked.pop(message.name, message.reason)
-        if index is not None and index == self.at_work and message.outcome in OF_REMAKE:
+        if index is not None and index == self.at_work and message.outcome in OF_RECOMPUTE:
             self.at_work = None
         match message.outcome:
-            case MendOutcome.WHOLE:
+            case RepairOutcome.WHOLE:
                 log.warning("%s could not be read once (%s), and is whole", message.name, reason)
-            case MendOutcome.WRITTEN:
+            case RepairOutcome.WRITTEN:
                 self._say(message.name, f"{message.reason}; it was written again, and nothing is lost")
-            case MendOutcome.REPORT_LOST:
+            case RepairOutcome.REPORT_LOST:
                 self._say(
                     message.name, f"{message.reason}; its state is whole and was written again, its report is lost"
                 )
-            case MendOutcome.DAMAGED if index is not None:
+            case RepairOutcome.DAMAGED if index is not None:
                 self._decide(index, message.reason)
-            case MendOutcome.DAMAGED if checkpoint_of(message.name) is not None:
+            case RepairOutcome.DAMAGED if checkpoint_of(message.name) is not None:
                 self._say(message.name, f"{message.reason}; it is needed by nothing but a second damage", lasting=True)
-            case MendOutcome.DAMAGED:
+            case RepairOutcome.DAMAGED:
                 self._say(message.name, f"{message.reason}; it cannot be made again", lasting=True)
-            case MendOutcome.REMADE:
+            case RepairOutcome.RECOMPUTED:
                 assert index is not None
                 reason = self.waiting.pop(index, reason)
                 self._ledger.frames.set_unreadable(index, False)
@@ -217,16 +217,16 @@ class Mending:
                     message.name,
                     f"frame {index}: {reason}; its state was made again from its pictures, not with the same bits",
                 )
-            case MendOutcome.LOST:
+            case RepairOutcome.LOST:
                 assert index is not None
                 self._lost(index, message.reason)
-            case MendOutcome.NO_ROOM:
+            case RepairOutcome.NO_ROOM:
                 if index is None or index not in self.waiting:
                     self._asked[message.name] = reason
                     self._ask_later(message.name)
                 else:
                     self._full_until = asyncio.get_running_loop().time() + AGAIN_S
-            case MendOutcome.GONE | MendOutcome.LATER:
+            case RepairOutcome.GONE | RepairOutcome.LATER:
                 pass
         return () if index is None else (index,)
 

@@ -17,9 +17,9 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 
+from scas4d_core.compilation.compiled_markers import CompiledMarkers, here
 from scas4d_core.compilation.compiling import compile_kernel
-from scas4d_core.compilation.manifest import Group, kernels_of
-from scas4d_core.compilation.marks import Marks, here
+from scas4d_core.compilation.manifest import KernelGroup, kernels_of
 
 log = logging.getLogger("scas4d.kernels")
 
@@ -35,7 +35,7 @@ PARENT_EVERY_S = 0.5
 TRIES = 2
 """Crews that are started for the same kernels: the first may have been killed."""
 
-Told = Callable[[int, int], None]
+OnProgress = Callable[[int, int], None]
 """Called with the number of kernels that are compiled, and that of all which are waited for."""
 
 _crew: list[subprocess.Popen[bytes]] = []
@@ -59,14 +59,14 @@ def work(wanted: Iterable[str], then: Iterable[str]) -> int:
     with marks.place(processes()) as taken:
         if not taken:
             return 0
-        failed += _compile_all(marks, map(Group, wanted))
+        failed += _compile_all(marks, map(KernelGroup, wanted))
         with contextlib.suppress(OSError, AttributeError):
             os.nice(NICE)
-        failed += _compile_all(marks, map(Group, then))
+        failed += _compile_all(marks, map(KernelGroup, then))
     return failed
 
 
-def _compile_all(marks: Marks, groups: Iterable[Group]) -> int:
+def _compile_all(marks: CompiledMarkers, groups: Iterable[KernelGroup]) -> int:
     failed = 0
     for kernel in kernels_of(groups):
         with marks.claim(kernel) as mine:
@@ -82,12 +82,14 @@ def _compile_all(marks: Marks, groups: Iterable[Group]) -> int:
     return failed
 
 
-def compiled(wanted: Iterable[Group], then: Iterable[Group] = (), told: Told | None = None) -> bool:
+def wait_for_kernels(
+    wanted: Iterable[KernelGroup], then: Iterable[KernelGroup] = (), on_progress: OnProgress | None = None
+) -> bool:
     """Waits until the cache has the kernels of the groups ``wanted``, which other processes compile if need be.
 
     Args:
         then: groups that the same processes go on with, and that nobody waits for here.
-        told: called at the beginning where there is something to wait for, and with every kernel.
+        on_progress: called at the beginning where there is something to wait for, and with every kernel.
 
     Returns:
         False where they could not be compiled beforehand: they are where they are first called.
@@ -103,9 +105,9 @@ def compiled(wanted: Iterable[Group], then: Iterable[Group] = (), told: Told | N
     tries, said = 0, -1
     while True:
         missing = len(marks.missing(kernels))
-        if told is not None and (said >= 0 or missing) and said != len(kernels) - missing:
+        if on_progress is not None and (said >= 0 or missing) and said != len(kernels) - missing:
             said = len(kernels) - missing
-            told(said, len(kernels))
+            on_progress(said, len(kernels))
         later = missing == 0 and tries == 0 and marks.missing(kernels_of(then))
         if missing == 0 and not later:
             return True
@@ -122,12 +124,12 @@ def compiled(wanted: Iterable[Group], then: Iterable[Group] = (), told: Told | N
         time.sleep(POLL_S)
 
 
-def _start(wanted: Iterable[Group], then: Iterable[Group]) -> bool:
+def _start(wanted: Iterable[KernelGroup], then: Iterable[KernelGroup]) -> bool:
     # The same sources: they may be where only this process looks.
     program = (
         "import sys; groups = [given.split(';') if given else [] for given in sys.argv[1:3]]; "
         "sys.path[:] = sys.argv[3:]; "
-        "from scas4d_core.compilation.crew import work; sys.exit(work(*groups) > 0)"
+        "from scas4d_core.compilation.compile_pool import work; sys.exit(work(*groups) > 0)"
     )
     command = [sys.executable or "python3", "-c", program, ";".join(wanted), ";".join(then), *sys.path]
     for _ in range(processes()):
