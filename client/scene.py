@@ -187,7 +187,7 @@ class Scene:
 
     @property
     def rig(self) -> Rig | None:
-        """The cameras in the user's world, as the reconstruction has refined them; None where the file tells none."""
+        """The cameras in the user's world, as the reconstruction has refined them; None where the file has none."""
         return self._given.head.rig
 
     @property

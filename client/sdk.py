@@ -212,7 +212,7 @@ class Client(_ClientBase):
             time.sleep(every)
 
     def wait(self, id: str, index: int, *, seconds: float = BUSY_S, every: float = 0.2) -> FrameReportModel:
-        """Waits until a frame is committed, set aside, missing or skipped; or the scene failed.
+        """Waits until a frame is committed, failed, missing or skipped, or the scene failed.
 
         Raises:
             TimeoutError: none of these within `seconds`.

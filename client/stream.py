@@ -176,7 +176,7 @@ class Stream:
             if self._connection is not None:
                 self._connection.send(message)
         except ConnectionClosed:
-            pass  # whoever receives connects anew, and says what is subscribed to then
+            pass  # the receiver connects again, and then repeats its subscriptions
 
 
 class AsyncStream:

@@ -266,7 +266,7 @@ class Rig:
     def radius(self) -> float:
         """1.1 x the largest distance of a camera centre from their mean: the scene radius of Dynamic3DGaussians.
 
-        One camera, or several at one place, do not tell the size of their scene, and with radius 0 nothing would move:
+        One camera, or several at one place, do not determine the size of a scene, and with radius 0 nothing would move:
         the radius is ``AUTO_RIG_RADIUS_M`` then, in the unit of the cameras.
         """
         return AUTO_RIG_RADIUS_M if self.at_one_place else self._spread

@@ -65,10 +65,10 @@ class FrameReport:
         put_off: what the budget left no time for, in words; the next frame has some for it.
         alarms: what a person should look at (``robust/alarms.py``).
         timing: by camera, frames after the others at which its pictures seem to be taken, by all frames so far; only
-            of cameras of which motion tells it well enough (``robust/timing.py``).
+            of cameras for which the motion determines it well enough (``robust/timing.py``).
         cloud: of frame 0: where its first points came from. calibration: of frame 0, against its pictures.
         cameras: by name, how well each camera's picture was met when it was last rendered: a bumped camera shows.
-        used: cameras whose pictures were learnt from; none of a frame that was held or stood. dropped: cameras left
+        used: cameras whose pictures were learnt from; none of a rejected or skipped frame. dropped: cameras left
             out, with the reason.
         degraded: for people, why the state is not the frame's, or only in part; None of a frame that went as it should.
         attempts: each attempt at the frame, with what came of it.

@@ -121,7 +121,7 @@ class Reconstruction(CommittedScene):
         Args:
             rig: training cameras, user's world and units, at the size of the frame's pictures.
             frame: with a picture of every camera, or of most; masks where there are.
-            points: a first cloud, user's world; None: made from the pictures. progress: told of each stage.
+            points: a first cloud, user's world; None: made from the pictures. progress: called with each stage.
             history: to commit to; None: in memory. static: a frame 0 that was fitted before, taken as it is.
             dropped, notes, started: see ``step``; the stage "load" has the time before: decoding, loading the kernels.
 
@@ -133,13 +133,13 @@ class Reconstruction(CommittedScene):
             raise ValueError(f"frame {frame.index}: time {frame.time} s must be finite")
         if static is None:
             check_rig(rig, settings.scene, None if points is None else points.positions)
-        began, told = perf_counter(), progress or (lambda _: None)
+        began, on_progress = perf_counter(), progress or (lambda _: None)
         frame = replace(frame, images=dict(frame.images))  # decoded once
-        calibration = first_calibration(rig, frame, settings.static, told, measured=static is None)
+        calibration = first_calibration(rig, frame, settings.static, on_progress, measured=static is None)
         settings, checked = with_background(settings, frame.images), perf_counter()
         self = cls(rig, settings, History() if history is None else history, calibration)
         scaled = self._factory.scaled(frame)
-        result = static or fit_first(scaled, points, self._factory, self.settings, self.world, told)
+        result = static or fit_first(scaled, points, self._factory, self.settings, self.world, on_progress)
         self.static = result = replace(result, gaussians=first_labels(result.gaussians, self.rig, scaled.masks))
         fitted = perf_counter()
         fixed = (
@@ -413,7 +413,7 @@ class Reconstruction(CommittedScene):
         resumed = None if self.resumed is None or self.report is not None else asdict(self.resumed)
         effects = switches_record(carried.switches)
         record = {**report.record(), "effects": effects, "threads": get_num_threads(), "resumed": resumed, **more}
-        seconds = report.seconds  # a record cannot tell its own writing: it has that of the one before
+        seconds = report.seconds  # a record cannot time its own writing: it has that of the one before
         seconds[REPORT] = seconds.get(REPORT, 0.0) + self.history.record_seconds + perf_counter() - began
         record["seconds"] = dict(seconds)
         kept = kept_of(carried.effects) if self.history.indices else carried.effects

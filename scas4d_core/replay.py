@@ -59,7 +59,7 @@ def replay(
         history: of the scene; only ``base`` and the first frame are read.
         base: the committed frame that the first of ``frames`` follows.
         frames: at least two, in order; the first warms up. iterations: a frame.
-        over: told of the end of each update.
+        over: called at the end of each update.
 
     Raises:
         HistoryError: ``base`` cannot be read.

@@ -149,13 +149,13 @@ def check_start(rig: Rig, has_points: bool) -> None:
     >>> lens = [[100, 0, 32], [0, 100, 24], [0, 0, 1]]
     >>> check_start(Rig((Camera("front", lens, np.eye(4), 64, 48),)), has_points=False)
     Traceback (most recent call last):
-    scas4d_core.rig_checks.RigError: one camera, and no points: nothing tells how far away things are; give points ...
+    scas4d_core.rig_checks.RigError: one camera, and no points: distances are unknown; give points ...
     """
     if has_points or not rig.at_one_place:
         return
     which = "one camera" if len(rig) == 1 else f"all {len(rig)} cameras are at one place"
     raise RigError(
-        f"{which}, and no points: nothing tells how far away things are",
+        f"{which}, and no points: distances are unknown",
         "give points of the first frame, or cameras that stand apart",
         "points",
         "nothing",
@@ -244,7 +244,7 @@ def pose_warnings(rig: Rig, positions: Float | None = None) -> list[str]:
     With points: they are out of view, and would be in view the other way round. Without: the viewing axes come
     together nowhere, before or behind the cameras, and would in nearly all pictures. Rigs that look outward come
     together behind, those that look all one way neither way. Poses in the world of one of the cameras often come
-    together both ways: nothing is said then, as only pictures can tell.
+    together both ways: nothing is reported then, as only pictures could decide.
 
     Args:
         rig: of at least three cameras where there are no points. positions: [P, 3] in its world, or None.

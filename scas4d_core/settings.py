@@ -39,7 +39,7 @@ class SceneSettings(SettingsModel):
     metres_per_unit: Positive | Literal["auto"] = Field(
         1.0,
         description="Metres in one unit of the calibration; 'auto' takes the rig's radius for 3 m. A single "
-        "camera tells no size: give a number such that what it sees is about 3 m away.",
+        "camera determines no size: give a number such that what it sees is about 3 m away.",
     )
     image_scale: float = Field(1.0, gt=0, le=1, description="Pictures are resized by this before anything else.")
     background: tuple[Unit, Unit, Unit] | Literal["auto"] = Field(
@@ -116,7 +116,7 @@ class Weights(SettingsModel):
     mask: NotNegative = Field(
         1.0,
         description="The same form on the rendered label, where masks are given and at least a tenth of the Gaussians "
-        "stands: it tells moving from standing Gaussians.",
+        "is static: it separates moving from static Gaussians.",
     )
     mask_alone: NotNegative = Field(
         0.3,

@@ -118,7 +118,7 @@ class Hub:
         return sum(len(channel.listeners) for channel in channels)
 
     def publish(self, scene: str, event: Event) -> None:
-        """Tells every listener of a scene. Never blocks, never raises: the scene's own work comes first."""
+        """Notifies every listener of a scene. Never blocks, never raises: the scene's own work comes first."""
         channel = self._channels.get(scene)
         if channel is None:
             return
@@ -130,7 +130,7 @@ class Hub:
                 log.exception("scene %s: a subscriber could not take the event %s", scene, type(event).__name__)
 
     def close(self, scene: str, reason: str) -> None:
-        """Closes the channel of a scene that is gone, and tells its listeners."""
+        """Closes the channel of a scene that is gone, and notifies its listeners."""
         for listener in self._give_up(scene):
             listener.on_close(reason)
 

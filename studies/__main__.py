@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 def remedy(missing: ModuleNotFoundError) -> str:
-    """Tells what to install for a missing package, as matplotlib; studies need everything that the tests need."""
+    """Names what to install for a missing package, as matplotlib; studies need everything that the tests need."""
     return f"this needs {missing.name}, which is not installed; in the checkout: scripts/setup dev"
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import scas4d_core
 
 CPU_INFO = Path("/proc/cpuinfo")
-"""Where Linux names the processor; other systems tell Python."""
+"""Where Linux names the processor; other systems report it through Python."""
 
 
 def machine() -> dict[str, Any]:

@@ -48,7 +48,7 @@ def tradeoff(id: str) -> Call[TradeoffModel]:
 def replay(id: str, iterations: Sequence[int] = (25, 50, 200), frames: int = 4) -> Call[TradeoffModel]:
     """Measures other numbers of iterations: the newest frames are updated again, in the background and in memory.
 
-    `tradeoff` tells how far it is, and has the points when it is done.
+    `tradeoff` reports its progress, and has the points when it is done.
 
     Args:
         id: of the scene.

@@ -15,7 +15,7 @@ def begin_export(
     last: int | None = None,
     ids: Sequence[int] | None = None,
 ) -> Call[ExportModel]:
-    """Has the service write committed frames to a file, in the background; `export` tells how far it is.
+    """Has the service write committed frames to a file, in the background; `export` reports its progress.
 
     Args:
         id: of the scene.

@@ -139,7 +139,7 @@ def ply(id: str, index: int) -> Call[bytes]:
 def states(id: str, first: int = 0, limit: int = 120, parts: bool = False) -> Call[tuple[bytes, int | None]]:
     """Reads committed frames from `first` on as a compact 4D file, and the frame to go on with, or None.
 
-    The file may begin with earlier frames, by which those asked for are told.
+    The file may start before the requested range, at the key frame that it depends on.
 
     >>> data, following = client.states(scene)
     >>> data[:4], following

@@ -191,7 +191,7 @@ def begin_again(
         n: number of the new reconstruction, `scene(id).reconstruction + 1`: so it is begun once, however often this is
             sent.
         settings: what changes of the scene's settings, nested.
-        frame: to begin with, here or still to come; None: as before. Those before it are set aside.
+        frame: to begin with, here or still to come; None: as before. Earlier frames fail.
         points: begin from the scene's points (`put_points`), False: from the pictures alone.
         discard: drop committed states; must be True where a frame after the first is committed.
 

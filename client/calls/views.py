@@ -35,7 +35,7 @@ def render(
         format: how it crosses the wire: png, jpeg or webp.
         background: RGB in 0…1; the scene's where None.
         width: pixels that the camera is scaled to.
-        parts: how many parts to tell apart; by a stated rule where None.
+        parts: number of parts; None: chosen by the rule of the method.
 
     >>> client.render(scene, "c0").shape
     (16, 24, 3)

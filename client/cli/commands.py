@@ -113,7 +113,7 @@ def push(
         status = client.scene(delivery.scene)
     console.print(delivery.lateness.summary(fps), highlight=False, soft_wrap=True)
     for sentence in status.warnings:
-        if sentence not in source.remarks:  # those were told when it was opened
+        if sentence not in source.remarks:  # those were printed when it was opened
             console.print(sentence, style="yellow", highlight=False)
     console.print(f"scene {status.id}: {status.committed} of {status.next_frame} frames committed, {status.state}")
     console.print(f"{url.rstrip('/')}/#scene={status.id}", soft_wrap=True)
@@ -260,8 +260,8 @@ def import_(
     console.print(f"{out}: {count} cameras; try: scas4d push {out}", highlight=False, soft_wrap=True)
 
 
-TOLD = frozenset({AlarmKind.CAMERA_LEFT_OUT, AlarmKind.FRAME_REJECTED, AlarmKind.FRAME_IN_PART})
-"""Alarms that the line of a frame tells without."""
+IN_THE_LINE = frozenset({AlarmKind.CAMERA_LEFT_OUT, AlarmKind.FRAME_REJECTED, AlarmKind.FRAME_IN_PART})
+"""Alarms that the line of a frame states already."""
 
 
 def out_of_step(report: FrameReportModel) -> set[str]:
@@ -285,7 +285,7 @@ def frame_line(report: FrameReportModel, missed: int = 0, off: Collection[str] =
     if report.dropped_cameras:
         parts.append(f"without {', '.join(report.dropped_cameras)}")
     for alarm in report.alarms:
-        if alarm.what not in TOLD:
+        if alarm.what not in IN_THE_LINE:
             parts.append(alarm.evidence if alarm.camera is None else f"camera {alarm.camera}: {alarm.evidence}")
     for name in sorted(out_of_step(report).difference(off)):
         parts.append(f"camera {name}: out of step by {report.timing[name].frames:+.2f} frames")

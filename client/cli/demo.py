@@ -126,11 +126,11 @@ def run(capture: Capture, url: str, out: Path, *, frames: int | None, preset: st
 
 
 def _report(client: Client, id: str, frames: int) -> None:
-    """Prints a line on time, and a line for each frame that was set aside."""
+    """Prints a line on time, and a line for each frame that failed."""
     reports = [client.frame(id, index) for index in range(frames)]
     for report in reports:
         if report.state != "committed":
-            console.print(f"[red]frame {report.index} was set aside: {report.error}")
+            console.print(f"[red]frame {report.index} failed: {report.error}")
     done = [report for report in reports if report.state == "committed"]
     first, updates = done[0], [report.seconds["total"] for report in done[1:]]
     later = f", updates {np.median(updates):.2f} s each (median of {len(updates)})" if updates else ""

@@ -35,7 +35,7 @@ Report = Callable[[str], None]
 DEFAULT_OPTIONS = CaptureOptions()
 
 TRAINING = "training cameras"
-"""The mark of a row that tells how well seen pictures are met, for want of test cameras."""
+"""Mark of a row that scores training pictures, because there are no test cameras."""
 
 
 @dataclass(frozen=True)
@@ -320,9 +320,9 @@ def save_parts(reconstruction: Committed, capture: Capture, index: int, labels: 
 
 
 def peak_megabytes() -> float | None:
-    """Largest resident memory of this process so far, 10⁶ bytes; None where the system does not tell (Windows)."""
+    """Largest resident memory of this process so far, 10⁶ bytes; None where the system does not report it (Windows)."""
     status = Path("/proc/self/status")
-    if status.exists():  # what `getrusage` tells on Linux is, in a child, at least what its parent had
+    if status.exists():  # on Linux `getrusage` reports, in a child, at least the memory of its parent
         peak = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
         return int(peak.split()[1]) * 1024 / 1e6
     try:

@@ -1,6 +1,6 @@
 """`scas4d evaluate --states`: states of a file, scored on a capture's test cameras and ground truth.
 
-Nothing is reconstructed: a compact file, or an export that tells which Gaussian is which, is rendered as it is.
+Nothing is reconstructed: a compact file, or an export with the ids of its Gaussians, is rendered as it is.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def _measure(found: Source, truth: Capture, store: Store, frames: int | None, re
         "psnr_first": lines[0]["psnr"],
         **summary(lines),
     }
-    row.pop("alarms", None)  # files tell none
+    row.pop("alarms", None)  # files have none
     if len(chosen) > 1:
         if truth.ground_truth is not None:
             row |= measure_tracks(scene, truth, chosen)

@@ -165,7 +165,7 @@ def reconstruct(
                     add[camera.name] = opened.enter_context(video_file(file, given.fps))
                 if videos:
                     add[camera.name](compared)
-            console.print(f"frame {index}: {np.mean(scores):.2f} dB{told(done.report)}")
+            console.print(f"frame {index}: {np.mean(scores):.2f} dB{remarks_on(done.report)}")
         if writer is not None and history.newest.moving.any():
             writer.add_parts(history.indices[-1], parts(history))
     write_ply(out / "last.ply", history.gaussians(history.indices[-1]), reconstruction.world)
@@ -175,10 +175,10 @@ def reconstruct(
     console.print(f"pictures, states, states.s4d and last.ply: {out}{seen}")
 
 
-def told(report: FrameReport | None) -> str:
+def remarks_on(report: FrameReport | None) -> str:
     """The lines on a frame that a person should read beside its figure: that it was held, and its alarms.
 
-    >>> told(None)
+    >>> remarks_on(None)
     ''
     """
     if report is None:

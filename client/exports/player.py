@@ -120,7 +120,7 @@ def _files(given: Source, low: int, high: int, count: int) -> Iterator[Sequence[
 
 
 def _facing(points: NDArray[np.float64]) -> Camera:
-    """A camera that sees points [N, 3] of the user's world from the front, along its z: where a source tells none.
+    """A camera that sees points [N, 3] of the user's world from the front, along its z: where a source has none.
 
     >>> camera = _facing(np.array([[0.0, 0, 5], [1, 0, 5], [0, 1, 5], [1, 1, 5]]))
     >>> pixels, depth = camera.project(np.array([[0.5, 0.5, 5]]))
@@ -135,7 +135,7 @@ def _facing(points: NDArray[np.float64]) -> Camera:
 
 
 def _held(files: Sequence[Path]) -> int:
-    """Number of the frames in compact files, those by which others are told among them."""
+    """Number of frames in compact files, with those that others depend on."""
     indices: set[int] = set()
     for file in files:
         with CompactReader(file) as reader:

@@ -46,7 +46,7 @@ def make_recording(
         source: as `opened` takes it. out: ends in `.rrd`; None: beside the source, named after it.
         frames: `A:B`, the frames from A to B, both counted in; None: all.
         tracks: how many of the Gaussians that move draw their way. trail: its length, seconds of the scene.
-        parts: whether points have the colours of their parts; their own else. The part is told of each, anyway.
+        parts: whether points have the colours of their parts; their own else. The part of each is recorded anyway.
         url, token: of the service.
 
     Returns:

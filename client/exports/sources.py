@@ -115,7 +115,7 @@ def opened(
     """The states of a source; those of a scene are fetched from the service.
 
     Args:
-        source: a compact file, the folder in which `scas4d reconstruct` left one, an export that tells which Gaussian
+        source: a compact file, the folder in which `scas4d reconstruct` left one, an export that records which Gaussian
             is which (docs/exports.md), or the id of a scene of the service.
         low, high: first and last frame. parts: with the part of each Gaussian. url, token: of the service.
         rate: frames a second of numbered files.
@@ -136,7 +136,7 @@ def opened(
 
 
 def is_scene_id(source: str) -> bool:
-    """Tells whether a source is the id of a scene: it is no file, and its name could not be one.
+    """True where a source is the id of a scene: it is no file, and its name could not be one.
 
     >>> is_scene_id("0f6a21"), is_scene_id("client"), is_scene_id("out/robot"), is_scene_id("robot.s4d")
     (True, False, False, False)
@@ -163,7 +163,7 @@ class CompactStates:
 
     @classmethod
     def of(cls, files: Sequence[Path], first: int = 0) -> CompactStates:
-        """Looks at each file; frames before ``first`` are left out: they only tell the others."""
+        """Looks at each file; frames before ``first`` are left out: later frames only depend on them."""
         heads: list[FileHeader] = []
         times: dict[int, float] = {}
         damages: list[str] = []

@@ -39,7 +39,7 @@ class CaptureOptions:
 
     @property
     def changed(self) -> dict[str, Any]:
-        """The options that are not the default, as JSON values; the encoding aside, which changes no pixel here."""
+        """The options that are not the default, as JSON values, without the encoding, which changes no pixel here."""
         usual, own = asdict(CaptureOptions()), asdict(self)
         changes = {name: value for name, value in own.items() if value != usual[name] and name != "encoding"}
         return {

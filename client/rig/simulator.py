@@ -162,7 +162,7 @@ def _check_cameras(status: SceneStatus, source: Capture) -> None:
 
 
 def _follow(client: Client, id: str, index: int, count: int, on_progress: OnProgress) -> None:
-    """Tells of progress until a frame is finished."""
+    """Reports progress until a frame is finished."""
     for status in client.watch(id, index):
         if status.state == "failed":
             raise RuntimeError(f"scene {id} failed: {status.error}")

@@ -128,7 +128,7 @@ class CameraResidualModel(Model):
 
     pixels: float | None = Field(
         description="Median distance of matching features from their epipolar lines, pixels of its pictures; null "
-        "where too few tell."
+        "where too few cameras measure it."
     )
     matches: int = Field(description="Right matches, about.")
 
@@ -139,7 +139,7 @@ class RefinedCameraModel(Model):
     turned: float = Field(description="Degrees.")
     moved: float = Field(description="Of its centre, in the calibration's unit.")
     focal: float = Field(description="Times its focal length.")
-    before: float | None = Field(description="Its residual as given, pixels; null where too few matches tell.")
+    before: float | None = Field(description="Its residual as given, pixels; null where there are too few matches.")
     after: float | None = Field(description="The same, refined.")
     fixed: bool = Field(description="Left as given for want of matches.")
     pose: list[list[float]] = Field(description="4×4 world to camera, in the world of the calibration.")
@@ -176,7 +176,7 @@ class FrameReportModel(Model):
         "can be read. failed: it was taken and could not be reconstructed; `error` says why. missing: it was "
         "declared missing. skipped: the queue was full and the scene skips to the newest."
     )
-    error: str | None = Field(default=None, description="Why the frame was set aside, skipped, or is missing.")
+    error: str | None = Field(default=None, description="Why the frame failed, was skipped, or is missing.")
     identity: str | None = Field(default=None, description="As in its receipt; null where it never had one.")
     attempts: int = Field(default=0, description="How often the worker died at this frame.")
     pictures_kept: bool = Field(default=False, description="Its pictures are still in the frame log.")
@@ -238,7 +238,7 @@ class FrameReportModel(Model):
     cameras: dict[str, CameraFitModel] = Field(default_factory=dict, description="By camera that the update saw.")
     alarms: list[AlarmModel] = Field(default_factory=list, description="What a person should look at.")
     timing: dict[str, CameraTimingModel] = Field(
-        default_factory=dict, description="By camera; only where motion tells it well enough."
+        default_factory=dict, description="By camera; only where the motion determines it well enough."
     )
     moving: int | None = None
     gaussians: int | None = Field(default=None, description="That are there; those retired are not counted.")

@@ -52,7 +52,7 @@ class IngestSettings(Model):
         default=None,
         ge=1,
         le=MAX_CAMERAS,
-        description="A frame that has fewer pictures left is set aside; half of the rig's, rounded up, where null.",
+        description="A frame that has fewer pictures left fails; half of the rig's, rounded up, where null.",
     )
     part_seconds: float | None = Field(
         default=None,
@@ -138,7 +138,7 @@ class ReconstructionRequest(Model):
         strict=True,
         ge=0,
         le=1_000_000_000,
-        description="The frame to begin with, here or still to come; null: as before. Those before it are set aside.",
+        description="The frame to begin with, here or still to come; null: as before. Earlier frames fail.",
     )
     points: bool = Field(
         default=True,
@@ -196,7 +196,7 @@ class SceneStatus(Model):
         "awaiting_first_frame: nothing to do yet. initialising: frame 0 is being reconstructed. ready: "
         "idle, the last frame was committed whole. updating: a later frame is being reconstructed. paused: it takes "
         "frames and reconstructs none. degraded: the scene goes on, but its last frame lost a camera, was held or "
-        "was set aside, or its worker is being restarted; `error` says why. failed: it takes no more frames until its "
+        "failed, or its worker is being restarted; `error` says why. failed: it takes no more frames until its "
         "reconstruction is begun anew (PUT …/reconstructions/{n})."
     )
     error: str | None = Field(default=None, description="Why the scene is failed or degraded.")
@@ -211,7 +211,7 @@ class SceneStatus(Model):
     last_committed: int | None
     gaussians: int | None
     reconstruction: int = Field(description="Number of its reconstruction: one more each time that it was begun anew.")
-    first_frame: int = Field(description="The reconstruction begins with this frame; those before it are set aside.")
+    first_frame: int = Field(description="The reconstruction begins with this frame; earlier frames failed.")
     paused: bool = Field(description="It begins no further frame, whatever `state` says: one may still be at work.")
     asleep: bool = Field(
         description="It was idle, has no processes and counts for nothing; it wakes by itself when it is asked or sent "

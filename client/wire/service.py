@@ -92,5 +92,5 @@ class Cluster(Model):
     nodes: list[Node]
     waiting: list[Waiting]
     answers: bool = Field(
-        default=True, description="The head of the cluster answers; else the nodes are as it told them last."
+        default=True, description="The head of the cluster answers; else the nodes are those of its last answer."
     )

@@ -67,7 +67,7 @@ class GaussianModel(Model):
 class GaussiansModel(Model):
     """The lives of Gaussians, in the order asked for."""
 
-    frame: int = Field(description="The newest committed frame: the lives are told up to it.")
+    frame: int = Field(description="The newest committed frame, up to which the lives are known.")
     gaussians: list[GaussianModel]
 
 

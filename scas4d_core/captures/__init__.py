@@ -33,7 +33,7 @@ __all__ = [
 
 
 def open_capture(folder: Path | str, **options: Any) -> Capture:
-    """Opens a capture of any known layout; the files in the folder tell the layout.
+    """Opens a capture of any known layout; the files in the folder determine the layout.
 
     Args:
         folder: of the capture.

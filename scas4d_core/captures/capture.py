@@ -163,7 +163,7 @@ class Capture:
         return replace(self, full_rig=Rig(train), full_test_rig=Rig(held + others))
 
     def measured_on_training(self, rig: Rig | None = None) -> Capture:
-        """The same capture with its training cameras for test cameras: tells how well seen pictures are met.
+        """The same capture with its training cameras for test cameras: measures how well training pictures are met.
 
         Args:
             rig: these cameras as a scene has refined them; None: as they are.

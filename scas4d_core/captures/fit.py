@@ -28,7 +28,7 @@ def fitted_intrinsics(
     """Intrinsics [3, 3] for pictures of another size than a camera was calibrated for, and a remark that says so.
 
     A picture of the calibrated shape was resized: intrinsics scale with it. One of another shape may have been cut in
-    more than one way, and the file does not tell in which: it is refused unless `fit` says.
+    more than one way, and the file does not say in which: it is refused unless `fit` says.
 
     Args:
         intrinsics: [3, 3] in pixels, principal point from the upper left corner.

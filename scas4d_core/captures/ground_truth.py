@@ -144,7 +144,7 @@ def read_ground_truth(folder: Path, frame_count: int, sizes: Mapping[str, tuple[
 
 
 def read_extent(folder: Path) -> float | None:
-    """Longest side of the box of the foreground over the sequence, user's units, where ``scene.json`` tells it."""
+    """Longest side of the box of the foreground over the sequence, user's units, where ``scene.json`` has it."""
     path = folder / "scene.json"
     value = read_json(path).get("extent") if path.exists() else None
     if value is None:

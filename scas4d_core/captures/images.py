@@ -4,7 +4,7 @@ Content of a picture file, and its treatment:
 
 ======================  ====================================================================================
 EXIF orientation ≠ 1    refused: the intrinsics of a calibrated camera belong to one orientation of the pixels,
-                        and the file does not tell which one the calibration used
+                        and the file does not say which one the calibration used
 alpha (also palette)    composited over black, in the values of the file: the empty background of a capture
 grey                    replicated to three channels
 16 bit                  to 8 bit by value / 257: grey exactly, colour by its high byte (within one level of that)
@@ -235,7 +235,7 @@ def mixed_colours(grey: Mapping[str, bool]) -> list[str]:
 
 
 def grey_among(images: Mapping[str, NDArray[np.uint8]]) -> list[str]:
-    """Names of the grey pictures, where others have colours; a picture without any contrast tells nothing.
+    """Names of the grey pictures, where others have colours; a picture without contrast counts for nothing.
 
     Args:
         images: [H, W, 3] by camera. Sensors of colour cameras have noise: no picture of theirs is grey in every pixel.

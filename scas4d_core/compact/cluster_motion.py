@@ -32,7 +32,7 @@ SMALLEST = 1e-9
 STILL = (1.0, 0.0, 0.0, 0.0)
 """No turn."""
 RIDGE = 1e-3
-"""Pull of A to zero, in parts of the Gaussians' own size: a cluster that is flat or thin tells nothing across."""
+"""Pull of A to zero, in units of the Gaussians' size: a flat or thin cluster does not determine A across its plane."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +137,7 @@ class ClusterMotion:
         moments[:, 3, 3] += 1e-12 + (moments[:, 3, 3] == 0)
         try:
             maps = np.asarray(np.linalg.solve(moments, right.transpose(2, 0, 1)), np.float64)
-        except np.linalg.LinAlgError:  # numbers near the ends of float64: all is told as each Gaussian's own
+        except np.linalg.LinAlgError:  # numbers near the ends of float64: every Gaussian is coded by itself
             maps = np.zeros((clusters.count, 4, 3))
         maps[~np.isfinite(maps).all(axis=(1, 2))] = 0
         return cls(np.ascontiguousarray(maps[:, :3].transpose(0, 2, 1)), maps[:, 3])

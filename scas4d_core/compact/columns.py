@@ -15,7 +15,7 @@ Array = NDArray[np.float32]
 Float = NDArray[np.float64]
 
 LABELS = 64
-"""Levels of the learnt label; 0.5, which tells what moves, is between two."""
+"""Levels of the learnt label; the threshold of moving Gaussians, 0.5, lies between two."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ class EncoderState:
 
     Attributes:
         head: of the file. records: up to the last state. record: the record of that. state: that, as it is read.
-        born, clusters: of all Gaussians so far, as they were told. since_key: states since the last key.
+        born, clusters: of all Gaussians so far, as they were coded. since_key: states since the last key.
     """
 
     head: FileHeader

@@ -1,4 +1,4 @@
-"""One state as bytes, told by a reference that the reader has: cluster motion, and what each Gaussian has of its own.
+"""One state as bytes, coded against a reference that the reader has: cluster motion, and residuals of each Gaussian.
 
 The reference is a decoded state, so errors do not add up: what one frame leaves wrong, the next one sees. Numpy only.
 """
@@ -33,7 +33,7 @@ Array = NDArray[np.float32]
 Float = NDArray[np.float64]
 
 FLAT = 0.1
-"""A decoded Gaussian whose volume is not between this part of the true one and its inverse is told exactly: thin ones,
+"""A decoded Gaussian whose volume is not between this part of the true one and its inverse is coded exactly: thin ones,
 whose error in an axis is as large as the axis, would lose their volume or turn inside out."""
 SLACK = 1 + 1e-4
 """On bounds, for the rounding of float32."""
@@ -114,12 +114,12 @@ def encode(reference: Columns, state: Columns, clusters: Clusters, bounds: Bound
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """Changes that the body of one state tells.
+    """Changes that the body of one state encodes.
 
     Attributes:
         steps: of A and t. motion: [12, clusters] in these steps.
         residuals: of each attribute, [R] rows and [P, R] whole steps.
-        rows, values: what is told exactly, [E] and [12, E]. retired, environment: None where they are as before.
+        rows, values: what is coded exactly, [E] and [12, E]. retired, environment: None where they are as before.
     """
 
     steps: tuple[float, float]
@@ -202,8 +202,8 @@ def after(reference: Columns, clusters: Clusters, bounds: Bounds, changes: Seque
         return reference
     chosen = clusters.labels > 0
     for change in changes:
-        for told in (change.rows, *(change.residuals[name][0] for name in SHAPE)):
-            chosen[told] = True
+        for coded in (change.rows, *(change.residuals[name][0] for name in SHAPE)):
+            chosen[coded] = True
     rows, places = np.flatnonzero(chosen), np.cumsum(chosen) - 1
     state, own = reference.rows(rows), clusters.rows(rows)
     for change in changes:
@@ -247,14 +247,14 @@ def _unlike(decoded: Columns, state: Columns) -> dict[str, float]:
 
 
 def _whole(reference: Columns, clusters: Clusters) -> bool:
-    """True where all rows are told: if all move, or have gloss, a search for those that stand only takes time."""
+    """True where all rows are coded: if all move, or have gloss, a search for those that stand only takes time."""
     return reference.gloss is not None or bool(clusters.labels.all())
 
 
 def _changing(
     reference: Columns, state: Columns, clusters: Clusters, bounds: Bounds
 ) -> tuple[NDArray[np.intp] | None, dict[str, float]]:
-    """[E] the Gaussians whose shape or place is told: they move, or are off by more than the bounds; None for all.
+    """[E] the Gaussians whose shape or place is coded: they move, or are off by more than the bounds; None for all.
 
     Returns:
         And the largest errors of the others.
@@ -310,7 +310,7 @@ def completed(
     retired: NDArray[np.bool_] | None = None,
     environment: Array | None = None,
 ) -> Columns:
-    """A state with what is told exactly: centres and axes [12, E] of some rows, who is retired, what is mirrored.
+    """A state with what is coded exactly: centres and axes [12, E] of some rows, who is retired, what is mirrored.
 
     Args:
         rows, values: None for no rows. retired, environment: None where the state's own hold.

@@ -58,7 +58,7 @@ def read_index(file: BinaryIO, name: str) -> tuple[list[Record], dict[str, Any]]
 def _parsed(body: bytes, end: int) -> tuple[list[Record], dict[str, Any]] | None:
     (count,) = _COUNT.unpack_from(body)
     size = zstandard.frame_content_size(body[_COUNT.size :])
-    if not count * _ROW.itemsize <= size <= end:  # a table is never longer than the records it tells of
+    if not count * _ROW.itemsize <= size <= end:  # a table is never longer than the records that it lists
         return None
     data = inflated(body[_COUNT.size :], size)
     rows = np.frombuffer(data, _ROW, count)

@@ -40,7 +40,7 @@ STATES = (RecordKind.KEY, RecordKind.DELTA)
 AT_ONCE = 8
 """States whose changes are held at a time."""
 MOST_PER_BYTE = 4
-"""Gaussians for each byte that tells of them; a count that lies must not fill the memory."""
+"""Gaussians per byte at most; a wrong count must not fill the memory."""
 
 
 class CompactReader:
@@ -177,10 +177,10 @@ class CompactReader:
 
         Returns:
             The frames of the copy, up to the first that is damaged. It begins with this file's first frame and the key
-            before ``first``, by which the others are told.
+            before ``first`` that the others depend on.
 
         Raises:
-            FileError: no frame lies between. DamagedFileError: the first of them, or what tells it, is damaged.
+            FileError: no frame lies between. DamagedFileError: the first, or a record that it depends on, is damaged.
         """
         wanted = [place for place, index in enumerate(self._frames) if first <= index <= last]
         if not wanted:
@@ -227,13 +227,13 @@ class CompactReader:
         """All that a writer needs to go on after the last state; there has to be one."""
         place = len(self._states) - 1
         self.state(self._frames[place])
-        told, columns = self._states[place], self._last
+        record, columns = self._states[place], self._last
         assert columns is not None
-        born, clusters = self._born_by(told.frame)
+        born, clusters = self._born_by(record.frame)
         key = next(i for i in range(place, -1, -1) if i == 0 or self._states[i].kind is RecordKind.KEY)
-        behind = (told.end, *(one.end for one in self._parts if one.frame == told.frame))
+        behind = (record.end, *(one.end for one in self._parts if one.frame == record.frame))
         records = tuple(one for one in self._records if one.end <= max(behind))
-        return EncoderState(self.head, records, told, columns[1], born, clusters, place - key)
+        return EncoderState(self.head, records, record, columns[1], born, clusters, place - key)
 
     def sizes(self) -> list[tuple[int, int, int]]:
         """Index, bytes of the file since the state before, and checksum of the state, of each frame."""
@@ -241,7 +241,7 @@ class CompactReader:
         return [(one.frame, one.end - before, one.checksum) for one, before in zip(self._states, ends, strict=False)]
 
     def end_before(self, index: int) -> int:
-        """Bytes of the file up to what tells of a frame."""
+        """Bytes of the file up to the records of a frame."""
         return min(one.offset - HEAD_SIZE for one in self._records if one.frame >= index)
 
     def note(self, index: int) -> dict[str, Any]:
@@ -299,24 +299,24 @@ class CompactReader:
             raise self._damaged(self._states[places[-1]], error) from None
 
     def _change(self, place: int, reference: Columns, clusters: Clusters) -> Change:
-        """Changes that the record of a state tells."""
+        """Changes that the record of a state encodes."""
         record = self._states[place]
         body = read_body(self._file, record, self.path.name)
         if record.kind is RecordKind.DELTA:
-            told = checksum_bytes(self._states[place - 1])
-            if body[: len(told)] != told:
+            expected = checksum_bytes(self._states[place - 1])
+            if body[: len(expected)] != expected:
                 raise self._damaged(record, PlaneError("the state before it is another one"))
-            body = body[len(told) :]
+            body = body[len(expected) :]
         try:
             return Change.read(body, reference, clusters)
         except ValueError as error:
             raise self._damaged(record, error) from None
 
     def _born_by(self, index: int) -> tuple[Columns, Clusters]:
-        """All Gaussians that are born by a frame, as they were told then, and their clusters."""
+        """All Gaussians that are born up to a frame, as they were coded then, and their clusters."""
         wanted = [record for record in self._births if record.frame <= index]
         if not wanted:
-            raise DamagedFileError(f"{self.path.name}: the Gaussians of frame {index} are not told")
+            raise DamagedFileError(f"{self.path.name}: the Gaussians of frame {index} are missing")
         count = len(wanted)
         known, state, clusters = (0, None, None) if self._born is None or self._born[0] > count else self._born
         for number in range(known, count):

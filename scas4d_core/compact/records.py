@@ -1,6 +1,6 @@
 """Records of a compact file: a head with checksum, so that a file is listed without its bodies, and a body with one.
 
-A file is read while it is written: what is not whole at its end is not there yet. What is damaged before is told with
+A file is read while it is written: what is not whole at its end is not there yet. Earlier damage is reported with
 its place.
 """
 
@@ -36,9 +36,9 @@ class RecordKind(IntEnum):
     BORN = 2
     """Gaussians without a reference: those of the first frame, or born in this one."""
     KEY = 3
-    """A state, told by the born."""
+    """A key state, coded against the newborn Gaussians."""
     DELTA = 4
-    """A state, told by the one before."""
+    """A state, coded against the one before."""
     PARTS = 5
     """A part of each Gaussian."""
     INDEX = 6

@@ -1,4 +1,4 @@
-"""A state as far as it is told: attribute by attribute, in whole steps of what the bounds allow. Numpy only."""
+"""A state that is decoded attribute by attribute, in whole steps of what the bounds allow. Numpy only."""
 
 from __future__ import annotations
 
@@ -32,18 +32,18 @@ SCALE_STEP = 0.08
 MARGIN = 0.95
 """Of steps that are parts of a size, for that."""
 LARGEST = 1 << 30
-"""Residuals from here on, in steps, are told exactly, as are numbers that are not finite."""
+"""Residuals from here on, in steps, are coded exactly, as are numbers that are not finite."""
 SHAPE = ("sizes", "rotations", "factors", "means")
-"""What is told first, in this order: each helps the next."""
+"""Attributes that are coded first, in this order: each helps the next."""
 
 
 def looks(state: Columns) -> tuple[str, ...]:
-    """Attributes that are told after the shape, each by itself."""
+    """Attributes that are coded after the shape, each by itself."""
     return ("colours", "foreground") if state.gloss is None else ("colours", "foreground", "gloss")
 
 
 def coded_shape(state: Columns, name: str) -> tuple[int, int]:
-    """Components and rows of what is told of an attribute."""
+    """Components and rows of an attribute that are coded."""
     if name == "gloss" and state.gloss is not None:
         return 3, state.gloss.shape[1]
     return {"sizes": 1, "factors": 9, "foreground": 1}.get(name, 3), len(state)
@@ -51,19 +51,19 @@ def coded_shape(state: Columns, name: str) -> tuple[int, int]:
 
 @dataclass(frozen=True, eq=False)
 class DecodedState:
-    """A state as far as it is told: what clusters foretell, and attributes one after the other.
+    """A partly decoded state: the prediction of the clusters, and attributes one after the other.
 
-    What comes first helps the next: axes turn with the rotation, and steps are parts of the told size.
+    What comes first helps the next: axes turn with the rotation, and steps are parts of the decoded size.
     """
 
     bounds: Bounds
     state: Columns
     sizes: Array
-    """[N] metres, as they are told so far."""
+    """[N] metres, as decoded so far."""
 
     @classmethod
     def of(cls, bounds: Bounds, state: Columns) -> DecodedState:
-        """A state of which nothing is told but what its clusters foretell."""
+        """The prediction of the clusters, before any residual is decoded."""
         return cls(bounds, state, state.sizes())
 
     def _step(self, name: str) -> Array | np.float32:
@@ -113,7 +113,7 @@ class DecodedState:
         factors = np.stack(mapped(rotation_rows(turns), self.state.factors))
         rotations = products(turns, self.state.rotations)
         rotations /= np.sqrt(np.square(rotations).sum(axis=0))
-        # What does not turn keeps its bits, whichever other rows are told with it.
+        # What does not turn keeps its bits, whichever other rows are coded with it.
         rotations = np.where(vectors.any(axis=0), rotations, self.state.rotations)
         return replace(self, state=self.state.having(rotations=rotations, factors=factors))
 

@@ -15,7 +15,7 @@ Floats = NDArray[np.float32]
 SPARSE = 0.6
 """Where a smaller share of the rows changed, a mask says which."""
 NONE, ALL, SOME = 0, 1, 2
-"""First byte of a section: nothing is told, of all rows, or of those that a mask names."""
+"""First byte of a section: values of no row, of all rows, or of the rows in a mask."""
 LARGEST_ARRAY = 1 << 24
 """Bytes; no exact array is larger."""
 
@@ -47,8 +47,8 @@ def write_residuals(planes: Ints, rows: NDArray[np.intp] | None = None, total: i
 
 def read_residuals(body: bytes, offset: int, components: int, rows: int) -> tuple[Ints, int]:
     """[components, rows] residuals of a section, and where it ends; raises PlaneError."""
-    chosen, told, offset = read_coded_rows(body, offset, components, rows)
-    return scattered(chosen, told, rows), offset
+    chosen, values, offset = read_coded_rows(body, offset, components, rows)
+    return scattered(chosen, values, rows), offset
 
 
 def scattered(rows: NDArray[np.intp], planes: Ints, total: int) -> Ints:
@@ -80,12 +80,12 @@ def read_coded_rows(body: bytes, offset: int, components: int, rows: int) -> tup
 
 
 def write_mask(mask: NDArray[np.bool_] | None) -> bytes:
-    """[N] bool, a bit each; None: nothing is told."""
+    """[N] bool, a bit each; None: unchanged."""
     return bytes([NONE]) if mask is None else bytes([SOME]) + _sized(deflated(np.packbits(mask).tobytes()))
 
 
 def read_mask(body: bytes, offset: int, rows: int) -> tuple[NDArray[np.bool_] | None, int]:
-    """[rows] bool of a section, None where nothing is told, and where it ends."""
+    """[rows] bool of a section, None where it is unchanged, and where it ends."""
     kind, offset = _read_kind(body, offset)
     return (None, offset) if kind == NONE else _read_bits(body, offset, rows)
 
@@ -96,7 +96,7 @@ def _read_bits(body: bytes, offset: int, rows: int) -> tuple[NDArray[np.bool_], 
 
 
 def write_array(array: NDArray[Any] | None) -> bytes:
-    """A float32 array of any shape, exactly; None: nothing is told."""
+    """A float32 array of any shape, exactly; None: unchanged."""
     if array is None:
         return bytes([NONE])
     shape = struct.pack(f"<B{array.ndim}I", array.ndim, *array.shape)
@@ -104,7 +104,7 @@ def write_array(array: NDArray[Any] | None) -> bytes:
 
 
 def read_array(body: bytes, offset: int) -> tuple[Floats | None, int]:
-    """The array of a section, None where nothing is told, and where it ends."""
+    """The array of a section, None where it is unchanged, and where it ends."""
     kind, offset = _read_kind(body, offset)
     if kind == NONE:
         return None, offset
@@ -122,7 +122,7 @@ def read_array(body: bytes, offset: int) -> tuple[Floats | None, int]:
 
 
 def write_exact(rows: NDArray[np.intp], values: NDArray[Any]) -> bytes:
-    """[E] rows with [P, E] float32 values that are told exactly."""
+    """[E] rows with [P, E] float32 values that are coded exactly."""
     if not len(rows):
         return bytes([NONE])
     data = rows.astype("<u4").tobytes() + values.astype("<f4").tobytes()
@@ -138,11 +138,11 @@ def read_exact(body: bytes, offset: int, most: int, width: int) -> tuple[NDArray
         raise PlaneError(f"the data end at byte {len(body)}, within a count")
     (count,) = struct.unpack_from("<I", body, offset)
     if not 0 < count <= most:
-        raise PlaneError(f"{count} of {most} rows cannot be told exactly")
+        raise PlaneError(f"{count} of {most} rows cannot be coded exactly")
     data, offset = _read_sized(body, offset + 4, 4 * count * (1 + width))
     rows = np.frombuffer(data, "<u4", count).astype(np.intp)
     if int(rows.max()) >= most:
-        raise PlaneError(f"row {int(rows.max())} of {most} is told")
+        raise PlaneError(f"row {int(rows.max())} of {most} is coded")
     values = np.frombuffer(data, "<f4", count * width, 4 * count).reshape(width, count).astype(np.float32)
     return rows, values, offset
 

@@ -157,8 +157,10 @@ class CompactWriter:
             key = self._since_key + 1 >= self._key_every
             self._since_key = 0 if key else self._since_key + 1
             coded = encode(born if key else before, columns, self._clusters, self.head.bounds)
-            told = b"" if key else checksum_bytes(self._record)  # a reader must not tell it by another state
-            records.append((RecordKind.KEY if key else RecordKind.DELTA, told + coded.body))
+            reference = (
+                b"" if key else checksum_bytes(self._record)
+            )  # a reader must not decode it against another state
+            records.append((RecordKind.KEY if key else RecordKind.DELTA, reference + coded.body))
             decoded, errors = coded.decoded, coded.errors
         if note is not None:
             records.insert(0, (RecordKind.NOTE, note_bytes({**note, ERRORS: dict(errors)})))

@@ -1,7 +1,7 @@
 """Processes that compile kernels side by side, and those who wait for them.
 
 Each process of a crew takes the first kernel that nobody compiles, until none is left. At most one process a core
-compiles for one cache at a time, whoever started it: service, tests, commands. Which process compiled a kernel changes
+compiles for one cache at a time, for service, tests and commands alike. Which process compiled a kernel changes
 no bit of its results.
 """
 

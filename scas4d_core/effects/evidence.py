@@ -50,7 +50,7 @@ class FrameObservation:
         index: of the frame. before: Θ_{t−1}. result: Θ_t, the trace of its update, arrays of the effects.
         rig: the cameras inside, as they were posed. views: that were learnt from. renderer: draws states of the scene.
         room: Gaussians that may still be born in the scene. time: for fitting them.
-        suspects: views that were not learnt from, of cameras that are set aside.
+        suspects: views that were not learnt from, of excluded cameras.
     """
 
     index: int

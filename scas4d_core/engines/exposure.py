@@ -21,7 +21,7 @@ MIDDLE = np.float32(0.5)
 LOOKED_AT = 4096
 """Pixels of a picture that are looked at, about: rows and columns apart; the median of more is the same."""
 DARK, SATURATED = 0.05, 0.985
-"""Values, 0…1, between which a pixel tells a gain: darker ones are on the curve's straight part, and noise."""
+"""Values, 0…1, between which a pixel measures a gain: darker ones are on the curve's straight part, and noise."""
 PIXELS = 100
 """Such pixels, at least; else the camera's gain stays."""
 SHARE = 0.5
@@ -30,7 +30,7 @@ eight rounds, so they have followed a drift at its end, and a round that measure
 LARGEST = 2.0
 """Of a gain's a, and the inverse the smallest: 5 times the light; more is a camera that shows something else."""
 CAMERAS = 4
-"""At least, of which gains can be told from colours that a few cameras see."""
+"""Cameras at least, for gains that differ from colours which few cameras see."""
 ENOUGH = 0.5
 """Share of the rig's cameras from which a frame teaches gains: between a few, each one's faults pass for gains."""
 
@@ -56,9 +56,9 @@ def measured_gain(picture: Array, shown: Array) -> Array:
     every = max(1, int(sqrt(picture[0].size / LOOKED_AT)))
     for channel in range(3):
         here, there = picture[channel, ::every, ::every], shown[channel, ::every, ::every]
-        tells = (here > DARK) & (here < SATURATED) & (there > DARK) & (there < SATURATED)
-        if np.count_nonzero(tells) >= PIXELS:
-            gain[channel] = np.median((here[tells] + FOOT) / (there[tells] + FOOT))
+        usable = (here > DARK) & (here < SATURATED) & (there > DARK) & (there < SATURATED)
+        if np.count_nonzero(usable) >= PIXELS:
+            gain[channel] = np.median((here[usable] + FOOT) / (there[usable] + FOOT))
     return gain
 
 

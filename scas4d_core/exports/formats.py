@@ -25,7 +25,7 @@ class Format:
         numbered: a sequence is a numbered file a frame; else it is one file.
         needs_parts: it cannot be written without parts.
         axes, unit: of positions. colour: its space and form. scale, opacity: linear, or their logarithm or logit.
-        shape: how a covariance is told. ids: where the ids are, or "lost". lost: what a reader cannot get back.
+        shape: how a covariance is encoded. ids: where the ids are, or "lost". lost: what a reader cannot get back.
         package: to be installed beside those that a reconstruction needs, or "".
     """
 
@@ -159,10 +159,10 @@ _FORMATS = (
         name="s4d",
         suffixes=(".s4d",),
         numbered=False,
-        axes="x right, y down, z forward, from the `origin` that the head tells",
-        unit="metre; the head tells `metres_per_unit`",
+        axes="x right, y down, z forward, from the `origin` in the header",
+        unit="metre; the header has `metres_per_unit`",
         colour="sRGB; gloss as it is",
-        scale="by the factor, within bounds that the head tells ([format.md](format.md))",
+        scale="by the factor, within bounds in the header ([format.md](format.md))",
         opacity="linear",
         shape="the factor F, Σ = F Fᵀ, and the material rotation",
         ids="kept",

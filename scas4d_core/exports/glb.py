@@ -56,7 +56,7 @@ class Binary:
         Args:
             array: [N, …] of a dtype in ``COMPONENTS`` and N ≥ 1; its rows must fill a multiple of 4 bytes where it
                 holds vertices.
-            vertices: whether it is an attribute of a primitive. bounds: whether min and max are told, as glTF asks
+            vertices: whether it is an attribute of a primitive. bounds: whether min and max are written, as glTF asks
                 for positions and times. normalized: whether integers stand for 0…1.
         """
         given = np.ascontiguousarray(array)

@@ -101,7 +101,7 @@ def splat_primitive(binary: Binary, cloud: Cloud) -> dict[str, Any]:
 
 
 def asset_extras(world: WorldFrame) -> dict[str, Any]:
-    """Tells how the file's world lies to the user's: position · (1, −1, −1) / ``metres_per_unit``.
+    """Describes how the file's world relates to the user's: position · (1, −1, −1) / ``metres_per_unit``.
 
     >>> asset_extras(WorldFrame(np.zeros(3), metres_per_unit=0.01))["metres_per_unit"]
     0.01

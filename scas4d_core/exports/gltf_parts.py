@@ -5,7 +5,7 @@ Each node has the Gaussians of the first frame in the part's own frame, and an a
 Axes, units and attributes are those of ``gltf``. Lost are bending within a part, Gaussians that are born later, changes
 of colour and size, and that highlights stay with the world: here they turn with the part.
 
-``extras`` of a node tell what the rigid motion leaves: ``residual_rms``, the weighted RMS distance between the rigid
+``extras`` of a node report what the rigid motion leaves: ``residual_rms``, the weighted RMS distance between the rigid
 prediction and the means over all frames after the first, ``residual_worst``, that of the worst frame, and its index
 ``worst_frame``. They are in the user's units, and ``…_percent`` in percent of the extent of what moves.
 """

@@ -61,7 +61,7 @@ class PartMotion:
 
     Attributes:
         parts: the labels that have a Gaussian in the first frame, rising.
-        extent: of what moves in the first frame, user's units; residuals are also told in percent of it.
+        extent: of the moving Gaussians in the first frame, user's units; residuals are also given in percent of it.
 
     Raises:
         InputError: labels of another shape, or no Gaussian of the first frame belongs to a part.

@@ -82,7 +82,7 @@ def export_sequence(
         ids: the Gaussians of ``tracks``; None: all that move.
         frames_per_second: of USD's time codes; None: by the first two frames.
         background: RGB in 0…1 behind everything; only ``s4d`` has it.
-        progress: told each frame.
+        progress: called with each frame.
 
     Returns:
         The paths of the numbered files, or of the one file.

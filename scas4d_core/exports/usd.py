@@ -2,12 +2,12 @@
 
 ``/World/Gaussians`` has one fixed set of Gaussians for all frames: opacity is 0 before the birth of one and while it is
 retired. By the schema, scales and opacities are linear, harmonics lie together by Gaussian. Colours are values of
-pictures (sRGB); the schema has no place for that, so ``colorSpace`` of the harmonics tells it. ``primvars:scas4d:id``
+pictures (sRGB); the schema has no place for that, so ``colorSpace`` of the harmonics names it. ``primvars:scas4d:id``
 and ``primvars:scas4d:part`` have the ids and the parts. ``/World/Parts/part_k`` are Xforms with the rigid motion of
 each part since the first frame, and its residual (``part_motion``). ``/World/Tracks`` are the centres of up to
 ``MOST_TRACKS`` moving Gaussians as UsdGeomPoints, a guide. ``/World/Cameras`` are those of the rig.
 
-The stage is y up: the user's world is turned by 180° about x. Its unit is the user's, ``metersPerUnit`` tells it. A
+The stage is y up: the user's world is turned by 180° about x. Its unit is the user's, ``metersPerUnit`` gives it. A
 time code is seconds since the first frame times ``timeCodesPerSecond``.
 
 Frames are saved one by one, so that memory does not grow with their number; a copy beside the target takes the room
@@ -50,7 +50,7 @@ REACH = 3.0
 COLOUR_SPACE = "srgb_rec709_scene"
 """USD's name for the primaries and the curve of sRGB."""
 DEFAULT_RATE = 24.0
-"""Time codes a second where nothing tells a rate, as with a single frame; USD's own default."""
+"""Time codes per second where there is no rate, as with a single frame; USD's own default."""
 
 
 class UsdSequence:
@@ -254,17 +254,17 @@ class UsdSequence:
             residual.Set(pose.residual, code)
 
     def _complete(self) -> None:
-        """Lengthens early samples, tells ids, parts and the range of time."""
+        """Lengthens early samples, writes ids, parts and the range of time."""
         for channel in self._channels.values():
             for _ in channel.lengthen():
                 self._layer.Save()
             channel.settle()
         primvars = self._geometry.PrimvarsAPI(self._stage.GetPrimAtPath("/World/Gaussians"))
-        told = {"scas4d:id": (self._sdf.ValueTypeNames.Int64Array, self._vt.Int64Array.FromNumpy(self._ids))}
+        attributes = {"scas4d:id": (self._sdf.ValueTypeNames.Int64Array, self._vt.Int64Array.FromNumpy(self._ids))}
         if self._labels is not None:
             parts = part_labels(self._labels, len(self._ids)).astype(np.int32)
-            told["scas4d:part"] = (self._sdf.ValueTypeNames.IntArray, self._vt.IntArray.FromNumpy(parts))
-        for name, (kind, values) in told.items():
+            attributes["scas4d:part"] = (self._sdf.ValueTypeNames.IntArray, self._vt.IntArray.FromNumpy(parts))
+        for name, (kind, values) in attributes.items():
             primvars.CreatePrimvar(name, kind, self._geometry.Tokens.vertex).Set(values)
         self._stage.SetTimeCodesPerSecond(self._rate or DEFAULT_RATE)
         self._stage.SetFramesPerSecond(self._rate or DEFAULT_RATE)

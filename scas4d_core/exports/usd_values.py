@@ -24,7 +24,7 @@ NEAREST, FARTHEST = 0.01, 1000.0
 
 
 class AnimatedValues:
-    """Samples of one attribute with a value a Gaussian; a sample is written only where it tells something new.
+    """Samples of one attribute with a value a Gaussian; a sample is written only where the value changes.
 
     USD interpolates between samples, so before a change the value of the frame before is written as well. Gaussians
     that are born later make a sample longer: earlier ones are lengthened in the end (``lengthen``).

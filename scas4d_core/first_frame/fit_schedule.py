@@ -33,7 +33,7 @@ FEWER = 0.05
 in what the seed does. The sample at half size, two seeds each: 35.33 dB, with 5, 10 and 20 % fewer 35.20, 35.29 and
 35.24, with half of them 35.03; *cloth* at half size, one seed: 28.91 dB, with 5 and 20 % fewer 28.91 and 28.88."""
 VARIED = 1.3
-"""Ratio of numbers of Gaussians from which the cost of one can be told from that of the pixels."""
+"""Ratio of numbers of Gaussians from which the cost of one can be separated from that of the pixels."""
 
 
 @dataclass(frozen=True)

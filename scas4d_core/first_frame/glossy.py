@@ -32,7 +32,7 @@ Array = NDArray[np.float32]
 TRIAL = 0.15
 """Share of the iterations after which the trial is made: there is a surface, and little has been made up behind it."""
 FEWEST_ITERATIONS = 100
-"""Of a fit, from which a part of it can tell what colours alone will not explain."""
+"""Of a fit, after which its residual shows what colours alone will not explain."""
 FEWEST_VIEWS = 12
 """For the trial: of fewer cameras each has highlights that no other sees beside it, and anything explains them."""
 HURRIED = 1.5

@@ -68,7 +68,7 @@ def settle(
     """Moves what enters a layer through it, for as long as it rests: ``entering`` then enters the layer below.
 
     Args:
-        layer: not the last. entering: [B, 13 · 16] in place, see ``deform``, which tells of the others, too; of points
+        layer: not the last. entering: [B, 13 · 16] in place, see ``deform``, which describes the others, too; of points
             and sums those of the layer below are filled, of tables those of its clusters.
     """
     blocks = clusters.shape[0]

@@ -40,7 +40,7 @@ CHANGED = 0.1
 STILL_LEVELS = 6
 """Of 255: the true pictures' own noise; a pixel that stays within them in every channel does not change."""
 FEWEST_STILL = 500
-"""Still pixels over all test cameras from which flicker is told; fewer are chance."""
+"""Still pixels over all test cameras from which flicker is measured; fewer are chance."""
 
 Scores = dict[str, float | None]
 

@@ -16,7 +16,7 @@ BYTES_AT_ONCE = 64e6
 NOT_THERE = -1e9
 """Logarithm of the opacity of a retired Gaussian: it carries nothing, wherever it was."""
 LEAST_THERE = 0.05
-"""Of the weight of a point's carriers, that has to be there: the few at its edge do not tell where it is."""
+"""Of the weight of a point's carriers, that has to be there: the few at its edge do not determine its place."""
 
 
 def carriers(

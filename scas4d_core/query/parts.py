@@ -34,7 +34,7 @@ ROWS_AT_ONCE = 8192
 LAMBDA_POSITION = 0.25
 """λp, of p over time; p in units of the extent."""
 LAMBDA_ROTATION = 1.0
-"""λR, of the entries of R over time; a turn of angle a moves them by 2.8 sin(a/2). Rotation tells parts apart,
+"""λR, of the entries of R over time; a turn of angle a moves them by 2.8 sin(a/2). Rotation separates parts,
 position only those that turn alike: with more of it long parts are cut across."""
 LAMBDA_INITIAL = 0.25
 """λp0, of p at the first frame, repeated as in the paper."""
@@ -61,11 +61,11 @@ def parts(
 ) -> NDArray[np.int64]:
     """Part labels of all Gaussians, [N] int64: 0…count−1, the largest part first; −1 for those that do not move.
 
-    The newest committed frame tells which Gaussians move. A Gaussian weighs by its opacity times the area of its two
+    The newest committed frame decides which Gaussians move. A Gaussian weighs by its opacity times the area of its two
     longest axes, about its area in a picture, so that swarms of small ones do not decide the borders.
 
     Args:
-        history: at least one committed frame; with a single frame only its positions tell parts apart.
+        history: at least one committed frame; with a single frame only its positions separate parts.
         count: of parts; None: the count from 2 to ``MOST_PARTS`` with the largest mean silhouette
             (Rousseeuw 1987) on up to 1,000 Gaussians.
         previous: [N] labels found from fewer frames with the same ``count`` (or None). Parts that continue keep their

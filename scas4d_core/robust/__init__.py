@@ -2,5 +2,5 @@
 
 ``solve_frame`` runs the update and decides; ``checks`` looks at the pictures before (black, repeated, exposed
 otherwise) and at the state after, ``outliers`` at how well each camera was met, and ``relocation`` finds an object
-that jumped. ``timing`` tells which cameras are out of step, and changes nothing.
+that jumped. ``timing`` measures which cameras are out of step, and changes nothing.
 """

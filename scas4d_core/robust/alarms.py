@@ -1,6 +1,6 @@
-"""Alarms tell a person what to look at after a frame. They are made here alone, and only shown everywhere else.
+"""Alarms point a person to what needs a look after a frame. They are made here alone, and only shown everywhere else.
 
-They are told from the figures that an update has anyway. A camera is compared with its own past and with the other
+They are derived from the figures that an update has anyway. A camera is compared with its own past and with the other
 cameras of the frame, so what all see together is no camera's fault. One frame may be noise: what is not far off has to
 stay so for two. The thresholds were read off the captures: docs/stability.md has the distributions.
 """
@@ -37,7 +37,7 @@ DARKEST = 0.02
 FLAT = 0.5
 """Levels of 255, mean difference of neighbouring pixels, below which a picture has no sharpness."""
 ROWS = 64
-"""Of a picture, about, that its sharpness is told from."""
+"""Pixels of a picture, about, from which its sharpness is measured."""
 COLOURS = ("red", "green", "blue")
 
 Numbers = NDArray[np.float64]
@@ -45,7 +45,7 @@ Numbers = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Watch:
-    """Figures that the alarms of one camera are told from.
+    """Figures from which the alarms of one camera are derived.
 
     Attributes:
         colours: [3] usual ``colours_of``, less the median over the cameras; NaN where not known. sharp: usual
@@ -101,13 +101,13 @@ def alarms_of(
     if outcome.rejected or not offsets:
         return found, after  # nothing that a camera could be held against
     watch, raised = dict(after.watch), dict[AlarmKind, dict[str, Alarm]]()
-    beside, told = _beside(colours), {name: Watch.of(past, name) for name in sharp}
-    changes = {name: value - told[name].sharp for name, value in sharp.items()}
+    beside, watches = _beside(colours), {name: Watch.of(past, name) for name in sharp}
+    changes = {name: value - watches[name].sharp for name, value in sharp.items()}
     common = float(np.nanmedian(list(changes.values()))) if not np.isnan(list(changes.values())).all() else 0.0
     few_same = len(same) <= MOST_OUT * count
-    moved = {name: colour - _known(told[name].colours, colour) for name, colour in beside.items() if name in told}
+    moved = {name: colour - _known(watches[name].colours, colour) for name, colour in beside.items() if name in watches}
     spread = _half(tint_of(change) for change in moved.values()), _half(gain_of(change) for change in moved.values())
-    for name, before in told.items():
+    for name, before in watches.items():
         now, alarms = _judged(
             name, before, past, offsets.get(name), beside.get(name), sharp[name], changes[name] - common,
             few_same and name in same, spread,
@@ -250,7 +250,7 @@ def sharpness(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, float]:
 
 
 def first_watched(past: Past, pictures: Mapping[str, NDArray[np.uint8]]) -> Past:
-    """The past after frame 0, with what its pictures tell for the alarms."""
+    """The past after frame 0, with the figures of its pictures for the alarms."""
     return replace(past, watch={name: Watch(sharp=value).row() for name, value in sharpness(pictures).items()})
 
 

@@ -2,7 +2,7 @@
 
 A black frame is finite, and 100 iterations would paint the scene black. Lights flicker, and cameras that choose their
 own exposure do it together: learnt as colours, that would be unlearnt a frame later, so the gain is taken out of the
-pictures. It is read against the scene as it stood: the median over the pixels is that of the many in which nothing but
+pictures. It is measured against the earlier scene: the median over the pixels is that of the many in which nothing but
 the light changed. A light that stays, or that goes on from frame to frame as a lamp that dims, is another one
 (``solve_frame``): then the scene's colours take the gain, and its pictures are as they are.
 
@@ -48,7 +48,7 @@ DARKEST = 1e-3
 """Mean of a picture, 0…1, below which its brightness says nothing."""
 
 DARK = 0.05
-"""Of a channel, 0…1, from which it tells how bright the light is."""
+"""Of a channel, 0…1, from which it measures how bright the light is."""
 PIXELS = 100
 """Of every other row and column that a camera needs to have a say."""
 SATURATED = 0.99
@@ -103,13 +103,13 @@ def check_brightness(past: Past, bright: Mapping[str, float]) -> tuple[float, di
 
 
 def step_of(past: Past, bright: Mapping[str, float]) -> float:
-    """Times that a frame is brighter than the one before, median over the cameras; 1 where too few can tell."""
+    """Brightness over that of the frame before, median over the cameras; 1 where too few pixels are usable."""
     ratios = [value / past.last[name] for name, value in bright.items() if past.last.get(name, 0.0) > DARKEST]
     return float(np.median(ratios)) if len(ratios) >= ENOUGH else 1.0
 
 
 def light_continues(past: Past, bright: Mapping[str, float]) -> bool:
-    """True where a frame's light goes on as it went to the frame before, faster than is told from noise.
+    """True where a frame's light goes on as it went to the frame before, faster than noise explains.
 
     The scene's own light does so, and is followed at once. A flicker comes back, and a jump has no step before it.
     """

@@ -2,7 +2,7 @@
 
 Which basin it ends in is chance: with a bad order it ends 1 to 5 dB below others, and later updates do not find what it
 missed. Orders differ in their rates, too, for what one scene's steps pass over, another's do not reach. The errors of
-the ends in all training views tell which is best; a few small pictures do not (docs/method.md).
+the ends in all training views decide which is best; a few small pictures do not (docs/method.md).
 """
 
 from __future__ import annotations

@@ -76,7 +76,7 @@ class Past:
             that were brighter, or that were darker.
         last: by camera, mean of its picture in the last frame, in whatever light. step: times that the last frame was
             brighter than the one before it.
-        watch: by camera, what its alarms are told from, see ``alarms.Watch``.
+        watch: by camera, what its alarms are derived from, see ``alarms.Watch``.
         timing: by camera, the moments of its pictures, see ``timing.Looks``.
     """
 
@@ -214,7 +214,7 @@ def unmet(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | N
     """Why an update has not met its frame, or None.
 
     Args:
-        psnr: dB by camera when last rendered. iterations: of the update; one that was told to take fewer than the one
+        psnr: dB by camera when last rendered. iterations: of the update; one that took fewer than the one
             before may meet its frame less well. 0: as many.
     """
     if not psnr or past.level != past.level:
@@ -235,7 +235,7 @@ def behind(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | 
 
 
 def _shorter(past: Past, iterations: int) -> float:
-    """DB that an update of so many iterations may be worse by, as it was told to take fewer than the one before."""
+    """DB that an update of so many iterations may be worse by, as it took fewer than the one before."""
     return HALVED_DB * log2(past.iterations / iterations) if 0 < iterations < past.iterations else 0.0
 
 

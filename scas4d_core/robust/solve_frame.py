@@ -153,12 +153,12 @@ class FrameSolver:
         with self._timed():  # what most cameras do not agree on may still have moved
             fits = self._measured(given.views, given.state)
             level = outliers.level_of(given.past, fits)
-        if outliers.misfits(given.past, fits, outliers.LAST_DB):  # an update tells what is wrong with a camera
+        if outliers.misfits(given.past, fits, outliers.LAST_DB):  # an update shows what is wrong with a camera
             return None
         return "nothing is seen to move" if level > given.past.level - outliers.RESTS_DB else None
 
     def _retry_with_light_gain(self, given: UpdateInput) -> Solved | None:
-        """A frame in a light that stays or moves: the colours take it on; None where the cameras tell of no other.
+        """A frame in a light that stays or moves: the colours take it on; None where the cameras show no other.
 
         Where the scene is shown as bright as it was, something new makes the pictures brighter: no reason to hold them.
         """

@@ -29,11 +29,11 @@ LOOKS, ITERATIONS = 4, 25
 HALF = 0.5
 """Of the way of a frame, that what moves is rendered on and back: a camera is off by no more."""
 STEEP = 0.02
-"""Of a value 0…1 in half a frame, from which a pixel's change tells anything: less is noise."""
+"""Of a value 0…1 in half a frame, above which a pixel's change is more than noise."""
 BRIGHT = 0.98
 """Value of a picture from which it may be cut off."""
 FEW, MOST = 50, 1500
-"""Pixels that change: of fewer nothing is told, and of more only so many are asked, about."""
+"""Changing pixels: fewer are not enough, and of more about this many are used."""
 CAUCHY, QUIETEST = 2.4, 1 / 255
 """As those of ``effects.cameras.alignment``: residuals beyond have less weight, and rounding is no residual."""
 SMALLEST = 1e-6
@@ -43,17 +43,17 @@ NEIGHBOURS = 10.0
 USUAL = 0.1
 """Of a frame, that looks of one camera differ by where motion is fast: what it is followed late by, and bends."""
 FARTHEST = 0.75
-"""Of a frame, from which a look says no more than that: what turns back has gone no way that could be told."""
+"""Of a frame, from which a look says no more than that: motion that turns back has no measurable shift."""
 KEEPS = 0.95
-"""Weight of the looks before, at each look: about the last forty tell."""
+"""Weight of the looks before, at each look: about the last forty count."""
 ENOUGH = 2.5
 """Looks of about the same weight, from which a camera's mean is known."""
 CAMERAS = 4
-"""That are known, of which a median is taken: of fewer nobody can tell which is off."""
+"""That are known, of which a median is taken: with fewer it cannot be decided which is off."""
 APART = 0.02
-"""Of a frame, that the means of cameras differ by on captures whose cameras are in step, as far as can be told from
+"""Of a frame, that the means of cameras differ by on captures whose cameras are in step, as far as can be measured on
 these: added to each error."""
-TOLD = 0.1
+MAX_ERROR = 0.1
 """Error, of a frame, from which a camera's mean is too little known to be reported."""
 OFF, SURE = 0.15, 4.0
 """Frames, and times its error, by which a camera is clearly out of step; clean: 0.05. docs/calibration.md has more."""
@@ -100,7 +100,7 @@ class Looks:
 
     @property
     def count(self) -> float:
-        """Looks of the same weight that would tell as much."""
+        """Number of equally weighted looks with the same information."""
         return self.weight**2 / self.squares if self.squares > 0 else 0.0
 
     @property
@@ -121,7 +121,7 @@ def noted(
 ) -> Past:
     """The past with the looks at some cameras of a frame; the same where it says nothing.
 
-    That is a frame that was held, tried again, not moved, or lit otherwise, the first that moved, which no motion led,
+    That is a frame that was rejected, retried, skipped or lit differently, the first that moved, which no motion led,
     and any on a GPU, where no rendering is kept. A camera that is left out says nothing either.
 
     Args:
@@ -142,7 +142,9 @@ def noted(
         states = (ahead, back) if trace.kept is Candidate.END else (ahead, back, after)  # the end was shown
         here, there, *now = (_rendered(renderer, state, view)[:, ::every, ::every].copy() for state in states)
         shown = now[0] if now else planes[:3]
-        shifts = told(view.target[:3, ::every, ::every], *(_exposed(view, one) for one in (shown, here, there)))
+        shifts = measure_shift(
+            view.target[:3, ::every, ::every], *(_exposed(view, one) for one in (shown, here, there))
+        )
         known = replace(looks.get(view.name, Looks()), last=float(index))
         looks[view.name] = known if shifts is None else known.with_look(shifts, way, frame)
     return replace(past, timing={name: astuple(one) for name, one in looks.items()})
@@ -175,10 +177,10 @@ def _exposed(view: TrainingView, shown: Array) -> Array:
     return exposed
 
 
-def told(target: Array, shown: Array, ahead: Array, back: Array) -> Look | None:
+def measure_shift(target: Array, shown: Array, ahead: Array, back: Array) -> Look | None:
     """The moment of a picture; None: too little of it changes.
 
-    Of its residual what goes with the change is told apart from what goes with the bend of the change, which is that
+    Of its residual what goes with the change is separated from what goes with the bend of the change, which is that
     of a picture half a frame off to either side, and from a gain and an offset of the whole.
 
     Args:
@@ -207,7 +209,7 @@ def told(target: Array, shown: Array, ahead: Array, back: Array) -> Look | None:
 def timings(past: Past) -> dict[str, CameraTiming]:
     """By camera, the moment at which its pictures seem to be taken; only of those of which it is known well enough."""
     looks = {name: Looks(*row) for name, row in past.timing.items()}
-    known = {name: one for name, one in looks.items() if one.count >= ENOUGH and one.error <= TOLD}
+    known = {name: one for name, one in looks.items() if one.count >= ENOUGH and one.error <= MAX_ERROR}
     if len(known) < CAMERAS:
         return {}
     common = median(one.mean for one in known.values())

@@ -1,4 +1,4 @@
-"""All that the update of one frame starts from: the state, the pictures, and what the frames before have told."""
+"""All that the update of one frame starts from: the state, the pictures, and what earlier frames have shown."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class UpdateInput:
         lengths: [N, 3] metres, of the axes in frame 0.
         exposure, left_out, unusable: by the brightness of the pictures, see ``checks.check_brightness``.
         light_moves: whether it goes on from frame to frame, see ``checks.goes_on``.
-        rests: whether the pictures have shown nothing to move yet, where they tell what moves.
+        rests: whether the pictures have shown nothing to move yet, where they decide which Gaussians move.
         same: cameras whose picture is that of the last frame that was believed. sharp: ``alarms.sharpness`` of each.
         end: moment by which the last iteration has to be over. each: seconds of an iteration in the updates before.
     """

@@ -117,7 +117,7 @@ def rows_among(ids: Int, wanted: Int) -> Int:
 
 
 def lives_of(events: Int, wanted: Iterable[int], first: int) -> list[Life]:
-    """The lives of Gaussians, by id, as a log tells them.
+    """The lives of Gaussians, by id, as a log records them.
 
     Args:
         events: the log. first: the first frame, in which those are born that no event bears.

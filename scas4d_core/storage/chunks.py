@@ -55,7 +55,7 @@ class Chunk:
 
     @property
     def first(self) -> int:
-        """Its first frame, as its name tells."""
+        """Its first frame, as in its name."""
         return chunk_of(self.path.name) or 0
 
 

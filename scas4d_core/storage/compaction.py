@@ -22,8 +22,8 @@ from scas4d_core.storage.npz import sync_folder
 CHUNK_FRAMES = 120
 """Frames of a chunk: its first state takes as much as five to ten of the others, and retention deletes it whole."""
 
-UNTOLD = (ValueError, ArithmeticError, MemoryError)
-"""Errors of states that cannot be read or told: those of histories and of compact files are ValueErrors."""
+NOT_ENCODED = (ValueError, ArithmeticError, MemoryError)
+"""Errors of states that cannot be read or encoded: those of histories and of compact files are ValueErrors."""
 
 log = logging.getLogger("scas4d.storage")
 
@@ -85,7 +85,7 @@ class Compaction:
             except OSError:
                 self._drop()
                 raise
-            except UNTOLD as error:  # damaged, or it cannot be told: it stays as it is
+            except NOT_ENCODED as error:  # damaged, or it cannot be encoded: it stays as it is
                 log.warning("frame %d is not compacted: %s", index, error)
                 self._drop()
             else:
@@ -150,7 +150,7 @@ class Compaction:
         self._first = max(known)
         try:
             writer = CompactWriter.resume(known[self._first].path)
-        except UNTOLD:
+        except NOT_ENCODED:
             return None
         if writer.head.text() != self._head().text():
             self._finish(writer)

@@ -14,7 +14,7 @@ from scas4d_core.storage.npz import member
 
 Arrays = dict[str, NDArray[Any]]
 Stamp = tuple[int, int]
-"""Bytes and time of change of a file, in ns: they tell a file that was written anew. Of frames in chunks: ``Chunk``."""
+"""Bytes and time of change of a file, in ns: they reveal a rewritten file. Of frames in chunks: ``Chunk``."""
 EVENTS = "events"
 """Array of a frame's file: the log of births, retirements and revivals up to it; only where there are any."""
 EFFECTS = "effects"

@@ -238,7 +238,7 @@ class FramesReader:
                 try:
                     log = self._from_file(newest, (), (EVENTS,)).get(EVENTS, NO_EVENTS)
                 except UnreadableFrameError:
-                    continue  # it is forgotten, and the one before tells all but its own
+                    continue  # it is forgotten, and the one before has all but its own
             self._log = (newest, log)
             return log
         return NO_EVENTS

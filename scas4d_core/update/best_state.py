@@ -24,7 +24,7 @@ from scas4d_core.update.warm_start import Motion, warm_start
 VIEWS = 4
 """Probe views of a frame."""
 SCALE = 0.5
-"""Of their pictures: a quarter of the pixels tells as much about which state is better, ..."""
+"""Of their pictures: a quarter of the pixels decides as well which state is better, ..."""
 FEWEST = 80
 """... unless they would have fewer pixels on a side: with 32 a motion that merely went on was preferred for ten frames
 in a row, while all cameras lost 1.2 dB; ..."""
@@ -58,7 +58,7 @@ ones looked at."""
 
 
 def by_size(errors: Mapping[str, float], whole: bool) -> dict[str, float]:
-    """Errors under names that tell those of whole pictures, which are smaller, from those of small ones.
+    """Errors under names that distinguish whole pictures, whose errors are smaller, from small ones.
 
     >>> by_size({"c0": 0.1}, whole=True)
     {'c0 whole': 0.1}

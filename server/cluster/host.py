@@ -1,7 +1,7 @@
 """The actor that has one process of a scene, on whichever node Ray has placed it.
 
 The process is a child of the actor: it runs as it does on one machine (signals, niceness, threads), and how it ended is
-known by its exit code, which Ray does not tell. It ends with the actor.
+known by its exit code, which Ray does not report. It ends with the actor.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ NAMESPACE = "scas4d"
 REACH_S = 5.0
 """The head of the cluster answers within so long."""
 SILENT_S = 3.0
-"""A head that has not answered for so long is told of."""
+"""A head that has not answered for this long is reported."""
 JOIN_S = 60.0
 """A try to join takes so long at most; without a node on this machine it fails after some 10 s."""
 LEAVE_S = 10.0

@@ -1,4 +1,4 @@
-"""Nodes of the cluster as Ray tells them, and what this service has on each."""
+"""Nodes of the cluster as Ray lists them, and what this service has on each."""
 
 from __future__ import annotations
 

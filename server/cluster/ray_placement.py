@@ -1,4 +1,4 @@
-"""Runs the processes of scenes as actors on a Ray cluster. Ray chooses the node, and tells when one is lost."""
+"""Runs the processes of scenes as actors on a Ray cluster. Ray chooses the node, and reports when one is lost."""
 
 from __future__ import annotations
 

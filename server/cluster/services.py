@@ -23,7 +23,7 @@ log = logging.getLogger("scas4d.server")
 
 
 class Address:
-    """The actor: it tells where the service listens, and the machine from which alone that can be reached, or None."""
+    """The actor: it reports where the service listens, and the only machine that can reach it, or None."""
 
     def __init__(self, url: str, machine: str | None) -> None:
         self._told = url, machine
@@ -37,7 +37,7 @@ def announced(word: str, host: str, port: int) -> Any:
     """Announces this service; returns the actor, which goes with this process. Blocking.
 
     Args:
-        word: of this service. host, port: it listens there; an address that stands for all is told as this machine's.
+        word: of this service. host, port: it listens there; a wildcard address is announced as this machine's.
     """
     machine = own_machine()
     if host in ("0.0.0.0", "::", ""):
@@ -52,7 +52,7 @@ def announced(word: str, host: str, port: int) -> Any:
 
 
 def _authority(host: str, port: int) -> str:
-    """The numbers of an address: a service refuses names that it is not told of."""
+    """The numbers of an address: a service refuses names that it does not know."""
     addresses = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)
     number = str(addresses[0][4][0])
     return f"[{number}]:{port}" if ":" in number else f"{number}:{port}"
@@ -61,7 +61,7 @@ def _authority(host: str, port: int) -> str:
 def others(word: str, known: Mapping[str, str] | None) -> dict[str, str]:
     """Returns the addresses of the other services by the names of their actors. Blocking.
 
-    One that does not tell its address, as it begins or ends, has its name in place of it, which nobody answers.
+    One that does not answer, while it begins or ends, has its name in place of an address, which nobody answers.
 
     Args:
         word: of this service. known: what was returned before; returned again where Ray does not say.
@@ -83,7 +83,7 @@ def others(word: str, known: Mapping[str, str] | None) -> dict[str, str]:
 
 
 def _asked(names: Sequence[str]) -> dict[str, tuple[str, str | None]]:
-    """Asks services for their addresses; one that does not tell has its name as address."""
+    """Asks services for their addresses; one that does not answer has its name as address."""
     addresses: dict[str, tuple[str, str | None]] = {name: (name, None) for name in names}
     asked: dict[Any, str] = {}
     for name in names:
@@ -94,5 +94,5 @@ def _asked(names: Sequence[str]) -> dict[str, tuple[str, str | None]]:
         try:
             addresses[asked[answer]] = ray.get(answer)
         except RayError as error:  # it ends, or begins
-            log.info("service %s does not tell its address: %s", asked[answer], error)
+            log.info("service %s does not give its address: %s", asked[answer], error)
     return addresses

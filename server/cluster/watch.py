@@ -14,14 +14,14 @@ FRESH_S = 2.0
 PATIENCE_S = 2.0
 """A request waits for the head for so long; then it gets the answer before."""
 KEPT_S = 900.0
-"""A lost node is told of for so long: scrapers and people look every few seconds, and some are away for a moment."""
+"""Seconds for which a lost node is reported: scrapers and people look every few seconds, or miss a moment."""
 MOST_LOST = 16
 ON_PURPOSE = (1, 4)
 """Ray's reasons for a node that was stopped (`ray stop`), or was idle and ended by its autoscaler: it is not lost."""
 
 
 class NodeWatch:
-    """Nodes as the head of the cluster told them last, and those that were lost lately. On the event loop.
+    """Nodes as the head of the cluster listed them last, and those that were lost lately. On the event loop.
 
     Args:
         ask: asks the head for all nodes that there have been, as Ray describes them; returns a future of the answer.

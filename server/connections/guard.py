@@ -216,7 +216,7 @@ class ConnectionGuard:
         """Keeps uploads that have brought next to nothing to half of a cap, the oldest go.
 
         The other half is then of connections that give way at once: who has a request finds a place at any moment, and
-        not only when uploads that hang are old enough to be told from those that have just begun.
+        not only when uploads that hang are old enough to be distinguished from those that have just begun.
         """
         peers: Iterable[Peer] = [new.peer]
         if new.peer.proxy or 2 * len(new.peer.bodies) <= self.limits.per_peer:

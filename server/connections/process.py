@@ -25,7 +25,7 @@ FILES_EACH = 2
 
 
 def keep_freed_memory() -> None:
-    """Tells glibc to keep what is freed, up to `KEPT_BYTES`.
+    """Has glibc keep what is freed, up to `KEPT_BYTES`.
 
     A socket is read in pieces of 256 kB, for which it would otherwise ask the kernel for fresh memory each time: that
     takes longer than to fill it. Elsewhere nothing happens.

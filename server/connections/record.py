@@ -28,7 +28,7 @@ class Phase(Enum):
     LINGER = auto()
     """Answered before the body was whole: the rest is dropped."""
     SOCKET = auto()
-    """A WebSocket. It may idle for ever: pings tell whether its peer is there."""
+    """A WebSocket. It may idle for ever: pings check that its peer is there."""
     REFUSED = auto()
 
 

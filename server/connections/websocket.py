@@ -114,7 +114,7 @@ class Socket(WebSocketsSansIOProtocol):
 
     def handle_ping(self) -> None:
         """Answers a ping; while the peer does not read, only the newest is remembered, as RFC 6455 (5.5.3) allows: each
-        would add an answer to what waits. What the peer sends is read all the same: its pongs tell that it is there.
+        would add an answer to what waits. What the peer sends is read all the same: its pongs show that it is there.
         """
         if not self._record.write_paused:
             super().handle_ping()

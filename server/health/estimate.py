@@ -22,7 +22,7 @@ NOVEL_PIXEL = 38
 """Bytes for each pixel after scaling where Gaussians may be born: what each camera says is new there (a picture, an
 error, five masks: 21), the distances to it in carving, or the parts of pictures that the born are fitted to (17)."""
 VOXELS = 150e6
-"""Bytes of the voxels in which a new thing is carved, and of the grid that tells things apart, at their most."""
+"""Bytes of the voxels in which a new thing is carved, and of the grid that separates objects, at their most."""
 GAUSSIAN = 2200
 """Bytes for each Gaussian in the worker: state, layers, Adam, neighbours, and what a render needs."""
 READ_GAUSSIAN = 500

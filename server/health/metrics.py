@@ -70,7 +70,7 @@ class ServiceState:
 
 
 def of_cluster(cluster: Cluster) -> Iterator[Metric]:
-    """Yields the gauges of nodes, as far as the head of the cluster tells of them, and what this service has there."""
+    """Yields the gauges of nodes, as far as the head of the cluster lists them, and what this service has there."""
     yield GaugeMetricFamily("scas4d_cluster_up", "1 while the head of the cluster answers.", value=cluster.answers)
     nodes = cluster.nodes if cluster.answers else []
     for name, help, field, unit in (

@@ -107,7 +107,7 @@ class AuthMiddleware:
         given = Headers(scope=scope).getlist("authorization")
         scheme, _, token = given[0].partition(" ") if len(given) == 1 else ("", "", "")
         if scheme.lower() == "bearer":
-            if hmac.compare_digest(_hashed(token.strip()), self._token):  # hashed first: the length tells nothing
+            if hmac.compare_digest(_hashed(token.strip()), self._token):  # hashed first: the length reveals nothing
                 return ALL
             if (permission := self._sharing.read(token.strip())) is not None:
                 return permission

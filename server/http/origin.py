@@ -1,7 +1,7 @@
 """Checks of Host and Origin: no page of another site uses the service.
 
 Any web page can send requests to a server on the loopback of the machine that shows it. Two headers, which no page can
-forge, tell: `Origin` (and `Sec-Fetch-Site`, where a picture or a form leaves Origin out) names the page that asks;
+forge, show it: `Origin` (and `Sec-Fetch-Site`, where a picture or a form leaves Origin out) names the page that asks;
 `Host` is the name under which the service was found, and a name that is not ours was pointed at this machine (DNS
 rebinding), which makes the foreign page look like one of the service itself.
 """

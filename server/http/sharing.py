@@ -47,7 +47,7 @@ class Sharing:
                 401,
                 "the link, or the token for reading, has ended",
                 field="Authorization",
-                remedy="ask whoever gave it to you for another: POST /v1/shares, or scas4d scenes share",
+                remedy="ask for a new link where you got it: POST /v1/shares, or scas4d scenes share",
                 headers={"WWW-Authenticate": 'Bearer realm="scas4d", error="invalid_token"'},
             )
         return Permission(scene=None if scene == ALL_SCENES else scene, end=int(end))

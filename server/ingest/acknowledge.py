@@ -24,7 +24,7 @@ T = TypeVar("T")
 MOST_SOCKETS = 64
 """WebSockets that send frames to one scene: one a camera where each has a sender of its own."""
 LONGEST_S = 60.0
-"""The longest that a sender is told to wait: a prediction that far ahead is a guess."""
+"""Seconds that a sender is asked to wait at most: a prediction further ahead is a guess."""
 PAUSED_S = 5.0
 """A sender to a paused scene asks again after so long: nobody knows when a person resumes it."""
 

@@ -29,10 +29,10 @@ CONNECT_S = 3.0
 SILENT_S = 130.0
 """A peer may be silent for so long over a request: longer than it allows a query."""
 REMEMBERED_S = 600.0
-"""A service that is gone is waited for, for so long after it was there: clients of its scenes are told to ask again."""
+"""Seconds for which a lost service is awaited: clients of its scenes are asked to try again."""
 MOST_KNOWN = 100_000
 MOST_UNKNOWN = 1_000
-"""Ids that nobody has, remembered for a moment: whoever tries out ids does not reach every peer with each."""
+"""Ids that nobody has, remembered for a moment, so that guessed ids do not each reach every peer."""
 
 T = TypeVar("T")
 M = TypeVar("M", bound=BaseModel)

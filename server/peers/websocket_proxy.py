@@ -92,7 +92,7 @@ async def _connected(address: str) -> socket.socket:
 async def _to_sibling(peer: ClientConnection, receive: Receive) -> None:
     while (message := await receive())["type"] == "websocket.receive":
         text = message.get("text")
-        with contextlib.suppress(ConnectionClosed):  # `_from` tells the client
+        with contextlib.suppress(ConnectionClosed):  # `_from` notifies the client
             await peer.send(message["bytes"] if text is None else text)
     code = message.get("code") or RESTARTS
     await peer.close(code if _may_be_sent(code) else RESTARTS, message.get("reason") or "")

@@ -33,7 +33,7 @@ def write_compact(
     """Writes committed frames, each read when it is its turn; those that retention has deleted since are left out.
 
     What the scene keeps in a compact file already is copied with its bits; a file that begins so may have frames before
-    those asked for, by which they are told, and it ends with that compact file.
+    those requested, which depend on them, and it ends with that compact file.
 
     Args:
         file: replaced where it is there. asked: frames, rising. labels: [N] part of each Gaussian, or None.

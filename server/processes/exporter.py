@@ -46,7 +46,7 @@ def main(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
 
 
 def words(error: Exception) -> str:
-    """Tells a person why an export failed, without paths of this machine.
+    """Explains to a person why an export failed, without paths of this machine.
 
     >>> words(InputError("parts: no Gaussian belongs to one", "ask for the parts"))
     'parts: no Gaussian belongs to one; ask for the parts'

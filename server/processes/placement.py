@@ -38,7 +38,7 @@ class ProcessExit(str):
     Attributes:
         exit_code: as in multiprocessing: −N for signal N; None where it is not known.
         lost: its machine is gone, or cannot be reached. starved: the kernel killed processes beside it for want of
-            memory; None: this machine's control group tells.
+            memory; None: as this machine's control group allows.
     """
 
     exit_code: int | None
@@ -235,7 +235,7 @@ class Placement:
         return None
 
     async def announce(self, host: str, port: int) -> None:
-        """Tells other services of the cluster where this one listens."""
+        """Announces to other services of the cluster where this one listens."""
 
     async def peers(self) -> Sequence[str]:
         """Addresses of the other services of the cluster, as `http://10.0.0.2:8000`."""

@@ -199,8 +199,8 @@ class Renderer:
                 return Answer(number, body, "application/octet-stream", headers)
             case GaussiansQuery():
                 lives = [GaussianModel.model_validate(asdict(life)) for life in self.history.lives(query.ids)]
-                told = GaussiansModel(frame=self.history.indices[-1], gaussians=lives)
-                return Answer(number, told.model_dump_json().encode(), "application/json")
+                listing = GaussiansModel(frame=self.history.indices[-1], gaussians=lives)
+                return Answer(number, listing.model_dump_json().encode(), "application/json")
             case PlyQuery():
                 return self._file(number, lambda file: self.reader.write_ply(file, query.frame))
             case CompactQuery():

@@ -174,7 +174,7 @@ class Worker:
             self._later.append(message)
 
     def finish(self, message: FrameReady) -> FrameCommitted | UpdateFailed:
-        """Commits a frame, or returns the reason to set it aside.
+        """Commits a frame, or returns the reason why it fails.
 
         Raises:
             OSError: the disk is full; nothing is committed.

@@ -193,7 +193,7 @@ class Scrub:
             entry = self._ledger.frames.get(index)
             if fault is None or entry is None or name not in entry.files:  # deleted meanwhile
                 continue
-            what = "it is set aside when its turn comes"
+            what = "it fails when its turn comes"
             if entry.state == FrameState.COMMITTED:
                 what = "its state is not touched by that"
             sentence = f"frame {index}: its record in the frame log is damaged: {fault}; {what}"

@@ -68,7 +68,7 @@ async def file(id: SceneId, export: ExportId, exports: AllExports, request: Requ
             f"the export is {file_export.state.value}" + (f": {file_export.error}" if file_export.error else ""),
             field="export",
             value=export,
-            remedy=f"wait until GET /v1/scenes/{id}/exports/{export} tells that it is done"
+            remedy=f"wait until GET /v1/scenes/{id}/exports/{export} reports that it is done"
             if file_export.error is None
             else "ask for another export",
         )

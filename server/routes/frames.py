@@ -205,7 +205,7 @@ async def compact(
     """Exports committed frames as a compact 4D file, which `scas4d export` turns into other formats.
 
     Frames that the scene keeps in a compact file already come with the same bits: the answer ends where that file does,
-    and may begin with earlier frames, by which those asked for are told.
+    and may start before the requested range, at the key frame that it depends on.
     """
     scene.committed_frame(None, "first")
     begin = bisect_left(scene.committed, first)

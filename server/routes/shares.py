@@ -26,7 +26,7 @@ async def share(request: ShareRequest, scenes: AllScenes, settings: TheSettings,
     if secret is None:
         raise Problem(
             409,
-            "the service has no token: whoever reaches it may do everything",
+            "the service has no token: anyone who reaches it may do everything",
             field="SCAS4D_TOKEN",
             remedy="start it with SCAS4D_TOKEN; then others need a token, or a link",
         )

@@ -23,7 +23,7 @@ async def replay(scene: TheScene, request: ReplayRequest | None = None) -> Trade
     """Measures other numbers of iterations: the newest frames are updated again in the background, in memory.
 
     One replay of a scene at a time, on one thread and at a low priority; the scene's own number of iterations is
-    measured with the others, so that their ratios hold. `replay` tells how far it is.
+    measured with the others, so that their ratios hold. `replay` reports its progress.
     """
     scene.replays.start(request or ReplayRequest())
     return await answer(scene)

@@ -59,7 +59,7 @@ class Beginning:
 
         Raises:
             Problem: 409, it is another number's turn, the frame cannot be begun with, or committed frames would be
-                dropped unasked; 422, nothing tells how far away things are.
+                dropped unasked; 422, distances are unknown.
         """
         if self._known(ledger):
             return None

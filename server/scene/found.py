@@ -1,4 +1,4 @@
-"""Reads a scene back from its folder, or makes the folder of a new one; tells its status and whether it has work."""
+"""Reads a scene back from its folder, or makes the folder of a new one; reports its status and whether it has work."""
 
 from __future__ import annotations
 

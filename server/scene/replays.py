@@ -69,7 +69,7 @@ class Replays:
                 f"a replay of this scene is running: {self.status.done} of {counted(self.status.total, 'update')} over",
                 field="id",
                 value=id,
-                remedy=f"wait for it: GET /v1/scenes/{id}/tradeoff tells how far it is",
+                remedy=f"wait for it: GET /v1/scenes/{id}/tradeoff reports its progress",
             )
         base, indices = self._chosen(request.frames)
         own = self._own_iterations()
@@ -131,7 +131,7 @@ class Replays:
     def _own_iterations(self) -> int:
         """Returns the iterations that the scene runs: as its budget says, or as many as fitted into its time last.
 
-        A frame that stood still or was held tells nothing about that.
+        A skipped or rejected frame says nothing about that.
         """
         budget = effective_budget(self._spec.settings, self._ledger.budgets[-1][1])
         if budget.budget_ms is not None:

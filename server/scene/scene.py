@@ -143,7 +143,7 @@ class Scene:
         self._background.run(scrub.run(), endless=True)
 
     def _check_start(self) -> None:
-        """Refuses to begin where nothing tells how far away things are: 422."""
+        """Refuses to begin where distances are unknown: 422."""
         try:
             check_start(self.rig, self.points_sha256 is not None)
         except RigError as error:

@@ -316,7 +316,7 @@ class Scenes:
         Raises:
             Problem: see `refuse`.
         """
-        while id in self._turns:  # whoever waits for the same turn may begin another
+        while id in self._turns:  # another task that waits for the same turn may begin one
             with suppress(Problem):  # it cannot wake: no reason to keep it
                 await self._turns.end(id)
         folder = self._data.scene(id).path

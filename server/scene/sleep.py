@@ -1,4 +1,4 @@
-"""Sleep: idle scenes give up their processes and their place, and are woken by whoever asks them something.
+"""Sleep: idle scenes give up their processes and their place, and are woken by the next request.
 
 A scene that is asleep is its status in memory and its folder on disk. Waking reads the folder, as after a crash.
 """
@@ -42,7 +42,7 @@ class Turns(dict[str, asyncio.Task[None]]):
     """Scenes that are falling asleep or waking, by id: each is at one turn at a time."""
 
     def begin(self, id: str, coroutine: Coroutine[Any, Any, None]) -> None:
-        """Begins a turn; whoever asked for it may leave meanwhile."""
+        """Begins a turn; the caller may leave meanwhile."""
 
         async def turn() -> None:
             try:

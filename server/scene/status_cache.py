@@ -1,7 +1,7 @@
 """The card of a sleeping scene: its status beside its folder's other files, so that a start need not read those.
 
 A card is worth no more than the time it saves: it is believed only while every name, size and time of change in the
-scene's folder is what it was, and left aside otherwise.
+scene's folder is what it was, and ignored otherwise.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def write_card(folder: SceneFolder, status: SceneStatus) -> None:
     A scene with damage gets none: each start looks again.
 
     Args:
-        folder: of the scene. status: as it is told while the scene sleeps.
+        folder: of the scene. status: as reported while the scene sleeps.
     """
     if status.damage:
         return

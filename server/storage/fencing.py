@@ -27,7 +27,7 @@ PART = ".part"
 MARK = ".epoch"
 """A file in each folder of an epoch: a folder that has it cannot be replaced by another of the same epoch."""
 PASSES = 20
-"""Times that a folder is linked which changes meanwhile: whoever writes to it is at work still."""
+"""Times that a folder is linked which changes meanwhile: its writer is still at work."""
 MOST_KEPT = 5
 """Folders of epochs that are kept while worker after worker ends before it works."""
 LOCAL_S = 10.0

@@ -39,7 +39,7 @@ class FrameTable:
 
     Attributes:
         counts: frames in each state. committed: rising indices whose state can be read.
-        first: the reconstruction begins with this frame; one before it is set aside, unless it never came.
+        first: the reconstruction begins with this frame; an earlier one fails, unless it never came.
     """
 
     def __init__(self, scene: str) -> None:
@@ -130,7 +130,7 @@ class FrameTable:
     def begin_again(self, first: int) -> None:
         """Queues all frames again whose pictures are held, from `first` on; what happened to frames is forgotten.
 
-        Frames that are missing or skipped stay so; all others are set aside.
+        Frames that are missing or skipped stay so; all others fail.
         """
         states = self.states()
         stay = (states == CODES[FrameState.MISSING]) | (states == CODES[FrameState.SKIPPED])
@@ -314,7 +314,7 @@ class FrameEntry:
 
     @property
     def error(self) -> str | None:
-        """Reason why it was set aside or skipped, or is missing."""
+        """Reason why it failed, was skipped, or is missing."""
         if (error := self.note.error) is not None:
             return error
         if self.state == FrameState.SKIPPED:

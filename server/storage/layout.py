@@ -73,7 +73,7 @@ class SceneFolder:
 
     Attributes:
         reconstruction: its number. cloud: number of the reconstruction whose points it begins from.
-        epoch: of the worker that commits to the states (`server.storage.fencing`); None: of whoever has the scene.
+        epoch: of the worker that commits to the states (`server.storage.fencing`); None: of the scene's process.
     """
 
     path: Path

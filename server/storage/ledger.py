@@ -236,13 +236,13 @@ class Ledger:
         return indices[::-1]
 
     def hopeless(self) -> list[FrameFailed]:
-        """Returns events, not applied, that set aside the frames waiting behind a failed first one."""
+        """Returns events, not applied, that fail the frames waiting behind a failed first one."""
         if self.fatal is None:
             return []
         return [FrameFailed(index=index, reason=f"{HOPELESS}: {self.fatal}") for index in self.waiting()]
 
     def last_tried(self) -> int | None:
-        """Returns the newest frame that the worker has finished, committed or set aside."""
+        """Returns the newest frame that the worker has finished, committed or failed."""
         states = self.frames.states()
         states[: self.frames.first] = CODES[FrameState.SKIPPED]  # not tried: the reconstruction begins behind them
         tried = np.flatnonzero((states == CODES[FrameState.COMMITTED]) | (states == CODES[FrameState.FAILED]))
@@ -257,7 +257,7 @@ class Ledger:
         return None
 
     def _have(self, index: int) -> None:
-        """Grows to the frame; unknown indices up to it are set aside as lost."""
+        """Grows to the frame; unknown indices up to it fail as lost."""
         if index >= self.next_frame:
             for new in [new for new in self.open if new <= index]:
                 del self.open[new]

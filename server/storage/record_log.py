@@ -173,7 +173,7 @@ def records(data: bytes | memoryview) -> Iterator[LogRecord | Damage]:
 PIECE = 1 << 22
 """Bytes that are read at a time."""
 ENOUGH = 2 * (MAX_HEAD + PREFIX + CHECKSUM)
-"""So many bytes of a log are enough to tell whether a record without a body, such as an event, is whole."""
+"""Bytes of a log that are enough to decide whether a record without a body, such as an event, is whole."""
 
 
 class Readable(Protocol):

@@ -27,7 +27,7 @@ class Trouble:
 def trouble_of(report: FrameReportModel) -> str | None:
     """Says why a scene is degraded whose newest finished frame has this report; None: it is not."""
     if report.state == FrameState.FAILED:
-        return f"frame {report.index} was set aside: {report.error}"
+        return f"frame {report.index} failed: {report.error}"
     if report.outcome is not None and report.outcome.degraded:
         verb = "" if report.outcome.rejected else "committed in part: "
         return f"frame {report.index} was {verb}{report.degraded}"

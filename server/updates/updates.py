@@ -169,7 +169,7 @@ class Updates:
             case Ready():
                 self._background.run(self._resume(message, self.worker.life))
             case Progressed():
-                over = message.stage == STAGE and message.done == message.total  # an update tells no other stage
+                over = message.stage == STAGE and message.done == message.total  # an update reports no other stage
                 self.progress = None if over else ProgressModel(**vars(message))
                 self.clock.progress(message.stage, message.done, message.total, message.detail.get("seconds_left"))
                 self._publisher.changed()
@@ -327,7 +327,7 @@ class Updates:
                 death = WorkerDied(index=index, reason=str(reason), own=own)
                 await self._log.write(death)
                 self._ledger.apply(death)
-                # The worker may have died after its commit and before its message: then the next worker tells of it.
+                # The worker may have died after its commit and before its message: then the next worker reports it.
                 event = given_up(self._ledger.frames[index], death)
                 if event is not None and not await self._reports.is_committed(index):
                     await self._record_failure(event)

@@ -27,9 +27,9 @@ OWN_SIGNALS = frozenset(
     {signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSYS, signal.SIGTRAP}
 )
 OWN_DEATHS = 2
-"""A frame is set aside after so many deaths of the worker by its own doing."""
+"""Deaths of the worker, by its own doing, after which a frame fails."""
 OTHER_DEATHS = 6
-"""A frame is set aside after so many deaths from outside, too: something is wrong with it all the same."""
+"""Deaths from outside after which a frame fails, too: something is wrong with it all the same."""
 FIRST_DELAY_S, LONGEST_DELAY_S = 0.5, 30.0
 
 LOST_AT_ONCE = 3
@@ -77,7 +77,7 @@ class WorkerDeaths:
 
 
 def given_up(entry: FrameEntry, death: WorkerDied) -> FrameFailed | None:
-    """Returns the event that sets the frame aside for this death, which is counted already; None: it is tried again."""
+    """Returns the event that fails the frame for this death, which is counted already; None: it is tried again."""
     own, other = entry.note.own_deaths, entry.note.other_deaths
     if own >= OWN_DEATHS:
         reason = f"the worker died {own} times while it reconstructed this frame: {death.reason}"
@@ -162,7 +162,7 @@ class WorkerProcess:
         self._process = self._placement.start(worker.main, spec, self._received, self._gone)
 
     async def sweep(self) -> None:
-        """Removes the states of workers before, once whoever reads through an old link has seen the new one."""
+        """Removes the states of workers before, once readers through an old link have seen the new one."""
         if (epoch := self._epoch) is None:
             return
         await asyncio.sleep(SWEEP_AFTER_S)

@@ -209,7 +209,7 @@ def _is_placed_or_waits(service: Service, scene: str) -> bool:
 
 
 def _waits(service: Service, scene: str) -> bool:
-    """Tells whether the scene's worker finds no room on a node."""
+    """True where the scene's worker finds no room on a node."""
     waiting = Cluster.model_validate_json(service.http.get("/v1/cluster").content).waiting
     return any(one.scene == scene and one.role == "worker" and one.seconds > WAITS_S for one in waiting)
 

@@ -146,8 +146,8 @@ def _joined(ray: Any) -> bool:
 def _heads() -> Iterator[int]:
     for path in Path("/proc").iterdir():
         with contextlib.suppress(OSError):
-            told = (path / "cmdline").read_text().split("\0") if path.name.isdecimal() else [""]
-            if told[0].endswith("gcs_server") and f"--gcs_server_port={PORT}" in told:
+            arguments = (path / "cmdline").read_text().split("\0") if path.name.isdecimal() else [""]
+            if arguments[0].endswith("gcs_server") and f"--gcs_server_port={PORT}" in arguments:
                 yield int(path.name)
 
 

@@ -30,7 +30,7 @@ TARGET = 0.02
 
 
 def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report = print) -> Row:
-    """Updates of ``scas4d`` that tell everything, in turns with ones that do not; leaves
+    """Updates of ``scas4d`` with a full report, in turns with ones without; leaves
     ``out/effort/<capture>-report.json``.
 
     Args:
@@ -45,23 +45,23 @@ def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report
     stages: list[dict[str, float]] = []
     cpu: dict[bool, list[float]] = {True: [], False: []}
     with tempfile.TemporaryDirectory() as directory:
-        scenes = {tells: started(capture, settings, out, Path(directory) / str(tells)) for tells in (True, False)}
+        scenes = {full: started(capture, settings, out, Path(directory) / str(full)) for full in (True, False)}
         for index in range(1, min(updates, capture.frame_count - 1) + 1):
             frame = capture.frame(index)
             dict(frame.images), dict(frame.masks)  # decoded before, so that both find them so
-            for tells in (True, False) if index % 2 else (False, True):
+            for full in (True, False) if index % 2 else (False, True):
                 began = time.process_time()
-                FrameUpdate.curve = tells
+                FrameUpdate.curve = full
                 try:
-                    done = scenes[tells].step(frame)
+                    done = scenes[full].step(frame)
                 finally:
                     FrameUpdate.curve = True
                 taken = time.process_time() - began
                 if index < COUNTED_FROM:
                     continue
-                cpu[tells].append(taken)
-                if tells:
-                    seconds = {**done.seconds, REPORT: done.seconds[REPORT] + _published(scenes[tells], index)}
+                cpu[full].append(taken)
+                if full:
+                    seconds = {**done.seconds, REPORT: done.seconds[REPORT] + _published(scenes[full], index)}
                     stages.append(seconds)
                     shares.append(seconds[REPORT] / sum(seconds.values()))
     ratios = np.array(cpu[True]) / np.array(cpu[False])

@@ -1,7 +1,7 @@
 """The plots of the frontier, as PNG files: accuracy over time, within an update, over frames; time by stage.
 
 They are as wide as a column (``COLUMN``) or a page (``PAGE``) of a paper, with text of 6.5 to 8 points at that width.
-Colours are those of Okabe and Ito, told apart with any colour vision; shapes and labels say the same again. A colour is
+Colours are those of Okabe and Ito, distinguishable with any colour vision; shapes and labels repeat them. A colour is
 a method's, an axis's or a stage's, and a dash is a number of iterations, in every plot.
 """
 

@@ -113,7 +113,7 @@ def _own_turn(r: float) -> Deforming:
 
 
 def _through_a_half_turn(sign: float) -> Deforming:
-    """Two layers turn by 100° each, just beyond 180° together: the turn is told with w ≥ 0, as q or as −q."""
+    """Two layers turn by 100° each, just beyond 180° together: the turn is stored with w ≥ 0, as q or as −q."""
     made = ordinary()
     angle = np.tan(np.radians(50.0) * sign)
     for clusters in made.clusters:

@@ -64,7 +64,7 @@ def timing(
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Gives two cameras of a capture pictures from between the frames, and tells what is found of it.
+    """Gives two cameras of a capture pictures from between the frames, and reports what is found of it.
 
     Leaves timing.md in the study's folder; a run that was measured is not measured again.
     """

@@ -79,7 +79,7 @@ def run_case(case: HardCase, size: Any, on: Iterable[str]) -> CaseResult:
 
 
 def run(names: Sequence[str] | None = None, *, slow: bool = True, echo: Echo = print) -> list[CaseResult]:
-    """All sizes of the selected cases; tells each as it is done."""
+    """All sizes of the selected cases; reports each as it is done."""
     on = backends()
     lines = []
     for case in selected(names, slow):

@@ -129,7 +129,7 @@ def _shifted(metres: float) -> HardScene:
 
 
 def _cameras(names: tuple[int, ...]) -> HardScene:
-    least = 30 if len(names) > 1 else 26  # one camera does not tell how far away what moves is
+    least = 30 if len(names) > 1 else 26  # one camera does not determine how far away moving Gaussians are
     return HardScene(Rig(tuple(_six().cameras[k] for k in names)), least=least)
 
 

@@ -33,7 +33,12 @@ def camera_faults(footage: Footage) -> tuple[FrameCase, ...]:
 
     def case(title: str, what: str, sizes: tuple[Any, ...], fault: Fault) -> FrameCase:
         return FrameCase(
-            title, what, FIELD, sizes, lambda shown, at, size: _faulty(shown, at, name, size, fault), told(name, SOON)
+            title,
+            what,
+            FIELD,
+            sizes,
+            lambda shown, at, size: _faulty(shown, at, name, size, fault),
+            reports_alarm(name, SOON),
         )
 
     return (
@@ -47,12 +52,12 @@ def camera_faults(footage: Footage) -> tuple[FrameCase, ...]:
         case("a lens is dirty", "the middle ninth of its picture blurred, and so much white added", (0.2, 0.35), dirty),
         FrameCase(
             "a camera's picture stands", "as it was before, while the others go on; size: frames", FIELD, (FRAMES,),
-            lambda shown, at, size: _standing(shown, at, name, size), told(name, FRAMES),
+            lambda shown, at, size: _standing(shown, at, name, size), reports_alarm(name, FRAMES),
         ),
     )  # fmt: skip
 
 
-def told(name: str, soon: int) -> Holds:
+def reports_alarm(name: str, soon: int) -> Holds:
     """An alarm names the camera by frame ``soon`` of the fault, none names another, and no damage is done."""
 
     def holds(steps: Sequence[FrameStep], size: Any) -> list[str]:

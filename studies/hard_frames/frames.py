@@ -157,7 +157,7 @@ def near(steps: Sequence[FrameStep], size: Any) -> list[str]:
     ]
 
 
-def stood(steps: Sequence[FrameStep], size: Any) -> list[str]:
+def unchanged(steps: Sequence[FrameStep], size: Any) -> list[str]:
     """Nothing is moved, and the report says so."""
     faults = [f"frame {step.report.index}: the state has changed" for step in steps if not step.kept]
     return faults + [f"frame {s.report.index}: not said to stand" for s in steps if s.report.iterations]
@@ -376,8 +376,8 @@ def named(footage: Footage) -> tuple[FrameCase, ...]:
             "cameras show nothing", "so many are black, two frames", FIELD, (1, 3), capped,
             left_out(lambda size: capped_names(footage, size)),
         ),
-        FrameCase("everything stands", "the same pictures so many times, then on", FIELD, (1, 5), still, stood),
-        FrameCase("a frame again", "the same pictures so many times, the world goes on", FIELD, (1, 2), stuck, stood),
+        FrameCase("everything stands", "the same pictures so many times, then on", FIELD, (1, 5), still, unchanged),
+        FrameCase("a frame again", "repeated pictures while the world goes on", FIELD, (1, 2), stuck, unchanged),
         FrameCase(
             "a frame again, with noise", "the last pictures twice more, with noise of so many levels of 255", FIELD,
             (1, 3), still_noisy, near, lambda size: False,

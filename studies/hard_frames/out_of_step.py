@@ -106,8 +106,8 @@ def _row(key: str, folder: Path, out: Path, settings: Settings, updates: int, ca
     row = summary(reports, {name: shift / case.step for name, shift in shifts.items()})
     whole = float(np.median([sum(report.seconds.values()) for report in reports]))
     row |= {"milliseconds": 1000 * float(np.median(spent)), "share": float(np.median(spent)) / whole}
-    told = {"capture": capture.name, "step": case.step, "settings": recorded(settings, ()), "masks": masks}
-    return {"key": key, **told, **row, "core": core_version(), "machine": machine()}
+    identity = {"capture": capture.name, "step": case.step, "settings": recorded(settings, ()), "masks": masks}
+    return {"key": key, **identity, **row, "core": core_version(), "machine": machine()}
 
 
 def played(capture: Capture, index: int, step: int, shifts: Mapping[str, int]) -> Frame:

@@ -45,7 +45,7 @@ SETTINGS = Settings(
 """Few iterations: what one of them leaves wrong has thousands of frames to add up."""
 
 PIXEL_M = 0.023
-"""Metres that a pixel sees at the middle of the scene: what the pictures can tell."""
+"""Metres that a pixel sees at the middle of the scene: the resolution of the pictures."""
 RESTING_M = 4 * PIXEL_M
 """Target: root mean square of how far Gaussians that rest, but may move, are from where they were, in any row: an
 update finds where a ball of ten pixels is with some error, and a few in a row may err to the same side."""

@@ -122,7 +122,7 @@ def study(
     names: Sequence[str] = (),
     echo: Callable[[str], None] = print,
 ) -> list[FrameCaseResult]:
-    """All cases whose name holds one of ``names``, or all, in all sizes; tells each as it is done."""
+    """All cases whose name holds one of ``names``, or all, in all sizes; reports each as it is done."""
     of, lines = FrameStudy(footage, folder), []
     echo(f"{footage.name}, undisturbed: {', '.join(f'{of.undisturbed(index):.1f}' for index in range(1, AT + 4))} dB")
     for case in of.cases:
@@ -164,8 +164,8 @@ def _said(step: FrameStep) -> str:
     words = [] if report.degraded is None else [report.degraded]
     if report.dropped:
         words.append("without " + ", ".join(f"{name} ({why})" for name, why in report.dropped.items()))
-    told = [alarm for alarm in report.alarms if alarm.what not in FRAME_ALARMS and alarm.camera not in report.dropped]
-    words += [alarm.evidence if alarm.camera is None else f"{alarm.camera}: {alarm.evidence}" for alarm in told]
+    alarms = [alarm for alarm in report.alarms if alarm.what not in FRAME_ALARMS and alarm.camera not in report.dropped]
+    words += [alarm.evidence if alarm.camera is None else f"{alarm.camera}: {alarm.evidence}" for alarm in alarms]
     return "; ".join(words or report.attempts)
 
 

@@ -282,7 +282,7 @@ def _scene_words(on: Row) -> str:
 
 
 def run_and_time(folder: Path, settings: Settings, frames: int, first_file: Path) -> Row:
-    """Reconstructs so many frames, keeps frame 0, and tells seconds by update and this process's peak memory."""
+    """Reconstructs so many frames, keeps frame 0, and reports seconds by update and this process's peak memory."""
     capture = open_source(folder)
     count = min(frames, capture.frame_count)
     updates: list[Row] = []

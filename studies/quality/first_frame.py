@@ -64,8 +64,8 @@ def load_first_frame(path: Path) -> tuple[StaticResult, float] | None:
     with np.load(path, allow_pickle=False) as file:
         arrays = {name: file[name] for name in ARRAYS if name in file}  # those that are None are not kept
         names, exposures = file["exposure_names"].tolist(), file["exposures"]
-        told = zip(*(file[f"evidence_{name}"].tolist() for name in ("names", "shares", "texts")), strict=True)
-        evidence = {name: Evidence(share, text) for name, share, text in told}
+        rows = zip(*(file[f"evidence_{name}"].tolist() for name in ("names", "shares", "texts")), strict=True)
+        evidence = {name: Evidence(share, text) for name, share, text in rows}
         losses = file["losses"].tolist()
         result = StaticResult(Gaussians(**arrays), dict(zip(names, exposures, strict=True)), losses, evidence=evidence)
         return result, float(file["seconds"])

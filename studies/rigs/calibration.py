@@ -1,4 +1,4 @@
-"""``scripts/bench calibration``: rigs with faults: what frame 0 tells of them, and what refining them is worth.
+"""``scripts/bench calibration``: rigs with faults: what frame 0 reports of them, and what refining them is worth.
 
 Faults are put into the calibration; the pictures stay. Test cameras keep theirs.
 """
@@ -32,7 +32,7 @@ FAULTS = (
     ("focal", 0.01),
 )  # fmt: skip
 """Of one camera after the other: turns by pixels across and down, the principal point, the focal length."""
-TOLD = (
+MEASURED = (
     Column("capture", "capture"),
     Column("fault", "fault"),
     Column("residual, px", "residual"),
@@ -95,11 +95,11 @@ def run(
         captures: folders. out: a file a finished run goes here; run again to go on. fit: also frame 0 of faulty rigs.
         changes: to the settings. again: measure anew. report: takes the printed lines.
     """
-    told, fitted = [], []
+    measured_rows, fitted = [], []
     for folder in captures:
         capture = open_source(folder)
         matches = matches_by_appearance(collect_views(capture.rig, dict(capture.frame(0).images), {}))
-        told += _told(capture.name, matches)
+        measured_rows += _measured(capture.name, matches)
         report(f"{capture.name}, as given: {refined_rig(capture.rig, matches).text}")
         for way, pixels in RIGS if fit and capture.test_rig is not None else ():
             settings = recorded(settings_of("scas4d", None, 0, list(changes)), ())
@@ -111,18 +111,20 @@ def run(
             row = kept_row(path, partial(_row, known, folder, rig, changes), again=again)
             report(f"{row['capture']}, {row['rig']}: {row['given']:.2f} dB, refined {row['refined']:.2f} dB")
             fitted.append(row)
-    tables = "\n\n".join(markdown(rows, columns) for rows, columns in ((told, TOLD), (fitted, FITTED)) if rows)
+    tables = "\n\n".join(
+        markdown(rows, columns) for rows, columns in ((measured_rows, MEASURED), (fitted, FITTED)) if rows
+    )
     out.mkdir(parents=True, exist_ok=True)
     (out / "calibration.md").write_text(tables + "\n")
     report(tables)
-    return [*told, *fitted]
+    return [*measured_rows, *fitted]
 
 
 def _row(known: Row, folder: Path, rig: Rig, changes: Sequence[str]) -> Row:
     return {**known, **_fitted(folder, rig, changes), "core": core_version(), "machine": machine()}
 
 
-def _told(name: str, matches: Matches) -> list[Row]:
+def _measured(name: str, matches: Matches) -> list[Row]:
     """Residuals of the rig as it is given, and of each camera in turn with each fault."""
     given, off = residuals(matches)
     known = np.array([fit.pixels for fit in given.values()])
@@ -143,7 +145,7 @@ def _told(name: str, matches: Matches) -> list[Row]:
 
 def _told_row(capture: str, fault: str, residual: NDArray[np.float64], named: str, others: int) -> Row:
     known = residual[np.isfinite(residual)]
-    few = f", {len(residual) - len(known)} not told" if len(known) < len(residual) else ""
+    few = f", {len(residual) - len(known)} not measured" if len(known) < len(residual) else ""
     text = f"{known.min():.2f} to {known.max():.2f}, median {np.median(known):.2f}" if len(known) else "–"
     return {"capture": capture, "fault": fault, "residual": text + few, "named": named, "others": others}
 

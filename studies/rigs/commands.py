@@ -60,7 +60,7 @@ def calibration(
     again: Again = False,
     changes: Changes = None,
 ) -> None:
-    """Puts faults into calibrations: what frame 0 tells of each, and what refining them is worth.
+    """Puts faults into calibrations: what frame 0 reports of each, and what refining them is worth.
 
     Leaves calibration.md in the study's folder; a fit that was measured is not measured again.
     """

@@ -25,13 +25,13 @@ Grey = Sequence[NDArray[np.uint8]]
 CORNERS, APART = 400, 4
 """Corners of a picture at most, and pixels between them."""
 MOVING = 2.0
-"""Pixels from frame 0 to the last that a corner must go: one that stands tells nothing of tracks."""
+"""Pixels from frame 0 to the last that a corner must go: a static one says nothing of tracks."""
 BACK = 0.5
 """Pixels by which a corner may miss where it came from, followed back frame by frame."""
 SAME = 0.01
 """Of the distance: what two cameras see at a pixel is one point where it is no farther apart."""
 FEWEST = 20
-"""Positions, over points and frames, from which a median is told."""
+"""Positions, over points and frames, from which a median is taken."""
 
 
 def flow_consistency(scene: Reconstruction, capture: Capture, count: int) -> Row:

@@ -101,7 +101,7 @@ def _played(folder: Path, out: Path, settings: Settings, updates: int, drift: tu
         scores.append(float("nan") if score is None else score)
     arrays = scene.history.effects(scene.history.indices[-1]).get(NAME, {})
     twists = arrays.get("twists", np.zeros((len(names), 6)))
-    told = {name: _pixels(scene, name, twists[names.index(name)]) for name in offsets}
+    offsets_found = {name: _pixels(scene, name, twists[names.index(name)]) for name in offsets}
     scale = settings.scene.image_scale
     return {
         "capture": capture.name,
@@ -109,7 +109,7 @@ def _played(folder: Path, out: Path, settings: Settings, updates: int, drift: tu
         "psnr": float(np.mean(scores)),
         "last": float(np.mean(scores[-5:])),
         "true": _words({name: scale * offset for name, offset in offsets.items()}),
-        "found": _words(told),
+        "found": _words(offsets_found),
         "followed": [name for name, twist in zip(names, twists, strict=True) if twist.any()],
     }
 

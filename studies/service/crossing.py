@@ -1,7 +1,7 @@
 """Files of the three packages that one frame crosses between PUT and commit, and one render between request and answer.
 
 Both bound how much a reader has to open to follow a frame. A file counts when a function of it runs, in whatever
-process, for each of two frames, or of two renders: what a process happens to do meanwhile is left aside. So are
+process, for each of two frames, or of two renders: what a process happens to do meanwhile is ignored. So are
 `__init__` files, the kernels, the groups of effects (those that a scene has: a few of many) and `server/repair` (which
 looks at the disk every few seconds, whatever comes). The service runs as usual, with a profiler in each process.
 """
@@ -134,19 +134,19 @@ def _files(folder: Path, phase: str, root: Path) -> Iterator[str]:
             path = Path(name)
             if path.is_relative_to(root):
                 inside = path.relative_to(root)
-                aside = path.name == "__init__.py" or "kernels" in inside.parts
-                aside = aside or ("effects" in inside.parts and inside.parts[-2] != "effects")
-                aside = aside or inside.parts[:2] == ("server", "repair")
-                if inside.parts[0] in PACKAGES and not aside:
+                ignored = path.name == "__init__.py" or "kernels" in inside.parts
+                ignored = ignored or ("effects" in inside.parts and inside.parts[-2] != "effects")
+                ignored = ignored or inside.parts[:2] == ("server", "repair")
+                if inside.parts[0] in PACKAGES and not ignored:
                     yield inside.as_posix()
 
 
-def run(sample: Path, told: Callable[[str], None] = print) -> bool:
+def run(sample: Path, echo: Callable[[str], None] = print) -> bool:
     """Prints both lists; answers whether both are short enough."""
     with tempfile.TemporaryDirectory(prefix="scas4d-crossing-") as folder:
         files = crossed(Path(folder), open_measured(sample))
     for phase, most in (("frame", MOST_OF_A_FRAME), ("render", MOST_OF_A_RENDER)):
-        told(f"a {phase} crosses {len(files[phase])} files (at most {most}):")
+        echo(f"a {phase} crosses {len(files[phase])} files (at most {most}):")
         for name in files[phase]:
-            told(f"  {name}")
+            echo(f"  {name}")
     return len(files["frame"]) <= MOST_OF_A_FRAME and len(files["render"]) <= MOST_OF_A_RENDER

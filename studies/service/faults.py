@@ -34,7 +34,7 @@ from studies.service.strangers import Attack, strangers
 TURN_S = 15.0
 """Of updates without strangers; with them, until the last connection is closed."""
 KILLS_OF_A_WORKER_AT_A_FRAME = 4
-"""The sixth sets a frame aside, as it should: the study stays below, and kills again when the next is at work."""
+"""The sixth fails a frame, as it should: the study stays below, and kills again when the next is at work."""
 
 PARTS = ("kills", "beginnings", "log", "disk", "bits", "strangers")
 """The scenarios by name."""
@@ -146,7 +146,7 @@ def damaged_log(
             faults.append(f"{said}: {error}")
         finally:
             victim.stop()
-    summary = f"started {cuts + flips} times; {dropped} frames set aside with their reason, all others committed"
+    summary = f"started {cuts + flips} times; {dropped} frames failed with their reason, all others committed"
     target = "starts, loses nothing acknowledged before the damage, says what it dropped"
     return ScenarioResult(f"{cuts} cuts and {flips} flipped bytes of journal and frame log", target, summary, faults)
 

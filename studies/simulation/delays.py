@@ -11,7 +11,7 @@ START_S: Range = (2.0, 4.0)
 NOTICED_S: Range = (3.0, 9.0)
 """From a node's silence until Ray takes it for lost, with checks every 1 s that may take 2 s and fail 3 times."""
 TOLD_S: Range = (3.0, 6.0)
-"""From then until the service is told: the rest of the 14 to 18 s that pass in all until a scene goes on."""
+"""From then until the service is notified: the rest of the 14 to 18 s that pass in all until a scene goes on."""
 
 HEAD_S: Range = (3.0, 5.5)
 """The head does not answer for so long after its end: `scripts/bench head`, with Redis and a supervisor."""

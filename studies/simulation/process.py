@@ -19,7 +19,7 @@ from studies.simulation.work import Work
 
 
 class SimulatedProcess:
-    """A worker process, as `RayProcess` tells of one: nothing of it reaches the service once its end was told.
+    """A worker process, as `RayProcess` describes one: nothing of it reaches the service once its end was reported.
 
     Attributes:
         over: the service has given it up, or has ended. work: None before it has a place, and when it has ended.

@@ -1,12 +1,12 @@
-"""The record of a simulation: frames acknowledged, committed and told; times of places and of failures got over.
+"""The record of a simulation: frames acknowledged, committed and reported; times of places and of failures got over.
 
 A frame is **run twice** if the service knew of one worker's commit of it (`FrameCommitted` or `Ready` of the scene's
-worker, or found by a new service; from then on clients see it), and another worker's commit was told or read after it,
+worker, or found by a new service; from then on clients see it), and another worker's commit was reported after it,
 or none. Two processes of one scene at a time, neither given up, count as well. A worker is **given up** for the folder
 of states once the service has started the next one: until then, what it still commits is taken over and kept.
 
 What a worker commits after the states were linked for the next, and before the link moves, is updated again by design
-(docs/cluster.md, Fencing). Nobody was told of it, so it does not count as run twice; it is counted apart.
+(docs/cluster.md, Fencing). It was not reported, so it does not count as run twice; it is counted apart.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class FrameCounts:
     Attributes:
         read: through the links. lost: acknowledged, and not read. foreign: read, and written by a worker that was given
             up. different: read, and other bytes than an undisturbed chain has. twice: run twice. beside: processes that
-            began while another of their scene ran. again: updated again after a commit that nobody was told of.
+            began while another of their scene ran. again: updated again after a commit that was not reported.
     """
 
     read: int
@@ -73,7 +73,7 @@ class FrameRecord:
         self._writes = 0
         self._adrift: set[int] = set()
         self._kept: dict[str, dict[tuple[int, int], None]] = {}
-        self._told: dict[str, dict[int, int]] = {}
+        self._reported: dict[str, dict[int, int]] = {}
         self._twice: dict[str, set[int]] = {}
 
     def start(self, scene: str, beside: bool) -> int:
@@ -100,17 +100,17 @@ class FrameRecord:
         if worker == self._newest[scene]:
             self._kept.setdefault(scene, {})[index, worker] = None
 
-    def tell(self, scene: str, index: int, worker: int) -> None:
+    def report(self, scene: str, index: int, worker: int) -> None:
         """The service learns that a frame is committed."""
-        if self._told.setdefault(scene, {}).setdefault(index, worker) != worker:
+        if self._reported.setdefault(scene, {}).setdefault(index, worker) != worker:
             self._twice.setdefault(scene, set()).add(index)
 
     def untold(self, scene: str, count: int) -> list[int]:
         """Returns those of the first `count` frames, which are committed, that the service did not know of."""
-        told = self._told.setdefault(scene, {})
-        if gone := {index for index in told if index >= count}:
+        reported = self._reported.setdefault(scene, {})
+        if gone := {index for index in reported if index >= count}:
             self._twice.setdefault(scene, set()).update(gone)
-        return [index for index in range(count) if index not in told]
+        return [index for index in range(count) if index not in reported]
 
     def check(self, scene: str, found: dict[int, FoundFrame], chain: Sequence[str]) -> FrameCounts:
         """Checks the frames of a scene that are read at the end.
@@ -118,12 +118,12 @@ class FrameRecord:
         Args:
             found: by index. chain: contents of an undisturbed run.
         """
-        told = self._told.get(scene, {})
+        reported = self._reported.get(scene, {})
         twice = self._twice.get(scene, set()) | {
-            index for index, worker in told.items() if index not in found or found[index].worker != worker
+            index for index, worker in reported.items() if index not in found or found[index].worker != worker
         }
         read = {(index, frame.worker) for index, frame in found.items()}
-        again = [(index, worker) for index, worker in self._kept.get(scene, {}) if told.get(index) != worker]
+        again = [(index, worker) for index, worker in self._kept.get(scene, {}) if reported.get(index) != worker]
         return FrameCounts(
             read=len(found),
             lost=sum(index not in found for index in range(self.acknowledged[scene])),
@@ -148,7 +148,7 @@ class TimeRecord:
         placed: seconds with room until a worker had a place, by the reason for which it was wanted; and those of them
             in which the head answered. resumed: seconds from a failure until the scene went on, by failure; and those
             of them without room. waited: seconds of processes that waited longer than `WAIT_S` for a place.
-        unexplained: those of them whose scene was not told what for.
+        unexplained: those of them whose scene was not given a reason.
     """
 
     capacity: Capacity
@@ -179,7 +179,7 @@ class TimeRecord:
         self._explained.discard(scene)
 
     def explain(self, scene: str) -> None:
-        """The scene was told that no node has room."""
+        """The scene was notified that no node has room."""
         self._explained.add(scene)
 
     def place(self, scene: str, kind: int) -> None:

@@ -1,4 +1,4 @@
-"""A scene of the simulated service: acknowledges frames, gives the worker one at a time, counts what it is told."""
+"""A scene of the simulated service: acknowledges frames, gives the worker one at a time, counts the reports."""
 
 from __future__ import annotations
 
@@ -89,9 +89,9 @@ class SimulatedScene:
         for index in self._frames.untold(self.plan.name, count):
             try:
                 worker = read_frame(frame_file(self.plan.spec.folder.states, index)).worker
-            except FileNotFoundError:  # told of, and not to be read: no worker has this number
+            except FileNotFoundError:  # reported, and not to be read: no worker has this number
                 worker = 0
-            self._frames.tell(self.plan.name, index, worker)
+            self._frames.report(self.plan.name, index, worker)
         self._committed = count
 
     # Frames.
@@ -132,7 +132,7 @@ class SimulatedScene:
                 self._background.run(self._resume(message, self.worker.life))
             case FrameCommitted():
                 self.worker.deaths.committed()
-                self._frames.tell(self.plan.name, message.index, message.report["worker"])
+                self._frames.report(self.plan.name, message.index, message.report["worker"])
                 self._committed, self._at = message.index + 1, None
                 self._begin()
                 self._end_if_done()

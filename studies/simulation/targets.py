@@ -55,7 +55,7 @@ def rows(outcome: Outcome) -> list[Row]:
     longest = max(outcome.waited, default=0.0)
     table_rows += [
         _none(
-            f"workers without a place for {WAIT_S:g} s whose scene was not told why",
+            f"workers without a place for {WAIT_S:g} s whose scene was not given a reason",
             outcome.unexplained,
             f" of {len(outcome.waited):,}",
         ),
@@ -65,7 +65,7 @@ def rows(outcome: Outcome) -> list[Row]:
             f"; {outcome.sizes.more:,} were asked for beyond the room, the longest wait was {longest:.0f} s",
         ),
         _none("folders of workers before that are left in the end", outcome.folders),
-        Row("frames updated again after a commit that nobody was told of", f"{frames.again:,}"),
+        Row("frames updated again after a commit that was not reported", f"{frames.again:,}"),
     ]
     for failure, words in AFTER.items():
         if times := outcome.resumed.get(failure):

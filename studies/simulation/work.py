@@ -145,7 +145,7 @@ class Work:
         self._end.resume()
 
     def drift(self) -> None:
-        """Nobody tells it what to do any more: it goes on by itself for a while."""
+        """It gets no instructions any more: it continues by itself for a while."""
         if not self._adrift and not self._ended:
             self._adrift = True
             self._end.set(ADRIFT_S, self._leave)

@@ -36,7 +36,7 @@ def variants(
 ) -> None:
     """Compares settings on variants of captures: backwards, every second frame, half of the cameras or pixels, later.
 
-    Tells what each contender gains against the first on every variant, how often it is behind, and for each capture
+    Reports what each contender gains against the first on every variant, how often it is behind, and for each capture
     what the contender gains on it that wins on all others.
 
     Example: scripts/bench variants captures/robot captures/wheel --contender scas4d --contender adaptive --quick

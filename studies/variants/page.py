@@ -37,9 +37,9 @@ def page(rows: Sequence[Row], contenders: Sequence[str]) -> str:
     ]
     for place in places:
         base = figures[place, first]
-        told = [f"{mean(base, 'psnr_first'):.2f}", f"{mean(base, 'psnr'):.2f}{_spread(base)}", _tracks(base)]
-        told += [_against(figures.get((place, name), []), base) for name in others]
-        lines.append("| " + " | ".join([*place, *told]) + " |")
+        cells = [f"{mean(base, 'psnr_first'):.2f}", f"{mean(base, 'psnr'):.2f}{_spread(base)}", _tracks(base)]
+        cells += [_against(figures.get((place, name), []), base) for name in others]
+        lines.append("| " + " | ".join([*place, *cells]) + " |")
     for name in others:
         both = [place for place in places if (place, name) in figures]
         if not both:

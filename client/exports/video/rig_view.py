@@ -12,7 +12,7 @@ from scas4d_core.cameras import Camera, Rig
 Float = NDArray[np.float64]
 
 PARALLEL = 1e-6
-"""Of the largest entry, cubed: a smaller determinant means that the optical axes do not tell a point."""
+"""Of the largest entry, cubed: a smaller determinant means that the optical axes do not meet in a point."""
 FAR = 20.0
 """In radii of the rig: axes that meet farther away are parallel."""
 

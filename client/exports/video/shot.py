@@ -163,7 +163,7 @@ def _camera(given: Source, name: str | None, beside: Capture | None) -> Camera:
         }
     if not cameras:
         raise InputError(
-            f"{given.name} tells no cameras; those of USD and .glb are not read back",
+            f"{given.name} has no cameras; those of USD and .glb are not read back",
             "give the folder of scas4d reconstruct, its .s4d file, or --beside a capture",
         )
     if name is None:

@@ -58,8 +58,8 @@ def make_video(
                 bars("rendering", number + 1, planned.count)
     width, height = planned.whole_size
     seconds, size = planned.count / planned.fps, target.stat().st_size / 1e6
-    told = f"{planned.count} pictures of {width}x{height}, {seconds:.1f} s, {size:.1f} MB"
-    console.print(f"{target}: {told}", highlight=False, soft_wrap=True)
+    summary = f"{planned.count} pictures of {width}x{height}, {seconds:.1f} s, {size:.1f} MB"
+    console.print(f"{target}: {summary}", highlight=False, soft_wrap=True)
     return target
 
 

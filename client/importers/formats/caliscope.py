@@ -3,7 +3,7 @@
 A table `[cameras.<id>]` a camera: `size` (width, height), `matrix`, `distortions` (5, of a `fisheye` 4), `rotation` as
 a matrix [3][3] or Rodrigues' vector [3], and `translation`, world to camera. Its videos are `cam_<id>.mp4`, those of
 earlier versions, which wrote `port` for `cam_id`, `port_<id>.mp4`; the camera has that name. `rotation_count` turns
-pictures for its trackers only, not for the calibration. Cameras that it was told to ignore, or that have no pose, are
+pictures for its trackers only, not for the calibration. Cameras that are marked as ignored, or that have no pose, are
 left out, with a remark. (github.com/mprib/caliscope, `src/caliscope/cameras/camera_array.py`.)
 """
 

@@ -107,5 +107,5 @@ def size_of_pictures(folder: Path, camera: str, where: str) -> tuple[int, int]:
                 raise CaptureError(f"{path}: cannot be read as video ({fault})") from fault
     raise CaptureError(
         f"{where} says nothing of the pictures' size, and there is no {images}/ nor {folder / 'videos' / camera}.mp4 "
-        "to tell it; give the pictures there, or the size in the file"
+        "to measure it; give the pictures there, or the size in the file"
     )

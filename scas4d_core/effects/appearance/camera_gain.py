@@ -72,7 +72,7 @@ def _centre(gains: Array) -> Array:
 def spread_of(seen: FrameObservation) -> float | None:
     """Standard deviation over the cameras of the colour of their gains of light; None: untold.
 
-    Means of the pictures and of their renderings tell it. What all channels of a camera share has no say: a thing
+    It is estimated from means of pictures and renderings. What all channels of a camera share has no say: a thing
     before black that is drawn too small, or that shines a little, is as dark in all of them.
     """
     spreads = []

@@ -3,7 +3,7 @@
 Each Gaussian has a normal and a strength, all share one environment (``kernels.appearance.direction``). A colour by the
 Gaussian's own harmonics, turned with it, would be wrong after a few frames: the highlight of a lamp that stands wanders
 over what turns. It is learnt with frame 0 (``first_frame.glossy``) and goes on in the updates: what turns brings its
-highlights to other places, which tells normals and lamps better than one frame can.
+highlights to other places, which determines normals and lamps better than one frame can.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from scas4d_core.effects.evidence import FrameObservation
 
 TURNED_TOGETHER = 32
-"""Gaussians whose places tell the rotation of a normal."""
+"""Gaussians from whose places the rotation of a normal is estimated."""
 FEW = 4
 """Views that the evidence is taken from."""
 

@@ -19,22 +19,22 @@ Double = NDArray[np.float64]
 LOOKED_AT = 4096
 """Pixels of a picture that are looked at, about: rows and columns apart."""
 MOST = 1000
-"""Of those that tell a shift, that are asked, about: more of a room tell it no better than things do."""
+"""Share of the informative pixels that are used, about: more pixels of a room add nothing that objects do not show."""
 STEEP = 0.02
-"""Length of the slope, of a value 0…1 a pixel, from which a pixel tells a shift: the others tell noise."""
+"""Length of the slope, of a value 0…1 a pixel, from which a pixel shows a shift: flatter pixels show noise."""
 CAUCHY = 2.4
 """Times the usual residual, at which a pixel has half of its weight (95 % efficient under Gaussian noise)."""
 QUIETEST = 1 / 255
 """Residual, 0…1, that is usual at least: the rounding of pictures."""
 FEW = 50
-"""Pixels that tell a shift: of fewer nothing is told."""
+"""Informative pixels that a shift needs at least."""
 TURNED, SHIFTED = 4.0, 0.25
 """Pixels that a turn, and a shift at the depth of the picture's middle, are thought to move it by before anything is
 seen: tripods sag and are knocked, which turns a camera rather than shifts it. It decides where the two look alike: with
 1 pixel of shift, and a prior for each step instead of for all, turns of 0.5° were undone by shifts of 1 cm."""
 SMALLEST = 1e-9
 """Of the trace, added to equations that may have no solution."""
-TOLD = 0.02
+RESIDUAL_SCALE = 0.02
 """Residual, 0…1, at which ``FEW`` pixels with a slope of 1 weigh as much as what is thought before."""
 
 
@@ -58,7 +58,7 @@ class Equations(NamedTuple):
 
     Attributes:
         matrix: [K, K], vector: [K]; a twist ξ leaves the weighted squares ``energy − 2 vector·ξ + ξ·matrix·ξ``, in
-            units of ``TOLD``. Shifts are in units of ``depth``. energy: those of the residual as it is.
+            units of ``RESIDUAL_SCALE``. Shifts are in units of ``depth``. energy: those of the residual as it is.
         depth: metres, of the picture's middle.
     """
 
@@ -69,7 +69,7 @@ class Equations(NamedTuple):
 
 
 def pictures(target: Array, shown: Array, every: int = 1) -> Pictures | None:
-    """Both at the pixels that tell a shift, of those that are looked at; None: too few do.
+    """Both at the informative pixels among those that are looked at; None: there are too few.
 
     Args:
         target: [3, H, W]. shown: [3, H, W], or [3, h, w] where it is thinned to every so many rows and columns, and the
@@ -140,7 +140,7 @@ def equations(seen: Pictures, moved: Double, depth: float = 1.0) -> Equations:
 def _weights(residual: Double) -> Double:
     """Of each residual."""
     usual = max(QUIETEST, 1.4826 * float(np.median(np.abs(residual))))
-    weights: Double = (FEW * TOLD**2) ** -1 / (1 + np.square(residual / (CAUCHY * usual)))
+    weights: Double = (FEW * RESIDUAL_SCALE**2) ** -1 / (1 + np.square(residual / (CAUCHY * usual)))
     return weights
 
 

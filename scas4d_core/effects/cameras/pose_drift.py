@@ -2,14 +2,14 @@
 
 Once a frame, after its update, the renderings of some cameras are compared with their pictures: the turn of a camera
 that would bring them onto each other is noted, as what the camera is off by against its calibration. One frame says
-little, for what moves is followed late. A camera is believed to have moved where its earlier frames tell what its
+little, for what moves is followed late. A camera is believed to have moved where its earlier frames show what its
 residual is now, and by ``LEAST`` pixels; then its pose follows, half of the way a frame. All others keep theirs to the
 bit.
 
 The poses are those of the training views of the frames after: masks shift with their camera, probe views and what is
 new are seen from where it stands. Views that users ask for are rendered for the camera as it is given: "as camera 7"
-is as that was calibrated. Who is believed is decided before (``robust.outliers``): a camera that is off is set aside
-as ever, and looked at all the same; it comes back once its pose is found, and stays aside beyond the limit. A gain of
+is as that was calibrated. Who is believed is decided before (``robust.outliers``): a camera that is off is excluded
+as ever, and still measured; it comes back once its pose is found, and stays excluded beyond the limit. A gain of
 a camera is the median over its pixels, which hardly sees a shift of some pixels; ``shadows`` may learn in such
 frames, but from all cameras.
 """
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 NAME = "pose_drift"
 CAMERAS = 4
-"""At least, of which one can be told to be off: between fewer, what moves passes for it."""
+"""Cameras that are needed to find one that is off: with fewer, moving Gaussians could explain the difference."""
 ENOUGH = 0.5
 """Share of the rig's cameras from which a frame teaches."""
 LEAST = 0.25
@@ -64,15 +64,15 @@ SHARE = 0.5
 """Of the way to what a frame says, that poses and what is noted take: a drift is followed late by as much as it goes in
 a frame, and a frame in which a thing is followed late does half of the harm."""
 STANDING = 6
-"""Cameras that stand, others in each frame, that are rendered where the effect is on: they tell what of a twist is the
+"""Cameras that stand, others in each frame, that are rendered where the effect is on: they show what of a twist is the
 scene's own motion."""
 LARGEST, TURN = 0.02, radians(1)
 """Share of the picture's width, and angle, by which a pose is moved at most: a camera that is off by more has been
-moved, and is set aside as ever."""
+moved, and is excluded as ever."""
 COVERED = 0.1
 """Alpha from which a pixel has a depth."""
 SMALLEST = 1e-3
-"""Added to the 3×3 equations of a turn in pixels, 0.3 pixels of one that weighs nothing: a bare wall tells no turn."""
+"""Added to the 3×3 equations of a turn in pixels, 0.3 pixels of one that weighs nothing: a bare wall shows no turn."""
 
 
 def posed(rig: Rig, carried: Mapping[str, Arrays]) -> Rig:
@@ -260,7 +260,7 @@ def _says(seen: FrameObservation) -> bool:
 
 
 def _looked_at(seen: FrameObservation, poses: Poses, rows: Mapping[str, int]) -> list[TrainingView]:
-    """Views to be aligned: of cameras that are off or set aside, and of some that stand, others in each frame."""
+    """Views to be aligned: of cameras that are off or excluded, and of some that stand, others in each frame."""
     off = poses.off()
     standing = [view for view in seen.views if not off[rows[view.name]]]
     count = len(standing)
@@ -270,21 +270,21 @@ def _looked_at(seen: FrameObservation, poses: Poses, rows: Mapping[str, int]) ->
 
 
 def _aligned(seen: FrameObservation, views: list[TrainingView]) -> dict[int, tuple[Equations, Camera, Array]]:
-    """By row, the equations of each view, its camera and lens; without those that tell too little."""
+    """By row, the equations of each view, its camera and lens; without those that show too little."""
     rows, by_row = {name: row for row, name in enumerate(seen.rig.names)}, {}
     for view in views:
         shown, depth = _rendered(seen, view)
-        told = pictures(view.target[:3], _exposed(view, shown))
-        if told is not None:
-            equations = twist_equations(view.camera.lens, told, depth)
+        compared = pictures(view.target[:3], _exposed(view, shown))
+        if compared is not None:
+            equations = twist_equations(view.camera.lens, compared, depth)
             by_row[rows[view.name]] = (equations, seen.rig[view.name], view.camera.lens)
     return by_row
 
 
 def _look(poses: Poses, row: int, view: TrainingView, shown: Array, every: int) -> None:
-    told = pictures(view.target[:3], _exposed(view, shown), every)
-    if told is not None:
-        poses.look(row, turn_equations(view.camera.lens, told))
+    compared = pictures(view.target[:3], _exposed(view, shown), every)
+    if compared is not None:
+        poses.look(row, turn_equations(view.camera.lens, compared))
 
 
 def _exposed(view: TrainingView, shown: Array) -> Array:

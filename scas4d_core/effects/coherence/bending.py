@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 SAMPLE = 4000
 """Gaussians that patches are made of, or up to twice as many: a patch is the same part of a thing in all states."""
 PATCH = 40
-"""Gaussians of a patch beside its middle: positions of fewer are too noisy to tell a turn."""
+"""Gaussians of a patch beside its middle: positions of fewer are too noisy to show a turn."""
 PATCHES = 400
 """Or up to twice as many: the evidence is a median over them."""
 AROUND = 19

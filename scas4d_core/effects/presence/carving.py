@@ -31,7 +31,7 @@ COARSE = 32
 VOXEL_PIXELS = 1.5
 """Edge of the smallest voxel, at most, in pixels at the middle of the stage."""
 MOST_CELLS = 1 << 24
-"""Of the grid in which things are told apart; what is strewn wider is no thing."""
+"""Cells of the grid that separates new objects; a sparser cluster is no object."""
 MOST_VOXELS = 1_000_000
 """A level that would hold more is not entered."""
 AT_ONCE = 1 << 16

@@ -50,7 +50,7 @@ class Novelty:
         new: [H, W] shows what the state does not have. stale: [H, W] the state shows what is not there.
         covered: [H, W] the state shows a moving thing, which something new may lie behind.
         bare: [H, W] the state shows nothing at all where the picture has something that stands. behind: [H, W] picture
-            and state show what stands, as far as can be told.
+            and state show static Gaussians, as far as can be measured.
         error: [H, W] squared difference of picture and rendering, mean over the channels.
     """
 

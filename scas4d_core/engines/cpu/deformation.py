@@ -134,7 +134,7 @@ class CpuDeformation:
     def rest(self, layers: int) -> None:
         """Let the first so many layers rest, as they are set now: they are applied once, and get no gradient.
 
-        What ``forward`` finds has the same bits. Whoever sets the parameters of one anew lets none rest before.
+        ``forward`` gives the same bits. Unfreeze all layers (``rest(0)``) before setting the parameters of one.
 
         Raises:
             ValueError: the last layer cannot.

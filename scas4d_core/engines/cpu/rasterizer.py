@@ -33,7 +33,7 @@ class Drawing(NamedTuple):
 
     Attributes:
         blocks: [tiles] uint64, bits as of ``tiles.cover``. learnt: [N] uint8, 1 for the Gaussians that change: they
-            have to stay within (``CpuRasterizer.escaped`` tells whether one did not), and they alone get gradients.
+            have to stay within (``CpuRasterizer.escaped`` is true where one did not), and they alone get gradients.
         narrow: whether only those of the blocks are drawn that these Gaussians reach: ``CpuRasterizer.drawn``.
     """
 

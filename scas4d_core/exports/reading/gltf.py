@@ -45,10 +45,10 @@ class GltfFrame:
     @property
     def metres_per_unit(self) -> float:
         """Metres of one of the user's units."""
-        told = self._document.get("asset", {}).get("extras", {}).get("metres_per_unit", 1.0)
-        if not isinstance(told, int | float) or not 0 < told < float("inf"):
-            raise InputError(f"{self._name}: metres_per_unit is {told!r}", REMEDY)
-        return float(told)
+        unit = self._document.get("asset", {}).get("extras", {}).get("metres_per_unit", 1.0)
+        if not isinstance(unit, int | float) or not 0 < unit < float("inf"):
+            raise InputError(f"{self._name}: metres_per_unit is {unit!r}", REMEDY)
+        return float(unit)
 
     def cloud(self) -> Cloud:
         """The Gaussians in the user's world and unit, OpenCV axes; of the harmonics all that the file has.

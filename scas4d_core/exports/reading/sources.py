@@ -23,7 +23,7 @@ from scas4d_core.exports.usd import SUFFIXES as USD_SUFFIXES
 from scas4d_core.query.ply import SH_DEGREE_0, read_ply
 
 RATE = 30.0
-"""Frames a second of numbered files where nothing tells: they have no times."""
+"""Frames per second of numbered files, which have no times."""
 NUMBERED = re.compile(r"frame_(\d+)(\.\w+)")
 LOST = {
     ".splat": "its rows are sorted by size, and have no ids",
@@ -44,7 +44,7 @@ def open_export(path: Path | str, frames_per_second: float = RATE) -> ReadStates
         frames_per_second: of numbered files: frame n is at n / frames_per_second.
 
     Raises:
-        InputError: it is none, or its format does not tell which Gaussian is which.
+        InputError: it is none, or its format has no ids of Gaussians.
 
     >>> open_export("scene.splat")
     Traceback (most recent call last):
@@ -119,13 +119,13 @@ def _sequence(source: str, suffix: str, files: dict[int, tuple[str, Bytes]], rat
     remarks = [f"numbered files have no times: {rate:g} frames a second are taken"] if len(frames) > 1 else []
     if NUMBERED.fullmatch(name) is None:
         remarks.append(
-            f"{name} tells no frame and is taken for frame 0: call it frame_000013{suffix} if it is frame 13"
+            f"{name} names no frame and is taken for frame 0: call it frame_000013{suffix} if it is frame 13"
         )
     cloud: Callable[[int], Cloud]
     if suffix == ".ply":
         rows = PlyRows(named)
         cloud, metres, deep = rows.cloud, 1.0, rows.glossy
-        remarks.append("a .ply tells no unit: metres are taken")
+        remarks.append("a .ply has no unit: metres are assumed")
     else:
         first = GltfFrame(read(), name)
         metres, deep = first.metres_per_unit, first.cloud().harmonics.shape[1] > 1

@@ -31,7 +31,7 @@ STANDS = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class _Known:
-    """All that the frames tell of each Gaussian, by row: ids, moving, opacities [N], and the first axes [N, 4]."""
+    """What the frames hold of each Gaussian, by row: ids, moving, opacities [N], and the first axes [N, 4]."""
 
     ids: Int
     moving: NDArray[np.bool_]
@@ -46,7 +46,7 @@ class ReadStates:
     Attributes:
         frames: indices, rising. times: seconds, rising.
         cloud: returns that of a frame by its place in ``frames``, in the user's world and unit, OpenCV axes.
-        head: its world has no origin of its own: a file tells none.
+        head: its world has no origin of its own: a file has none.
         part_of: label by id; empty where the file has none. remarks: what was lost, a sentence each.
         damage: always None, as a compact file may have some.
 
@@ -134,7 +134,7 @@ class ReadStates:
             moving[rows, 0] = np.maximum(moving[rows, 0], away)
             opacities[rows, 0] = np.maximum(opacities[rows, 0], of.opacities)
         extent = float(np.ptp(first, axis=0).max(initial=0)) if len(first) else 0.0
-        far = float(np.abs(first).max(initial=0))  # what float32 cannot tell apart is no motion
+        far = float(np.abs(first).max(initial=0))  # a difference below float32's resolution is no motion
         least = max(STANDS * extent, 4 * float(np.finfo(np.float32).eps) * far)
         return _Known(
             np.fromiter(ids, np.int64, len(ids)), moving[:, 0] > least, opacities[:, 0].astype(np.float32), turns

@@ -34,8 +34,8 @@ def open_usd(path: Path) -> ReadStates:
     prim = stage.GetPrimAtPath(GAUSSIANS)
     if not prim or not prim.IsA("ParticleField3DGaussianSplat"):
         raise InputError(f"{path.name} has no Gaussians at {GAUSSIANS}", REMEDY)
-    told = geometry.PrimvarsAPI(prim)
-    ids = told.GetPrimvar("scas4d:id").Get() if told.HasPrimvar("scas4d:id") else None
+    primvars = geometry.PrimvarsAPI(prim)
+    ids = primvars.GetPrimvar("scas4d:id").Get() if primvars.HasPrimvar("scas4d:id") else None
     if ids is None:
         raise InputError(
             f"{path.name} has no ids (primvars:scas4d:id), so nobody knows which Gaussian is which", REMEDY
@@ -50,7 +50,7 @@ def open_usd(path: Path) -> ReadStates:
     frames = [first + round(code) for code in codes]
     if len(set(frames)) < len(frames):  # several in one time code: the rate is not that of the frames
         frames = list(range(first, first + len(codes)))
-    parts = told.GetPrimvar("scas4d:part").Get() if told.HasPrimvar("scas4d:part") else None
+    parts = primvars.GetPrimvar("scas4d:part").Get() if primvars.HasPrimvar("scas4d:part") else None
     part_of = {} if parts is None else dict(zip(reader.ids.tolist(), np.array(parts).tolist(), strict=True))
     unit = float(geometry.GetStageMetersPerUnit(stage))
     return ReadStates(

@@ -2,7 +2,7 @@
 
 Matches leave some of a rig's numbers open: where it is, which way it looks, how large it is, and nearly open some
 others, as whether its ring is a little bent. Here each camera is drawn to its pose as calibrated, by a Cauchy loss:
-what matches do not tell stays, and a camera that is far off comes free, and takes no other along. pycolmap triangulates
+what matches do not determine stays, and a camera that is far off pulls no other along. pycolmap triangulates
 here; its own bundle adjustment has no such term, and moved the cameras of an exact rig by 0.6 pixels in the median
 (docs/calibration.md).
 """

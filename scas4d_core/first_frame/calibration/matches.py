@@ -24,7 +24,7 @@ from scas4d_core.first_frame.points.triangulation import (
 from scas4d_core.posed_pictures import Float, PosedPicture
 
 LONGEST_SIDE = 800
-"""Pixels; larger pictures are made smaller before features are found: they would tell smaller faults, at seconds a
+"""Pixels; larger pictures are made smaller before features are found: they would show smaller faults, at seconds a
 camera."""
 FEATURES, CONTRAST = 2048, 0.0067
 """Features of a picture at most, and COLMAP's least contrast: of `basketball` half as many as points are made from, of

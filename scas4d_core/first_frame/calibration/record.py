@@ -18,7 +18,7 @@ class CameraResidual:
 
     Attributes:
         pixels: median distance from the epipolar lines, in pixels of the camera's pictures; NaN where too few matches
-            tell. matches: how many are right, about.
+            determine it. matches: how many are right, about.
     """
 
     pixels: float
@@ -31,7 +31,7 @@ class RefinedCamera:
 
     Attributes:
         turned: degrees. moved: of its centre, in the user's unit. focal: times its focal length as given.
-        before, after: its residual, pixels; NaN where too few matches tell. fixed: left as given for want of matches.
+        before, after: its residual, pixels; NaN with too few matches. fixed: left as given for want of matches.
         pose: [4][4] world to camera, the user's world.
     """
 

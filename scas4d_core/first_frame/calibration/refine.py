@@ -20,7 +20,7 @@ from scas4d_core.progress import Progress
 from scas4d_core.settings import StaticSettings
 
 LEAST_CAMERAS = 3
-"""Of two cameras nothing tells which one is off."""
+"""Cameras at least: of two, either could be off."""
 SURE = 2.0
 """Standard errors by which the loss of matches held out has to fall."""
 FEWEST_HELD = 20
@@ -101,10 +101,10 @@ def refined_rig(rig: Rig, matches: Matches) -> Refinement:
         rig: as given, of the user's world. matches: of its cameras' pictures of one moment.
     """
     learnt, held = matches.split()
-    told = list(residuals(matches)[0].values())
-    counts = [camera_fit.matches for camera_fit in told]
+    fits = list(residuals(matches)[0].values())
+    counts = [camera_fit.matches for camera_fit in fits]
     fixed = [
-        i for i, camera_fit in enumerate(told) if camera_fit.matches < FEWEST or not np.isfinite(camera_fit.pixels)
+        i for i, camera_fit in enumerate(fits) if camera_fit.matches < FEWEST or not np.isfinite(camera_fit.pixels)
     ]
     if len(counts) - len(fixed) < LEAST_CAMERAS:
         return _kept(f"only {len(counts) - len(fixed)} cameras have {FEWEST} matches or more")

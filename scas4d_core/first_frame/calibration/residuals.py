@@ -57,7 +57,7 @@ def residuals(matches: Matches) -> tuple[dict[str, CameraResidual], list[str]]:
     """The residual of each camera against those that are not off themselves, by name; and the names of those off.
 
     A camera that is off spoils the residuals of its neighbours. So the worst one is taken out, and the others are
-    measured again without it, as long as one is far worse than most. Where most are off nothing tells which.
+    measured again without it, as long as one is far worse than most. Where most are off it cannot be decided which.
     """
     measured = [(pair, epipolar_distances(matches, pair)) for pair in matches.pairs]
     off: list[int] = []

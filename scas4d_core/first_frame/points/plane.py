@@ -228,9 +228,9 @@ def _agreement(
     """
     laid = [_laid(view, picture, points) for view, picture in zip(views, smooth, strict=True)]
     scores, pairs = np.zeros(len(points)), np.zeros(points.shape[:3], np.intp)
-    for i, (one, mean, spread, told) in enumerate(laid):
-        for other, other_mean, other_spread, other_told in laid[:i]:
-            both = told & other_told
+    for i, (one, mean, spread, textured) in enumerate(laid):
+        for other, other_mean, other_spread, other_textured in laid[:i]:
+            both = textured & other_textured
             if not both.any():
                 continue
             covariance = _box(one * other) - mean * other_mean
@@ -241,7 +241,7 @@ def _agreement(
 
 
 def _laid(view: PosedPicture, picture: Planes, points: Float) -> tuple[Planes, Planes, Planes, Bool]:
-    """A picture laid on planes: [T, C, C] values, their means and deviations over patches, and which patches tell."""
+    """A picture on planes: [T, C, C] values, their means and deviations over patches, and which have texture."""
     uv, depth = view.camera.project(points.reshape(-1, 3))
     height, width = picture.shape
     with np.errstate(invalid="ignore"):

@@ -83,7 +83,7 @@ def features(
 def _all_features(
     views: Sequence[PosedPicture], extract: Callable[[NDArray[np.float32]], Any], limit: TimeLimit
 ) -> list[tuple[Float, NDArray[np.float32]]]:
-    """``features`` by a function that takes grey pictures; the first picture tells the pace."""
+    """``features`` by a function that takes grey pictures; the first picture measures the pace."""
     features_by_view: list[tuple[Float, NDArray[np.float32]]] = []
     size, began, divisor = [view.camera.width * view.camera.height for view in views], limit.clock(), 1
     for view in views:
@@ -187,8 +187,10 @@ def matched_tracks(views: Sequence[PosedPicture], limit: TimeLimit | None = None
         limit: of the time of frame 0; where it is short, pairs that look in different directions are left out.
     """
     limit = limit or TimeLimit(None)
-    told = features(views, limit)
-    described = [(view.camera, uv, descriptors) for view, (uv, descriptors) in zip(views, told, strict=True)]
+    features_by_view = features(views, limit)
+    described = [
+        (view.camera, uv, descriptors) for view, (uv, descriptors) in zip(views, features_by_view, strict=True)
+    ]
     offsets = np.concatenate([[0], np.cumsum([len(uv) for _, uv, _ in described])])
     owner = np.repeat(np.arange(len(views)), np.diff(offsets))
     pixels = np.concatenate([uv for _, uv, _ in described]) if len(owner) else np.zeros((0, 2))

@@ -15,7 +15,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.robust import timing
 from scas4d_core.robust.outliers import Past
-from scas4d_core.robust.timing import APART, CAMERAS, FARTHEST, OFF, TOLD, Look, Looks, astuple, told
+from scas4d_core.robust.timing import APART, CAMERAS, FARTHEST, MAX_ERROR, OFF, Look, Looks, astuple, measure_shift
 from scas4d_core.storage.history import History
 from studies.constants import all_varied
 from studies.hard_frames.footage import SyntheticFootage
@@ -36,7 +36,7 @@ def shown(moment: float, speed: float = 3.0) -> np.ndarray:
 
 
 def look(target: np.ndarray, speed: float = 3.0) -> Look:
-    found = told(target, shown(0, speed), shown(0.5, speed), shown(-0.5, speed))
+    found = measure_shift(target, shown(0, speed), shown(0.5, speed), shown(-0.5, speed))
     assert found is not None
     return found
 
@@ -65,8 +65,8 @@ def test_cut_off_pixels_are_not_asked() -> None:
 
 
 def test_what_hardly_changes_tells_nothing() -> None:
-    assert told(shown(0.5), shown(0), shown(0), shown(0)) is None
-    assert told(shown(0.5, 0.01), shown(0), shown(0.5, 0.01), shown(-0.5, 0.01)) is None
+    assert measure_shift(shown(0.5), shown(0), shown(0), shown(0)) is None
+    assert measure_shift(shown(0.5, 0.01), shown(0), shown(0.5, 0.01), shown(-0.5, 0.01)) is None
 
 
 def test_what_noise_hides_is_uncertain() -> None:
@@ -112,7 +112,7 @@ def test_the_median_of_the_cameras_is_0_and_those_little_known_are_not_told() ->
     assert found.keys() == four.keys()
     assert found["d"]["frames"] == pytest.approx(0.395)
     assert sorted(abs(one["frames"]) for one in found.values())[:3] == pytest.approx([0.005, 0.005, 0.015])
-    assert all(one["error"] <= TOLD for one in found.values())
+    assert all(one["error"] <= MAX_ERROR for one in found.values())
     few = dict(list(four.items())[: CAMERAS - 1])
     assert timing.timings(past_of(few)) == {}
 

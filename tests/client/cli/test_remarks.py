@@ -1,8 +1,8 @@
-"""The lines of `scas4d reconstruct` on a frame: one that was held says so, and alarms are told once."""
+"""The lines of `scas4d reconstruct` on a frame: one that was held says so, and alarms are remarks_on once."""
 
 from __future__ import annotations
 
-from client.cli.reconstruct import told
+from client.cli.reconstruct import remarks_on
 from scas4d_core.frame_outcome import Alarm, AlarmKind, FrameOutcome
 from scas4d_core.frame_report import FrameReport
 
@@ -12,7 +12,7 @@ def report(**more: object) -> FrameReport:
 
 
 def test_a_frame_that_went_as_it_should_has_no_more_lines() -> None:
-    assert told(None) == told(report()) == ""
+    assert remarks_on(None) == remarks_on(report()) == ""
 
 
 def test_a_held_frame_and_its_alarms_are_told_once() -> None:
@@ -22,4 +22,4 @@ def test_a_held_frame_and_its_alarms_are_told_once() -> None:
         Alarm(AlarmKind.CAMERA_LEFT_OUT, "cam2", "no picture came"),
     ]
     held = report(outcome=FrameOutcome.REJECTED_MISFIT, degraded=why, alarms=alarms)
-    assert told(held).splitlines() == ["", f"  ! {why}", "  ! camera cam2: no picture came"]
+    assert remarks_on(held).splitlines() == ["", f"  ! {why}", "  ! camera cam2: no picture came"]
