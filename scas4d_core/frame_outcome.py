@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any, TypedDict
 
-REJECTED_TEXT = "held as it was: "
+REJECTED_TEXT = "previous state kept: "
 """The beginning of the text for a frame whose state is the one before."""
 
 
@@ -119,7 +119,7 @@ def degraded_text(outcome: FrameOutcome, reason: str) -> str | None:
     """The sentence of a report for people; None of a frame that went as it should.
 
     >>> degraded_text(FrameOutcome.REJECTED_MISFIT, "the pictures are met at 12.0 dB")
-    'held as it was: the pictures are met at 12.0 dB'
+    'previous state kept: the pictures are met at 12.0 dB'
     """
     if not outcome.degraded:
         return None

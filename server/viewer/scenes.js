@@ -28,7 +28,7 @@ const called = (scene) => (scene.name ? `${scene.name} (${scene.id.slice(0, 6)})
 const beside = (scene) => (scene.state === "failed" ? " · failed" : scene.archived ? " · archived" : scene.asleep ? " · asleep" : "");
 
 export class SceneList {
-  /** @param open opens a scene by its status in the list; listed: called whenever the service has told its scenes */
+  /** @param open opens a scene by its status in the list; listed: called whenever the service has listed its scenes */
   constructor(open, listed) {
     Object.assign(this, { open, listed });
     takeToken();

@@ -69,7 +69,7 @@ export class Stream {
     }
   }
 
-  /** Finds the reason of a refused handshake with a request for the scene: the browser does not tell it. */
+  /** Finds the reason of a refused handshake with a request for the scene: the browser does not report it. */
   async broken() {
     if (this.closed) return;
     try {

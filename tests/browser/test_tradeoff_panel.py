@@ -142,10 +142,10 @@ def test_held_frames_are_marked_with_their_reason_and_cameras_have_their_health(
     opened(page, service, id, frame=6)
     shown(page, frame="6")
     assert page.locator("#marks span").count() == 1
-    assert "the fake was told so" in page.locator("#marks span").get_attribute("title")
-    assert text(page, "moment").endswith("held")
-    assert text(page, "reason") == "Frame 6: held as it was: the fake was told so."
-    assert page.locator("#psnr .held").count() == 1
+    assert "the fake was asked to" in page.locator("#marks span").get_attribute("title")
+    assert text(page, "moment").endswith("rejected")
+    assert text(page, "reason") == "Frame 6: previous state kept: the fake was asked to."
+    assert page.locator("#psnr .rejected").count() == 1
     page.locator("#time").fill("7")
     shown(page, frame="7")
     assert page.locator("#reason").is_hidden()

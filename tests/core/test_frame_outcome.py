@@ -20,7 +20,7 @@ def test_an_outcome_is_degraded_or_learnt_as_it_says(outcome: FrameOutcome) -> N
 
 
 def test_the_text_says_first_whether_a_frame_was_held() -> None:
-    assert degraded_text(FrameOutcome.REJECTED_MISFIT, UNMET) == f"held as it was: {UNMET}"
+    assert degraded_text(FrameOutcome.REJECTED_MISFIT, UNMET) == f"previous state kept: {UNMET}"
     assert degraded_text(FrameOutcome.RETRIED, f"as set: {FAULT}") == f"as set: {FAULT}"
 
 

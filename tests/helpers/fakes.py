@@ -161,7 +161,7 @@ class FakeReconstruction:
             **(notes or {}),
         }
         if red == HELD:
-            record |= {"degraded": "held as it was: the fake was told so", "kept": "previous", "used": []}
+            record |= {"degraded": "previous state kept: the fake was asked to", "kept": "previous", "used": []}
         if red == STANDS:
             record |= {"iterations": 0, "kept": "previous", "used": []}
         if red == LEAVES_OUT:

@@ -33,7 +33,7 @@ export class Chart {
     this.note = element("title", {});
     svg.addEventListener("pointermove", (event) => {
       const point = this.nearest(event);
-      const why = point && [point.fault, point.held, point.change].filter((one) => one).join("; ");
+      const why = point && [point.fault, point.rejected, point.change].filter((one) => one).join("; ");
       this.note.textContent = point ? `frame ${point.index}: ${this.text(point.value)}${why ? `; ${why}` : ""}` : "";
     });
     new ResizeObserver(() => this.draw()).observe(svg);
@@ -43,7 +43,7 @@ export class Chart {
     return value === null ? "not measured" : `${value.toFixed(value < 10 ? 2 : 1)} ${this.unit}`;
   }
 
-  /** @param points [{index, value or null, fault, held, change}] by index: the reason for a mark, or nothing */
+  /** @param points [{index, value or null, fault, rejected, change}] by index: the reason for a mark, or nothing */
   set(points) {
     this.points = points;
     this.draw();
@@ -131,8 +131,8 @@ export class Chart {
       const x = this.x({ index: point.index - 0.5 });
       element("line", { x1: x, x2: x, y1: TOP - 4, y2: TOP + height, class: "change" }, this.svg);
     }
-    for (const point of this.points.filter((one) => one.held)) {
-      element("path", { d: `M${this.x(point)} ${TOP + height - 8}l4.5 4l-4.5 4l-4.5 -4z`, class: "held" }, this.svg);
+    for (const point of this.points.filter((one) => one.rejected)) {
+      element("path", { d: `M${this.x(point)} ${TOP + height - 8}l4.5 4l-4.5 4l-4.5 -4z`, class: "rejected" }, this.svg);
     }
     for (const point of this.points.filter((one) => one.fault)) {
       element("path", { d: `M${this.x(point)} ${TOP + height - 7}l4.5 7h-9z`, class: "fault" }, this.svg);

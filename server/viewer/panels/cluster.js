@@ -59,7 +59,7 @@ export class ClusterView {
     const lost = nodes.length > alive ? `, ${nodes.length - alive} lost` : "";
     const late = waiting.filter((one) => one.seconds >= STARTS_S).length;
     const waits = late ? `${counted(late, "process waits", "processes wait")} for a node.` : "No process waits for a node.";
-    const silent = answers ? "" : "The head of the cluster does not answer; the nodes are as it told them last. ";
+    const silent = answers ? "" : "The head of the cluster does not answer; the nodes are those of its last answer. ";
     this.say(`${silent}${counted(alive, "node")} alive${lost}. ${waits}`);
     const order = (one) => `${one.alive ? 1 : 0}${one.host}`;
     this.fill($("cluster-nodes"), [...nodes].sort((a, b) => order(a).localeCompare(order(b))), (one) => this.card(one));

@@ -10,9 +10,9 @@ export function reasonOf(report) {
   return report.degraded[0].toUpperCase() + report.degraded.slice(1);
 }
 
-const HELD = ["rejected_unusable", "rejected_implausible", "rejected_misfit"];
+const REJECTED = ["rejected_unusable", "rejected_implausible", "rejected_misfit"];
 
-export const isHeld = (report) => HELD.includes(report?.outcome);
+export const isRejected = (report) => REJECTED.includes(report?.outcome);
 
 export function showFacts(list, status) {
   const facts = [
@@ -56,12 +56,12 @@ const called = (name) => name[0].toUpperCase() + name.slice(1).replaceAll("_", "
 export function showEffects(list, words, effects) {
   const all = Object.entries(effects);
   const first = Math.min(...all.map(([, one]) => one.since));
-  const told = all.filter(([, one]) => one.pinned || one.text || one.since > first);
-  list.replaceChildren(...told.map(([name, one]) => {
+  const listed = all.filter(([, one]) => one.pinned || one.text || one.since > first);
+  list.replaceChildren(...listed.map(([name, one]) => {
     const state = one.pinned ? `pinned ${one.on ? "on" : "off"}` : `${one.on ? "on" : "off"} since frame ${one.since}`;
     return node("li", { title: one.says, class: one.on ? "on" : "off" }, `${called(name)}: ${state}${one.text ? `, ${one.text}` : ""}`);
   }));
-  const rest = (on) => all.filter((one) => !told.includes(one) && one[1].on === on).map(([name]) => called(name).toLowerCase());
+  const rest = (on) => all.filter((one) => !listed.includes(one) && one[1].on === on).map(([name]) => called(name).toLowerCase());
   const [usual, idle] = [rest(true), rest(false)];
   words.textContent = [
     ...(usual.length ? [`In every update: ${usual.join(", ")}.`] : []),
@@ -87,11 +87,11 @@ const outOfStep = (one) => (one?.off ? `, whose pictures are taken ${Math.abs(on
 /** Evidence of the alarms about a camera; they are made where the frame was reconstructed, and only shown here. */
 export const complaints = (name, report) => (report?.alarms ?? []).filter((one) => one.camera === name).map((one) => one.evidence);
 
-const TOLD = ["frame_rejected", "frame_in_part"];
+const IN_THE_REASON = ["frame_rejected", "frame_in_part"];
 
-/** Alarms in sentences, but for those that the reason of the frame tells. */
+/** Alarms in sentences, but for those that the reason of the frame states already. */
 function sentences(report) {
-  return (report?.alarms ?? []).filter((one) => !TOLD.includes(one.what)).map((one) => {
+  return (report?.alarms ?? []).filter((one) => !IN_THE_REASON.includes(one.what)).map((one) => {
     const words = one.camera === null ? called(one.evidence) : `Camera ${one.camera}: ${one.evidence}`;
     return words.endsWith("?") ? words : `${words}.`;
   });
@@ -127,9 +127,9 @@ export function showCameras(body, summary, names, report, lookFrom) {
           : found.length ? "look" : fit ? "good" : "no figures")));
   });
   body.replaceChildren(...rows);
-  const told = sentences(report);
-  summary.textContent = told.length ? told.slice(0, 3).join(" ") + (told.length > 3 ? ` … and ${told.length - 3} more.` : "")
+  const lines = sentences(report);
+  summary.textContent = lines.length ? lines.slice(0, 3).join(" ") + (lines.length > 3 ? ` … and ${lines.length - 3} more.` : "")
     : !report || !known.length ? "Figures come with the first update."
     : `All ${names.length} cameras look as they did before.`;
-  summary.classList.toggle("warning", told.length > 0);
+  summary.classList.toggle("warning", lines.length > 0);
 }

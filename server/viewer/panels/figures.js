@@ -20,13 +20,13 @@ export class Figures {
   draw() {
     const reports = inOrder();
     const fault = (one) => (one.state === "committed" ? "" : one.error ?? one.state);
-    this.psnr.set(reports.map((one) => ({ index: one.index, value: one.psnr ?? null, fault: fault(one), held: reasonOf(one) })));
+    this.psnr.set(reports.map((one) => ({ index: one.index, value: one.psnr ?? null, fault: fault(one), rejected: reasonOf(one) })));
     // The first frame takes minutes and would flatten all others; it is written below the chart.
     const first = reports.find((one) => one.state === "committed");
     this.updates = reports.filter((one) => one !== first);
     const budgets = this.updates.filter((one) => one.budget);
     const changes = new Map(budgets.slice(1).map((one, i) => [one.index, change(budgets[i].budget, one.budget)]));
-    this.seconds.set(reports.map((one) => ({ index: one.index, fault: fault(one), held: reasonOf(one), change: changes.get(one.index),
+    this.seconds.set(reports.map((one) => ({ index: one.index, fault: fault(one), rejected: reasonOf(one), change: changes.get(one.index),
       value: one === first ? null : one.seconds?.total ?? null })));
     const times = this.updates.map((one) => one.seconds?.total).filter((value) => value !== undefined).sort((a, b) => a - b);
     $("figures").textContent = first

@@ -30,21 +30,21 @@ export class PartList {
   toggle(label, hide) {
     if (hide) this.hidden.add(label);
     else this.hidden.delete(label);
-    this.tell();
+    this.describe();
   }
 
   /** One part alone; all again where it is alone already. */
   alone(label) {
     const alone = this.isAlone(label);
     this.hidden = new Set(alone ? [] : this.labels.filter((one) => one !== label));
-    this.tell();
+    this.describe();
   }
 
   isAlone(label) {
     return this.hidden.size === this.labels.length - 1 && !this.hidden.has(label);
   }
 
-  tell() {
+  describe() {
     this.mark();
     this.changed([...this.hidden]);
   }
@@ -56,7 +56,7 @@ export class PartList {
       row.querySelector("button").setAttribute("aria-pressed", String(this.isAlone(label)));
     }
     const { size } = this.hidden;
-    if (!this.labels.length) this.words.textContent = "No parts are told yet.";
+    if (!this.labels.length) this.words.textContent = "No parts are known yet.";
     else this.words.textContent = size ? `${size} of ${this.labels.length} hidden.` : "All parts are shown.";
   }
 }

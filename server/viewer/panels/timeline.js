@@ -1,6 +1,6 @@
 // Time: which frame is shown, the slider with its marks, and playing at the recorded rate.
 
-import { isHeld } from "./facts.js";
+import { isRejected } from "./facts.js";
 import { $, node, page, readable } from "../page.js";
 
 const SHORTEST_MS = 20; // no screen shows more pictures
@@ -97,7 +97,7 @@ export class Timeline {
     slider.value = Math.max(at, 0);
     const report = reports[at];
     slider.setAttribute("aria-valuetext", report ? `frame ${report.index}` : "no frame");
-    const how = isHeld(report) ? " · held" : report?.degraded ? " · in part" : "";
+    const how = isRejected(report) ? " · rejected" : report?.degraded ? " · in part" : "";
     $("moment").textContent = report ? `frame ${report.index} · ${report.time.toFixed(2)} s${how}` : "no frame";
     $("reason").hidden = !report?.degraded;
     $("reason").textContent = report?.degraded ? `Frame ${report.index}: ${report.degraded}.` : "";

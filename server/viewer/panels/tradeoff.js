@@ -59,7 +59,7 @@ export class Tradeoff {
     $("budget-kind").addEventListener("change", () => this.place(true));
     $("budget").addEventListener("input", () => {
       this.moving = true;
-      this.tell();
+      this.describe();
       this.draw();
     });
     $("budget").addEventListener("change", () => this.put());
@@ -93,7 +93,7 @@ export class Tradeoff {
   /** @param updates reports of the frames after the first, by index */
   follow(updates) {
     this.updates = updates.filter((one) => one.seconds?.total !== undefined);
-    this.tell();
+    this.describe();
   }
 
   async load() {
@@ -148,7 +148,7 @@ export class Tradeoff {
     const [kind, effective] = [this.$("budget-kind"), this.effective];
     slider.disabled = kind.disabled = !effective;
     if (effective && !chosen) {
-      kind.value = this.held;
+      kind.value = this.effectiveKind;
     }
     slider.hidden = this.$("budget-ends").hidden = !kind.value;
     if (kind.value) RANGES[kind.value].forEach((end, i) => { this.$("budget-ends").children[i].textContent = kind.value === "iterations" ? end : spoken(end); });
@@ -157,7 +157,7 @@ export class Tradeoff {
       const [from, to] = RANGES[kind.value];
       slider.value = Math.round(STEPS * Math.log(known / from) / Math.log(to / from));
     }
-    this.tell();
+    this.describe();
     if (chosen && !kind.value) this.put();
   }
 
@@ -167,7 +167,7 @@ export class Tradeoff {
   }
 
   /** Writes the value of the control, and its cost or effect. */
-  tell() {
+  describe() {
     const words = this.$("budget-words");
     const effective = this.effective;
     this.$("budget-value").textContent = effective && this.kind ? `${this.value} ${UNITS[this.kind]}` : "";
@@ -181,12 +181,12 @@ export class Tradeoff {
       then = this.kind === "iterations" ? ` Then: about ${spoken(this.milliseconds(this.value))} a frame.`
         : ` Then: about ${Math.max(1, Math.round((this.value - model.fixed) / model.per_iteration))} iterations a frame.`;
     }
-    else if (this.kind && this.kind !== this.held) then = " Move the slider to change it.";
+    else if (this.kind && this.kind !== this.effectiveKind) then = " Move the slider to change it.";
     words.textContent = now + then;
   }
 
   /** The kind of budget that holds: time or iterations; empty if it is the scene's own. */
-  get held() {
+  get effectiveKind() {
     return this.effective.budget_ms !== null ? "budget_ms" : this.asked.iterations !== null ? "iterations" : "";
   }
 

@@ -19,7 +19,7 @@ const LONE = { intrinsics: [[800, 0, 400], [0, 800, 300], [0, 0, 1]], width: 800
 
 const pace = new Pace();
 let [splats, clock, orbit, rig] = [null, null, null, null];
-let scene = null; // what the worker told of the files
+let scene = null; // what the worker reported of the files
 let shown = null; // { camera, place } of the picture that is seen
 let followed = null; // { row, positions, at }
 let [dirty, movedAt, tick, pictures] = [true, -Infinity, 0, 0];
@@ -69,7 +69,7 @@ function frames(message) {
   $("parts-box").hidden = parts === 0;
   const named = $("modes").querySelector("[data-mode=parts]");
   named.disabled = parts === 0;
-  if (!parts) named.title = "No parts are told in this file";
+  if (!parts) named.title = "This file has no parts";
   trails();
   if (message.damage) say(`Only a part can be read: ${message.damage}`);
   draw();

@@ -110,7 +110,7 @@ export class Sections {
     return chosen;
   }
 
-  /** [rows] Uint8Array of 0 and 1; null where nothing is told. */
+  /** [rows] Uint8Array of 0 and 1; null where it is unchanged. */
   mask(rows) {
     if (this.byte() === 0) return null;
     const mask = new Uint8Array(rows);
@@ -118,15 +118,15 @@ export class Sections {
     return mask;
   }
 
-  /** { rows, values [width × rows] } that are told exactly; null where none are. */
+  /** { rows, values [width × rows] } that are coded exactly; null where none are. */
   exact(most, width) {
     if (this.byte() === 0) return null;
     const count = this.word();
-    if (!count || count > most) throw new FileError(`${count} of ${most} rows cannot be told exactly`);
+    if (!count || count > most) throw new FileError(`${count} of ${most} rows cannot be coded exactly`);
     const data = this.sized(4 * count * (1 + width));
     const numbers = new DataView(data.buffer, data.byteOffset);
     const rows = Uint32Array.from({ length: count }, (_, i) => numbers.getUint32(4 * i, true));
-    if (rows.some((row) => row >= most)) throw new FileError("a row that is not there is told");
+    if (rows.some((row) => row >= most)) throw new FileError("a row that does not exist is coded");
     const values = Float32Array.from({ length: count * width }, (_, i) => numbers.getFloat32(4 * (count + i), true));
     return { rows, values };
   }

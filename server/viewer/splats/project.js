@@ -3,7 +3,7 @@
 export const STRIDE = 12; // floats of an ellipse: centre, half axis (pixels); short by long axis, log2 of the opacity; colour; spare ones
 export const FLOOR = Math.log2(255); // a Gaussian ends where its alpha is 1/255
 const LOW_PASS = 0.3; // pixels²: nothing is thinner than about a pixel
-const MARGIN = 0.3; // of half the picture's size, beyond which the projection's slope is held
+const MARGIN = 0.3; // of half the picture's size, beyond which the projection's slope is clamped
 const REACH = 2 * Math.LN2;
 const DIGIT = 11;
 const BUCKETS = 1 << DIGIT;
@@ -82,15 +82,15 @@ export class Projector {
         g[k] = axes[k * size + i];
         if (blend) g[k] += share * (f1[k * count + i] - g[k]);
       }
-      const heldU = u < lowX ? lowX : u > highX ? highX : u;
-      const heldV = v < lowY ? lowY : v > highY ? highY : v;
+      const clampedU = u < lowX ? lowX : u > highX ? highX : u;
+      const clampedV = v < lowY ? lowY : v > highY ? highY : v;
       let sxx = LOW_PASS;
       let sxy = 0;
       let syy = LOW_PASS;
       for (let k = 0; k < 3; k++) {
         const along = r20 * g[k] + r21 * g[3 + k] + r22 * g[6 + k];
-        const x = fx * inverse * (r00 * g[k] + r01 * g[3 + k] + r02 * g[6 + k] - heldU * along);
-        const y = fy * inverse * (r10 * g[k] + r11 * g[3 + k] + r12 * g[6 + k] - heldV * along);
+        const x = fx * inverse * (r00 * g[k] + r01 * g[3 + k] + r02 * g[6 + k] - clampedU * along);
+        const y = fy * inverse * (r10 * g[k] + r11 * g[3 + k] + r12 * g[6 + k] - clampedV * along);
         sxx += x * x;
         sxy += x * y;
         syy += y * y;

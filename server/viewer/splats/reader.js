@@ -4,7 +4,7 @@ import { BORN, DELTA, FileError, KEY, PARTS, bodyOf, list, readHead } from "./re
 import { Sections } from "./planes.js";
 import { appended, decodeBorn, decodeState, extended } from "./states.js";
 
-const MOST_PER_BYTE = 4; // Gaussians told by a byte; a count that lies must not fill the memory
+const MOST_PER_BYTE = 4; // Gaussians per byte at most; a wrong count must not fill the memory
 
 export class CompactReader {
   /** @param bytes Uint8Array, the whole file or the part of it that is there */
@@ -27,7 +27,7 @@ export class CompactReader {
 
   /** Lets go of what is decoded; it is decoded again when it is asked for. */
   forget() {
-    this.born = { told: 0, state: null, clusters: null, gloss: -1 };
+    this.born = { decoded: 0, state: null, clusters: null, gloss: -1 };
     this.last = { place: -1, state: null };
   }
 
@@ -58,26 +58,26 @@ export class CompactReader {
     let reference = born.state;
     if (record.kind === DELTA) {
       at = 4;
-      if (new Sections(body).word() !== this.states[place - 1].checksum) throw new FileError(`frame ${record.frame} is told by another state`);
+      if (new Sections(body).word() !== this.states[place - 1].checksum) throw new FileError(`frame ${record.frame} is coded against another state`);
       if (before) reference = before.count < born.state.count ? extended(before, born.state) : before;
     }
     return decodeState(body, at, reference, born.clusters, this.head.bounds, born.gloss);
   }
 
-  /** All Gaussians that are born by a frame, as they were told then. */
+  /** All Gaussians that are born by a frame, as they were coded then. */
   bornBy(frame) {
     const wanted = this.births.filter((record) => record.frame <= frame);
-    if (!wanted.length) throw new FileError(`the Gaussians of frame ${frame} are not told`);
-    if (this.born.told > wanted.length) this.born = { told: 0, state: null, clusters: null, gloss: -1 };
-    while (this.born.told < wanted.length) {
-      const body = bodyOf(this.bytes, wanted[this.born.told]);
+    if (!wanted.length) throw new FileError(`the Gaussians of frame ${frame} are missing`);
+    if (this.born.decoded > wanted.length) this.born = { decoded: 0, state: null, clusters: null, gloss: -1 };
+    while (this.born.decoded < wanted.length) {
+      const body = bodyOf(this.bytes, wanted[this.born.decoded]);
       const count = new Sections(body).word();
       if (count > MOST_PER_BYTE * body.length + 1024) throw new FileError(`${count} Gaussians in ${body.length} bytes cannot be`);
       const own = decodeBorn(body, 4, count, this.head.bounds);
-      const { state, clusters, told, gloss } = this.born;
+      const { state, clusters, decoded, gloss } = this.born;
       this.born = state
-        ? { told: told + 1, state: appended(state, own.state), clusters: Int32Array.from([...clusters, ...own.clusters]), gloss }
-        : { told: told + 1, ...own };
+        ? { decoded: decoded + 1, state: appended(state, own.state), clusters: Int32Array.from([...clusters, ...own.clusters]), gloss }
+        : { decoded: decoded + 1, ...own };
     }
     return this.born;
   }
@@ -86,9 +86,9 @@ export class CompactReader {
   parts() {
     const record = this.partRecords.at(-1);
     if (!record) return null;
-    const told = new Sections(bodyOf(this.bytes, record));
-    const count = told.word();
+    const sections = new Sections(bodyOf(this.bytes, record));
+    const count = sections.word();
     if (count > this.count) throw new FileError(`parts of ${count} Gaussians, there are ${this.count}`);
-    return told.plane(count).map((value) => value - 1);
+    return sections.plane(count).map((value) => value - 1);
   }
 }

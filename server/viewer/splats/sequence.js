@@ -17,7 +17,7 @@ export class Sequence {
     this.head = null;
   }
 
-  /** Takes the frames of a file; those that are known already are told by it from now on. */
+  /** Takes the frames of a file; frames that are known already are read from it from now on. */
   add(reader) {
     this.head ??= reader.head;
     const fresh = reader.frames.map((index, place) => ({ index, time: reader.times[place], reader, place }));
@@ -30,8 +30,8 @@ export class Sequence {
 
   /** Forgets files beyond a bound of memory, those first that were shown longest ago; never the newest, nor what is shown. */
   bound(newest) {
-    const told = new Set(this.frames.map((frame) => frame.reader));
-    for (const reader of this.used) if (!told.has(reader)) this.drop(reader);
+    const inUse = new Set(this.frames.map((frame) => frame.reader));
+    for (const reader of this.used) if (!inUse.has(reader)) this.drop(reader);
     let sum = 0;
     for (const reader of this.used) sum += reader.bytes.length;
     for (const reader of this.used) {

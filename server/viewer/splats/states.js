@@ -22,15 +22,15 @@ function each(found, values, of) {
   return found;
 }
 
-/** Gaussians without a reference, of a record's body after its count: { state, clusters, gloss }, so many with gloss, −1 for none told. */
+/** Gaussians without a reference, of a record's body after its count: { state, clusters, gloss }, so many with gloss, −1 for none sections. */
 export function decodeBorn(body, at, count, bounds) {
-  const told = new Sections(body, at);
+  const sections = new Sections(body, at);
   const ids = new Float64Array(count);
-  const steps = told.plane(count);
+  const steps = sections.plane(count);
   for (let i = 0, id = 0; i < count; i++) ids[i] = id += steps[i];
-  const clusters = told.plane(count);
+  const clusters = sections.plane(count);
   if (clusters.some((one) => one < 0 || one > MOST_CLUSTERS)) throw new FileError("a cluster cannot be");
-  const planes = (components) => told.residuals(components, count) ?? Array.from({ length: components }, () => new Int32Array(count));
+  const planes = (components) => sections.residuals(components, count) ?? Array.from({ length: components }, () => new Int32Array(count));
   const [lengths, axes, centres, turns, shades] = [planes(3), planes(9), planes(3), planes(3), planes(3)];
   const [levels, opaque] = [planes(1)[0], planes(1)[0]];
   const factors = new Float32Array(9 * count);
@@ -56,14 +56,14 @@ export function decodeBorn(body, at, count, bounds) {
   const opacities = each(new Float32Array(count), opaque, (value) => Math.max(OPAQUE, Math.min(1 - OPAQUE, value * 2 * bounds.opacity)));
   const state = { count, ids, means, factors, rotations, colours, opacities, foreground: each(new Float32Array(count), levels, label),
     retired: new Uint8Array(count) };
-  const gloss = finish(told, state, true);
+  const gloss = finish(sections, state, true);
   return { state, clusters, gloss };
 }
 
 /** Reads the end of a body: exact rows, who is retired; of the born, gloss, whose number is returned; what is mirrored. */
-function finish(told, state, born) {
+function finish(sections, state, born) {
   const { count } = state;
-  const exact = told.exact(count, 12);
+  const exact = sections.exact(count, 12);
   if (exact) {
     state.means = state.means.slice();
     state.factors = state.factors.slice();
@@ -76,15 +76,15 @@ function finish(told, state, born) {
       }
     });
   }
-  state.retired = told.mask(count) ?? state.retired;
+  state.retired = sections.mask(count) ?? state.retired;
   let gloss = -1;
   if (born) {
-    gloss = told.plane(1)[0] - 1;
+    gloss = sections.plane(1)[0] - 1;
     if (gloss < -1 || gloss > count) throw new FileError(`${gloss} of ${count} Gaussians cannot have gloss`);
-    if (gloss >= 0) told.residuals(3, gloss);
+    if (gloss >= 0) sections.residuals(3, gloss);
   }
-  told.skipArray();
-  told.done();
+  sections.skipArray();
+  sections.done();
   return gloss;
 }
 
@@ -112,20 +112,20 @@ export function appended(state, more) {
   return found;
 }
 
-/** The state that a body tells by a reference; `gloss` of the first Gaussians may have that, −1 where the file has none. */
+/** The state that a body encodes against a reference; `gloss` of the first Gaussians may have that, −1 where the file has none. */
 export function decodeState(body, at, reference, clusters, bounds, gloss) {
-  const told = new Sections(body, at);
+  const sections = new Sections(body, at);
   const { count } = reference;
-  const [linear, shift] = [told.double(), told.double()];
+  const [linear, shift] = [sections.double(), sections.double()];
   if (!Number.isFinite(linear) || !Number.isFinite(shift)) throw new FileError("the steps of a state cannot be");
   let most = 0;
   for (let i = 0; i < count; i++) if (clusters[i] > most) most = clusters[i];
-  const motion = Array.from({ length: 12 }, () => told.plane(most));
+  const motion = Array.from({ length: 12 }, () => sections.plane(most));
   const state = { ...reference };
   if (most) carry(state, clusters, most, motion, linear, shift);
   const sizes = sizesOf(state);
   const own = (name) => (state[name] === reference[name] ? (state[name] = state[name].slice()) : state[name]);
-  const scales = told.residuals(1, count)?.[0];
+  const scales = sections.residuals(1, count)?.[0];
   if (scales) {
     const factors = own("factors");
     for (let i = 0; i < count; i++) {
@@ -135,10 +135,10 @@ export function decodeState(body, at, reference, clusters, bounds, gloss) {
       for (let k = 0; k < 9; k++) factors[k * count + i] *= scale;
     }
   }
-  const turns = told.residuals(3, count);
+  const turns = sections.residuals(3, count);
   if (turns) turnBy(turns, turnStep(bounds), own("rotations"), own("factors"));
   for (const [name, components, bound] of [["factors", 9, bounds.axes], ["means", 3, bounds.position]]) {
-    const planes = told.residuals(components, count);
+    const planes = sections.residuals(components, count);
     if (!planes) continue;
     const array = own(name);
     const step = Math.fround(2 * bound * MARGIN);
@@ -146,15 +146,15 @@ export function decodeState(body, at, reference, clusters, bounds, gloss) {
       for (let i = 0, j = k * count; i < count; i++, j++) if (plane[i]) array[j] += plane[i] * step * sizes[i];
     });
   }
-  const shades = told.residuals(3, count);
+  const shades = sections.residuals(3, count);
   if (shades) addColours(shades, 2 * bounds.colour, own("colours"), count);
-  const levels = told.residuals(1, count)?.[0];
+  const levels = sections.residuals(1, count)?.[0];
   if (levels) {
     const foreground = own("foreground");
     for (let i = 0; i < count; i++) foreground[i] = label(levelOf(foreground[i]) + levels[i]);
   }
-  if (gloss >= 0) told.residuals(3, gloss);
-  finish(told, state, false);
+  if (gloss >= 0) sections.residuals(3, gloss);
+  finish(sections, state, false);
   return state;
 }
 

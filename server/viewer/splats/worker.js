@@ -1,5 +1,5 @@
 // A worker that decodes compact files and paints their Gaussians: the thread of the page has neither to do.
-// It is told by messages { kind, … }, and answers by such; see `Splats`, which is the page's side of it.
+// It receives messages { kind, … }, and answers with such; see `Splats`, which is the page's side of it.
 
 import { Painter } from "./painter.js";
 import { Projector } from "./project.js";
@@ -185,7 +185,7 @@ function failed(during, error, name) {
   post("failed", { during, name, words: error.message });
 }
 
-/** Acts; what goes wrong is told, and ends nothing else. */
+/** Acts; errors are reported, and end nothing else. */
 function guarded(during, action, name) {
   try {
     action();

@@ -32,7 +32,7 @@ export class Here {
     this.drawn = 0;
     this.slow = false;
     this.said = "";
-    this.labelled = 0; // parts that were told
+    this.labelled = 0; // parts that are known
   }
 
   open(scene) {
@@ -175,7 +175,7 @@ export class Here {
   }
 
   /**
-   * Draws a moment; `on.drawn` is told when it is there.
+   * Draws a moment; `on.drawn` is called when it is there.
    *
    * @param asked { index, next, share, camera, mode, background, moving }: share 0…1 of the way from one frame to the next
    */
@@ -186,9 +186,9 @@ export class Here {
       this.splats.look({ mode: asked.mode, background: asked.background });
     }
     const share = this.pace.share;
-    const told = { ...asked, serial: ++this.serial, opened: this.opened, pace: share };
+    const request = { ...asked, serial: ++this.serial, opened: this.opened, pace: share };
     const { index, next, share: way, camera } = asked;
-    this.splats.draw({ index, next, share: way, camera }, told);
+    this.splats.draw({ index, next, share: way, camera }, request);
   }
 
   shown(message) {

@@ -16,7 +16,7 @@ def test_a_frame_that_went_as_it_should_has_no_more_lines() -> None:
 
 
 def test_a_held_frame_and_its_alarms_are_told_once() -> None:
-    why = "held as it was: the pictures are met at 20.6 dB, 19.4 dB less than usual"
+    why = "previous state kept: the pictures are met at 20.6 dB, 19.4 dB less than usual"
     alarms = [
         Alarm(AlarmKind.FRAME_REJECTED, None, "the pictures are met at 20.6 dB"),
         Alarm(AlarmKind.CAMERA_LEFT_OUT, "cam2", "no picture came"),

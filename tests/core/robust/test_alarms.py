@@ -140,7 +140,7 @@ def test_alarms_of_the_frame_are_no_cameras(past: Past) -> None:
     wild = {"offsets": {**NONE, "c3": -20.0}, "reason": "too dark"}
     found, after = settled(past, outcome=FrameOutcome.REJECTED_UNUSABLE, **wild)
     assert kinds_of(found) == [("frame_rejected", None)]
-    assert found[0].evidence == "held as it was: too dark"
+    assert found[0].evidence == "previous state kept: too dark"
     assert after == past
     assert kinds_of(settled(past, outcome=FrameOutcome.RELOCATED, reason="far")[0]) == [("frame_in_part", None)]
     assert kinds_of(settled(past, exposure=1.3)[0]) == [("light", None)]

@@ -126,7 +126,7 @@ def test_frames_that_were_held_or_stood_are_told_as_they_are() -> None:
     upside_down = {name: image[::-1].copy() for name, image in sent(4, 1.2, True).images.items()}
     held = scene.step(replace(sent(4, 1.0, True), images=upside_down))
     assert (held.used, held.kept, held.outcome) == ([], "previous", FrameOutcome.REJECTED_MISFIT)
-    assert str(held.degraded).startswith("held as it was: ")
+    assert str(held.degraded).startswith("previous state kept: ")
     assert held.exposure > 1.0
     assert held.errors[Candidate.END] < held.errors[Candidate.PREVIOUS]
 

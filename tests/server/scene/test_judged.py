@@ -91,7 +91,7 @@ def test_a_black_frame_is_held_explained_and_over_with_the_next_good_one(served)
     index = sdk.scene(id).next_frame
     report = put(sdk, id, index, RIG.names)
     assert report.state == "committed"
-    assert report.degraded.startswith("held as it was: the pictures are")
+    assert report.degraded.startswith("previous state kept: the pictures are")
     assert report.used_cameras == []
     history = History.load(states)
     before, after = history.gaussians(index - 1), history.gaussians(index)
@@ -99,7 +99,7 @@ def test_a_black_frame_is_held_explained_and_over_with_the_next_good_one(served)
         assert np.array_equal(array, after.arrays()[name]), name
     status = sdk.scene(id)
     assert status.degraded
-    assert f"frame {index} was held as it was" in status.error
+    assert f"frame {index} was previous state kept" in status.error
     assert metric(sdk, 'scas4d_degraded_frames_total{how="rejected"}') == held + 1
     good = put(sdk, id, index + 1)
     assert good.degraded is None
@@ -157,7 +157,7 @@ def test_what_was_judged_is_known_again_after_a_restart(served):
         with Client(again.url, patience=HANG_S) as after, httpx.Client(base_url=again.url, timeout=HANG_S) as http:
             assert after.frame(id, index) == before
             assert after.scene(id).degraded
-            assert "held as it was" in after.scene(id).error
+            assert "previous state kept" in after.scene(id).error
             assert http.get(f"/v1/scenes/{id}/tradeoff").status_code == 200
     finally:
         again.stop()
