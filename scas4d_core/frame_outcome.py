@@ -137,21 +137,21 @@ def cloud_warnings(cloud: Mapping[str, Any] | None) -> list[str]:
     Args:
         cloud: record of a ``FirstCloud``; None: of a frame that is not the first.
 
-    >>> cloud_warnings({"way": "agreement", "points": 9000, "covered": 0.9})
+    >>> cloud_warnings({"method": "agreement", "points": 9000, "coverage": 0.9})
     []
-    >>> cloud_warnings({"way": "agreement + pairs", "points": 900, "covered": 0.12})[0][:75]
+    >>> cloud_warnings({"method": "agreement + pairs", "points": 900, "coverage": 0.12})[0][:75]
     'frame 0 is in part a guess: the points on which cameras agree cover 12 % of'
     """
-    if cloud is None or cloud.get("covered") is None:
+    if cloud is None or cloud.get("coverage") is None:
         return []
     remedy = (
         "if its views are poor, begin the reconstruction again with points, masks, more cameras that look at the same "
         "place, or a plain backdrop"
     )
-    if cloud["covered"] == 0:
+    if cloud["coverage"] == 0:
         return [f"frame 0 is a guess: no two cameras agree on any of its first points; {remedy}"]
-    if cloud["covered"] < COVERS_LITTLE:
-        share = f"cover {100 * cloud['covered']:.0f} % of the pictures"
+    if cloud["coverage"] < COVERS_LITTLE:
+        share = f"cover {100 * cloud['coverage']:.0f} % of the pictures"
         return [f"frame 0 is in part a guess: the points on which cameras agree {share}; {remedy}"]
     return []
 

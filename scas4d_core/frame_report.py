@@ -15,7 +15,7 @@ import numpy as np
 from scas4d_core.captures.frame import Frame
 from scas4d_core.captures.images import grey_among
 from scas4d_core.engines.engine import REPORT
-from scas4d_core.first_frame.calibration.record import Calibration
+from scas4d_core.first_frame.calibration.report import CalibrationReport
 from scas4d_core.first_frame.static_result import FirstCloud, StaticResult
 from scas4d_core.frame_outcome import (
     Alarm,
@@ -112,7 +112,7 @@ class FrameReport:
     timing: dict[str, CameraTiming] = field(default_factory=dict)
     cloud: FirstCloud | None = None
     shortened: list[str] = field(default_factory=list)
-    calibration: Calibration | None = None
+    calibration: CalibrationReport | None = None
     grey: list[str] = field(default_factory=list)
 
     @property
@@ -147,7 +147,7 @@ def report_of_first(
     moving: int,
     seconds: dict[str, float],
     dropped: Mapping[str, str] | None,
-    calibration: Calibration | None = None,
+    calibration: CalibrationReport | None = None,
 ) -> FrameReport:
     """The report of frame 0.
 

@@ -42,7 +42,7 @@ from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_outcome import FrameOutcome
 from scas4d_core.gaussians import UNBORN, Gaussians
 from scas4d_core.settings import Settings
-from scas4d_core.storage.births import NO_PARENT, grown_roots
+from scas4d_core.storage.births import NO_PARENT, extend_roots
 from scas4d_core.structure.hierarchy import Hierarchy, build_hierarchy
 from scas4d_core.structure.neighbours import Neighbours, build_neighbours
 from scas4d_core.update.frame_update import FrameUpdate
@@ -254,7 +254,7 @@ def _grown(prepared: Prepared, before: Gaussians, result: UpdateResult, other_ro
     if labels is not None:
         labels = np.concatenate([labels, now.foreground[len(labels) :] > 0.5])
     prepared = prepared.carry(effects=effects, labels=labels)
-    return replace(prepared, roots=grown_roots(prepared.roots, now, result.parents))
+    return replace(prepared, roots=extend_roots(prepared.roots, now, result.parents))
 
 
 def _with_motion(prepared: Prepared, seen: FrameObservation, result: UpdateResult) -> Prepared:

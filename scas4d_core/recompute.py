@@ -55,7 +55,7 @@ def recompute(
     if made.outcome.rejected:  # nothing was learnt from the pictures
         raise StepError(f"frame {frame.index} does not fit the frame before it: {made.degraded}")
     report = scratch.history.report(frame.index)
-    arrays = history.completed(frame.index, scratch.history.gaussians(frame.index)).arrays()
+    arrays = history.complete_state(frame.index, scratch.history.gaussians(frame.index)).arrays()
     kept = {name: arrays[name] for name in (*PER_FRAME, *WHOLES) if name in arrays}
     # Who was newborn in it is not known: its births are those of the history, not of this update.
     left = scratch.history.effects(frame.index)

@@ -26,9 +26,14 @@ from scas4d_core.engines.engine import REPORT
 from scas4d_core.engines.limits import rig_limits
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.errors import StepError
-from scas4d_core.first_frame.calibration.record import Calibration, in_use
-from scas4d_core.first_frame.calibration.refine import first_calibration
-from scas4d_core.first_frame.start import FirstFrame, as_begun, fit_first, with_background
+from scas4d_core.first_frame.calibration.refine import calibrate_first_frame
+from scas4d_core.first_frame.calibration.report import CalibrationReport, effective_rig
+from scas4d_core.first_frame.fit_first_frame import (
+    FirstFrame,
+    fit_first_frame,
+    with_background,
+    with_recorded_background,
+)
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_context import FrameContext, FrameInput
 from scas4d_core.frame_report import FrameReport, report_of_first, report_of_update
@@ -81,12 +86,14 @@ class Reconstruction(CommittedScene):
     (256, 256, 3)
     """
 
-    def __init__(self, rig: Rig, settings: Settings, history: History, found: Calibration | None = None) -> None:
+    def __init__(self, rig: Rig, settings: Settings, history: History, found: CalibrationReport | None = None) -> None:
         """Without a frame yet; ``rig`` as given, of the frames' pictures. ``found``: None: as the history began."""
         world, scale = rig.world_frame(settings.scene.metres_per_unit), settings.scene.image_scale
         limits = rig_limits(settings.scene.near, world, rig.cameras)
         super().__init__(history, world, limits)
-        self.calibrated = rig = in_use(rig, history.first_report if found is None else {"calibration": asdict(found)})
+        self.calibrated = rig = effective_rig(
+            rig, history.first_report if found is None else {"calibration": asdict(found)}
+        )
         self.rig = rig_inside(world, rig.scaled(scale).cameras)
         self.settings, self._update = settings, settings.update
         self._factory = ViewFactory(self.rig, None if scale == 1.0 else rig)
@@ -135,11 +142,11 @@ class Reconstruction(CommittedScene):
             check_rig(rig, settings.scene, None if points is None else points.positions)
         began, on_progress = perf_counter(), progress or (lambda _: None)
         frame = replace(frame, images=dict(frame.images))  # decoded once
-        calibration = first_calibration(rig, frame, settings.static, on_progress, measured=static is None)
+        calibration = calibrate_first_frame(rig, frame, settings.static, on_progress, measured=static is None)
         settings, checked = with_background(settings, frame.images), perf_counter()
         self = cls(rig, settings, History() if history is None else history, calibration)
         scaled = self._factory.scaled(frame)
-        result = static or fit_first(scaled, points, self._factory, self.settings, self.world, on_progress)
+        result = static or fit_first_frame(scaled, points, self._factory, self.settings, self.world, on_progress)
         self.static = result = replace(result, gaussians=first_labels(result.gaussians, self.rig, scaled.masks))
         fitted = perf_counter()
         fixed = (
@@ -181,7 +188,7 @@ class Reconstruction(CommittedScene):
         """
         if history.directory is None or not history.indices:
             raise ResumeError("the history holds no committed frame; start the scene with its first frame")
-        self = cls(rig, as_begun(settings, history), history)
+        self = cls(rig, with_recorded_background(settings, history), history)
         assert self._checkpoints is not None
         try:
             self._fixed = FirstFrame.of(history)
@@ -191,7 +198,7 @@ class Reconstruction(CommittedScene):
         same = self._go_on(index, cold_start(history, index, self._fixed.masked) if left is None else left)
         if left is not None and not same:
             faults.append("clusters came out otherwise than before: the next update starts without a motion")
-        self.resumed = ResumePoint(index, history.cut(index), faults, cold=left is None or not same)
+        self.resumed = ResumePoint(index, history.truncate(index), faults, cold=left is None or not same)
         self._checkpoints.clean(history.indices)
         if self.resumed.cold:
             with suppress(OSError):  # for want of room: the next start is as cold as this one
@@ -215,8 +222,8 @@ class Reconstruction(CommittedScene):
         Raises:
             HistoryError: the frame or the first one cannot be read.
         """
-        copy = history.copied((history.indices[0], index))
-        self = cls(rig, as_begun(settings, copy), copy)
+        copy = history.copy_frames((history.indices[0], index))
+        self = cls(rig, with_recorded_background(settings, copy), copy)
         self._fixed = FirstFrame.of(copy)
         self._go_on(index, cold_start(copy, index, self._fixed.masked))
         return self

@@ -55,7 +55,7 @@ class SceneSettings(SettingsModel):
 
     @property
     def background_rgb(self) -> tuple[float, float, float]:
-        """The background as RGB; black while 'auto' is not resolved (``first_frame.start.with_background``)."""
+        """The background as RGB; black until 'auto' is resolved (``fit_first_frame.with_background``)."""
         return (0.0, 0.0, 0.0) if self.background == "auto" else self.background
 
     @field_validator("floor")

@@ -24,4 +24,4 @@ def open_measured(folder: Path | str, options: CaptureOptions = DEFAULT_OPTIONS,
     if capture.full_test_rig is not None:
         return capture
     print(f"{capture.name} has no test cameras: measured on its training cameras", file=sys.stderr)
-    return capture.measured_on_training()
+    return capture.with_training_as_test()

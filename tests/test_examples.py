@@ -32,7 +32,7 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "scas4d_core.effects.presence.motion_mask": ("changed_pixels", "with_reliable_labels"),
     "scas4d_core.errors": ("message_of", "without_paths"),
     "scas4d_core.first_frame.initial_points": ("initial_points",),
-    "scas4d_core.first_frame.start": ("fit_static_scene",),
+    "scas4d_core.first_frame.fit_first_frame": ("fit_static_scene",),
     "scas4d_core.gaussians": ("Gaussians", "moving_extent", "quaternions_to_matrices"),
     "scas4d_core.guards": ("GuardCounts",),
     "scas4d_core.metrics.image": ("flip", "lpips", "psnr", "ssim"),

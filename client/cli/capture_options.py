@@ -24,7 +24,7 @@ class PicturesFrom(StrEnum):
     NAMED = "named"
 
 
-class Fit(StrEnum):
+class SizeMismatch(StrEnum):
     """Ways in which pictures of another shape than calibrated came about."""
 
     CORNER = "corner"
@@ -46,8 +46,8 @@ def _options(
     test: Annotated[
         list[str] | None, typer.Option(help="Hold out a camera, for measuring. May be repeated.", metavar="CAMERA")
     ] = None,
-    fit: Annotated[
-        Fit | None,
+    size_mismatch: Annotated[
+        SizeMismatch | None,
         typer.Option(
             help="Pictures of another shape than calibrated were cut at the right and the bottom (corner), were cut "
             "evenly (centre), or were resized (stretch)."
@@ -60,7 +60,7 @@ def _options(
         fps=capture_fps,
         use_masks=masks,
         test=tuple(test or ()),
-        fit=None if fit is None else fit.value,
+        size_mismatch=None if size_mismatch is None else size_mismatch.value,
     )
 
 

@@ -74,7 +74,7 @@ class Job:
     def open_truth(self) -> Capture:
         """The capture as it is measured: scaled as rendered, and with test cameras, if they are those it trains on."""
         truth = self.options.open(self.capture, image_scale=self.settings.scene.image_scale)
-        return truth if truth.full_test_rig is not None else truth.measured_on_training()
+        return truth if truth.full_test_rig is not None else truth.with_training_as_test()
 
     @property
     def record(self) -> Row:
@@ -208,7 +208,7 @@ def measure(
                     for sentence in first.warnings:
                         if sentence not in given.remarks:
                             report(f"    {sentence}")
-                truth = truth if unseen else truth.measured_on_training(reconstruction.calibrated)
+                truth = truth if unseen else truth.with_training_as_test(reconstruction.calibrated)
             if index == 0 and static is not None:
                 line["seconds"] = static[1]
             elif index == 0 and fitted is not None and reconstruction.static is not None:
@@ -224,7 +224,7 @@ def measure(
             line |= scores
             store.put_frame(job.key, {**line, "cameras": by_camera})
             lines.append(line)
-            reconstruction.history.put_aside(store.folder)
+            reconstruction.history.move_to_scratch(store.folder)
             report(f"    frame {index:3d}/{count - 1}  {line['psnr']:6.2f} dB  {line['seconds']:6.2f} s")
             for alarm in line.get("alarms", ()):
                 report(f"      ! {alarm['camera'] or 'all cameras'}: {alarm['evidence']}")

@@ -54,7 +54,7 @@ def evaluate_states(
     states = of_path(source, rate)
     truth = options.open(folder, image_scale=Settings().scene.image_scale)
     unseen = truth.full_test_rig is not None
-    truth = truth if unseen else truth.measured_on_training()
+    truth = truth if unseen else truth.with_training_as_test()
     for remark in [*states.of.remarks, *([] if states.of.damage is None else [states.of.damage])]:
         report(remark)
     if not unseen:
@@ -95,7 +95,7 @@ def _measure(found: Source, truth: Capture, store: Store, frames: int | None, re
     with Bars(Console(stderr=True)) as bars:
         for index, time, state in given.states(chosen[0], chosen[-1]):
             history.append(index, time, _owned(state, history), {"background": list(given.head.background)})
-            history.put_aside(store.folder)
+            history.move_to_scratch(store.folder)
             scores, by_camera = measure_pictures(scene, truth, index)
             line: Row = {"index": index, **scores}
             store.put_frame(key, {**line, "cameras": by_camera})

@@ -66,7 +66,7 @@ def write_player(out: Path, title: str, files: Sequence[Path]) -> None:
     Args:
         title: of the page. files: in the order of their frames.
     """
-    from scas4d_core.exports.whole_files import whole_file  # with it comes what exports need
+    from scas4d_core.exports.atomic_files import atomic_path  # with it comes what exports need
 
     parts = {
         "title": html.escape(title),
@@ -76,7 +76,7 @@ def write_player(out: Path, title: str, files: Sequence[Path]) -> None:
     }
     before, _, after = (VIEWER / "player" / "player.html").read_text(encoding="utf-8").partition("{{files}}")
     out.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(out) as working, working.open("w", encoding="utf-8") as page:
+    with atomic_path(out) as working, working.open("w", encoding="utf-8") as page:
         page.write(_filled(before, parts))
         for file in files:
             page.write(f'<div class="file" data-bytes="{file.stat().st_size}" hidden>\n')

@@ -89,11 +89,11 @@ def _stream(target: Path) -> Iterator[Any]:
     import rerun
     from rerun import blueprint
 
-    from scas4d_core.exports.whole_files import whole_file
+    from scas4d_core.exports.atomic_files import atomic_path
 
     target.parent.mkdir(parents=True, exist_ok=True)
     look = blueprint.Blueprint(blueprint.Spatial3DView(origin="/world", name="scene"))
-    with whole_file(target) as beside:
+    with atomic_path(target) as beside:
         stream = rerun.RecordingStream("scas4d")
         stream.set_log_time_enabled(False)  # when it was written says nothing
         stream.save(beside, default_blueprint=look)

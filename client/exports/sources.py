@@ -205,9 +205,9 @@ def of_path(path: Path, rate: float | None = None) -> Source:
     if path.suffix.lower() == ".s4d":
         return Source(path.stem, path.parent, CompactStates.of([path]))
     from scas4d_core.exports.reading import open_export  # it brings readers that a compact file does not need
-    from scas4d_core.exports.reading.sources import RATE
+    from scas4d_core.exports.reading.sources import DEFAULT_FPS
 
-    return Source(path.stem, path.parent, open_export(path, RATE if rate is None else rate))
+    return Source(path.stem, path.parent, open_export(path, DEFAULT_FPS if rate is None else rate))
 
 
 @contextmanager

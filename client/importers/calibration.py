@@ -13,7 +13,7 @@ from client.importers.lens import LensCamera
 from scas4d_core.cameras import CAMERA_NAME
 from scas4d_core.captures import CaptureError, InitialPoints
 
-STILL_TOLERANCE = 1e-6
+STATIC_TOLERANCE = 1e-6
 """Largest change of an entry of a pose or of the intrinsics that still counts as a camera standing still."""
 
 
@@ -131,7 +131,7 @@ def _still(source: Path, name: str, views: Sequence[CalibratedImage]) -> LensCam
     for view in views[1:]:
         for field in ("world_to_camera", "intrinsics", "distortion"):
             old, new = getattr(first, field), getattr(view.lens, field)
-            if old.shape != new.shape or np.abs(new - old).max() > STILL_TOLERANCE * max(1.0, np.abs(old).max()):
+            if old.shape != new.shape or np.abs(new - old).max() > STATIC_TOLERANCE * max(1.0, np.abs(old).max()):
                 raise CaptureError(
                     f"{source}: camera {name!r} has another {field} in {view.path} than in {views[0].path}; a rig's "
                     "cameras must stand still: calibrate with one picture a camera, or put each camera's pictures "

@@ -13,7 +13,7 @@ from client.importers.formats.nerfstudio import FILE, read_transforms
 from client.importers.pictures import PictureFiles, folders_of, named_files
 from client.importers.source import Encoding, ImportedPictures, RawReader, check_times, fitted
 from client.importers.videos import ENDS, Videos, find_videos
-from scas4d_core.captures import Capture, CaptureError, Fit, open_capture
+from scas4d_core.captures import Capture, CaptureError, SizeMismatch, open_capture
 from scas4d_core.captures.dynamic3dgs import TRAIN_META
 from scas4d_core.rig_checks import pose_warnings
 
@@ -30,7 +30,7 @@ class CaptureOptions:
     fps: float | None = None
     use_masks: bool = True
     test: tuple[str, ...] = ()
-    fit: Fit | None = None
+    size_mismatch: SizeMismatch | None = None
     encoding: Encoding = "jpeg"
 
     def open(self, folder: Path | str, **more: Any) -> Capture:
@@ -59,7 +59,7 @@ def open_source(
     use_points: bool = True,
     image_scale: float = 1.0,
     test: tuple[str, ...] = (),
-    fit: Fit | None = None,
+    size_mismatch: SizeMismatch | None = None,
 ) -> Capture:
     """Opens a capture of any layout that is known (docs/captures.md): all commands and studies open theirs here.
 
@@ -77,7 +77,7 @@ def open_source(
         use_points: False to leave the cloud alone.
         image_scale: pictures, masks and cameras are resized by this when they are read.
         test: cameras held out for measuring, beside those that the layout holds out.
-        fit: how pictures came about that are of another shape than calibrated (`fitted_intrinsics`); None refuses them.
+        size_mismatch: how pictures of another shape than calibrated were made (`adapt_intrinsics`); None refuses them.
 
     Raises:
         CaptureError: no known layout, or a fault in one of the files; the message says what is missing.
@@ -100,13 +100,15 @@ def open_source(
                 f"{folder / TRAIN_META}: names the pictures of this capture; leave --pictures {pictures} out, or name "
                 "another calibration with --calibration"
             )
-        given = open_capture(folder, fps=fps, use_masks=use_masks, use_points=use_points, fit=fit)
+        given = open_capture(folder, fps=fps, use_masks=use_masks, use_points=use_points, size_mismatch=size_mismatch)
     else:
-        given = _imported(folder, read_calibration(folder, calibration), pictures, fps, encoding, use_masks, fit)
+        given = _imported(
+            folder, read_calibration(folder, calibration), pictures, fps, encoding, use_masks, size_mismatch
+        )
         given = given if use_points else replace(given, points=None)
     suspicions = pose_warnings(given.full_rig, None if given.points is None else given.points.positions)
     given = replace(given, remarks=(*given.remarks, *suspicions))
-    return given.holding_out(test).scaled(image_scale)
+    return given.with_held_out(test).scaled(image_scale)
 
 
 def _imported(
@@ -116,10 +118,10 @@ def _imported(
     fps: float | None,
     encoding: Encoding,
     use_masks: bool,
-    fit: Fit | None,
+    size_mismatch: SizeMismatch | None,
 ) -> Capture:
     raw = _pictures(folder, found, pictures)
-    found, resized = fitted(found, raw, fit)
+    found, resized = fitted(found, raw, size_mismatch)
     masks = folder / "masks"
     files = tuple(folders_of(masks, found, what="masks")) if use_masks and masks.is_dir() else ()
     if files and isinstance(raw, PictureFiles):

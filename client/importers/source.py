@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from client.importers.calibration import Calibration
 from client.importers.undistort import Undistorter
 from scas4d_core.cameras import Rig
-from scas4d_core.captures import CaptureError, Fit, decode_mask
-from scas4d_core.captures.fit import fitted_intrinsics
+from scas4d_core.captures import CaptureError, SizeMismatch, decode_mask
 from scas4d_core.captures.images import Size, eight_bit_file
 from scas4d_core.captures.reader import read_bytes
+from scas4d_core.captures.size_mismatch import adapt_intrinsics
 
 Picture = NDArray[np.uint8]
 Encoding = Literal["jpeg", "png"]
@@ -118,7 +118,7 @@ class ImportedPictures:
         size = (undistorter.lens.width, undistorter.lens.height)
         return undistorter.mask(decode_mask(self._masks[index][camera], size=size))
 
-    def encoded(self, index: int, camera: str) -> bytes:
+    def encoded_image(self, index: int, camera: str) -> bytes:
         """The file as it is, or the undistorted picture encoded; 16 bits are rounded to 8."""
         if self._undistorters[camera].lens.straight:
             file = self._raw.file(index, camera)
@@ -131,22 +131,24 @@ class ImportedPictures:
         return encode(255 * self.mask(index, camera), "png") if self.has_mask(index, camera) else None
 
 
-def fitted(calibration: Calibration, raw: RawReader, fit: Fit | None) -> tuple[Calibration, list[str]]:
+def fitted(
+    calibration: Calibration, raw: RawReader, size_mismatch: SizeMismatch | None
+) -> tuple[Calibration, list[str]]:
     """The calibration for pictures of the size that they have, and remarks on cameras where that is another.
 
     Raises:
-        CaptureError: pictures of another shape than calibrated, and `fit` does not say how they came about.
+        CaptureError: pictures of another shape than calibrated, and `size_mismatch` does not say how they came about.
     """
     cameras, remarks = [], []
     for lens in calibration.cameras:
         size = raw.sizes[lens.name]
-        k, remark = fitted_intrinsics(
+        k, remark = adapt_intrinsics(
             lens.intrinsics,
             (lens.width, lens.height),
             size,
             camera=lens.name,
             where=str(raw.path(lens.name)),
-            fit=fit,
+            size_mismatch=size_mismatch,
         )
         cameras.append(replace(lens, intrinsics=k, width=size[0], height=size[1]))
         remarks += [] if remark is None else [remark]

@@ -54,7 +54,7 @@ def write_dynamic3dgs(
     fps = _rate(source, count)
 
     def write(index: int, name: str) -> None:
-        picture, mask = source.encoded(index, name), source.encoded_mask(index, name)
+        picture, mask = source.encoded_image(index, name), source.encoded_mask(index, name)
         ends[name, index] = end = _end_of(picture)
         _put(out / "ims" / name / f"{index:06d}{end}", picture)
         if mask is not None:

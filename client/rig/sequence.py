@@ -72,7 +72,9 @@ class Sequence:
 
     def _files(self, index: int) -> Files:
         place, names = self.place(index), self.source.full_rig.names
-        images = dict(zip(names, self._pool.map(lambda name: self.source.encoded(place, name), names), strict=True))
+        images = dict(
+            zip(names, self._pool.map(lambda name: self.source.encoded_image(place, name), names), strict=True)
+        )
         files = dict(zip(names, self._pool.map(lambda name: self.source.encoded_mask(place, name), names), strict=True))
         masks = {name: mask for name, mask in files.items() if mask is not None}
         # The service takes masks of all cameras or of none.

@@ -111,14 +111,14 @@ class EffectModel(Model):
 class FirstCloudModel(Model):
     """Origin of the points from which frame 0 was fitted, and how sure they are."""
 
-    way: str = Field(
+    method: str = Field(
         description="given; else how the pictures gave them: agreement (of three cameras or more), backdrop "
         "(silhouettes before a plain one), pairs (two cameras agree), plane (a floor or a table on which pictures "
         "agree), surroundings (what each camera sees, far behind), volume (no camera confirms them: a guess; "
         "give points, or more cameras); several are joined by +."
     )
     points: int
-    covered: float | None = Field(
+    coverage: float | None = Field(
         description="0…1, share of the pictures in which there are points on which cameras agree; null where given."
     )
 
@@ -136,8 +136,8 @@ class CameraResidualModel(Model):
 class RefinedCameraModel(Model):
     """A camera after refinement, against the calibration as it was given."""
 
-    turned: float = Field(description="Degrees.")
-    moved: float = Field(description="Of its centre, in the calibration's unit.")
+    rotation_deg: float = Field(description="Degrees.")
+    translation: float = Field(description="Of its centre, in the calibration's unit.")
     focal: float = Field(description="Times its focal length.")
     before: float | None = Field(description="Its residual as given, pixels; null where there are too few matches.")
     after: float | None = Field(description="The same, refined.")
@@ -160,7 +160,7 @@ class CalibrationModel(Model):
     """The calibration against the pictures of frame 0."""
 
     cameras: dict[str, CameraResidualModel] = Field(description="By name, as it was given.")
-    off: list[str] = Field(description="Cameras that are clearly off.")
+    miscalibrated: list[str] = Field(description="Cameras that are clearly off.")
     warnings: list[str] = Field(description="For people, a sentence each; they stand in the status of the scene too.")
     refined: RefinementModel | None = Field(description="Null where `static.refine_calibration` does not ask for it.")
 

@@ -8,21 +8,21 @@ from typing import Any
 from scas4d_core.captures.capture import Capture
 from scas4d_core.captures.dynamic3dgs import TRAIN_META, read_dynamic3dgs
 from scas4d_core.captures.files import CaptureError
-from scas4d_core.captures.fit import Fit
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.captures.ground_truth import GroundTruth, TruePart
 from scas4d_core.captures.images import ImageError, decode_image, decode_mask, resize_area
 from scas4d_core.captures.reader import PictureReader
+from scas4d_core.captures.size_mismatch import SizeMismatch
 
 __all__ = [
     "Capture",
     "CaptureError",
-    "Fit",
     "Frame",
     "GroundTruth",
     "ImageError",
     "InitialPoints",
     "PictureReader",
+    "SizeMismatch",
     "TruePart",
     "decode_image",
     "decode_mask",
@@ -37,7 +37,7 @@ def open_capture(folder: Path | str, **options: Any) -> Capture:
 
     Args:
         folder: of the capture.
-        options: of the reader, `read_dynamic3dgs`: image_scale, fps, use_masks, use_points, fit.
+        options: of the reader, `read_dynamic3dgs`: image_scale, fps, use_masks, use_points, size_mismatch.
 
     Raises:
         CaptureError: no such folder, no known layout, or a fault in one of the files.

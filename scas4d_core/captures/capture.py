@@ -56,11 +56,11 @@ class Capture:
     >>> frame = capture.frame(2)
     >>> round(frame.time, 4), sorted(frame.masks) == sorted(capture.rig.names)
     (0.0667, True)
-    >>> capture.encoded(2, "0")[:4]  # the file as it is
+    >>> capture.encoded_image(2, "0")[:4]  # the file as it is
     b'\x89PNG'
     >>> capture.test_rig.names
     ('4', '11')
-    >>> capture.holding_out(["3"]).test_rig.names
+    >>> capture.with_held_out(["3"]).test_rig.names
     ('3', '4', '11')
     """
 
@@ -114,7 +114,7 @@ class Capture:
             raise CaptureError(f"capture {self.name}: has no test cameras; hold some out (--test)")
         return self._frame(index, self.full_test_rig)
 
-    def encoded(self, index: int, camera: str) -> bytes:
+    def encoded_image(self, index: int, camera: str) -> bytes:
         """Bytes of a picture's file, at full size whatever ``image_scale``, of a training or test camera.
 
         Raises:
@@ -123,7 +123,7 @@ class Capture:
             CaptureError: the file cannot be read.
         """
         self._check(index)
-        return self.pictures.encoded(index, camera)
+        return self.pictures.encoded_image(index, camera)
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
         """Bytes of a mask's file, at full size whatever ``image_scale``; None where there is none.
@@ -143,7 +143,7 @@ class Capture:
             truth = replace(truth, image_size=sizes)
         return replace(self, image_scale=image_scale, ground_truth=truth)
 
-    def holding_out(self, names: Collection[str]) -> Capture:
+    def with_held_out(self, names: Collection[str]) -> Capture:
         """The same capture with these cameras among the test cameras: measured on, never trained on.
 
         Raises:
@@ -162,7 +162,7 @@ class Capture:
         held = tuple(camera for camera in self.full_rig.cameras if camera.name in names)
         return replace(self, full_rig=Rig(train), full_test_rig=Rig(held + others))
 
-    def measured_on_training(self, rig: Rig | None = None) -> Capture:
+    def with_training_as_test(self, rig: Rig | None = None) -> Capture:
         """The same capture with its training cameras for test cameras: measures how well training pictures are met.
 
         Args:

@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from scas4d_core.cameras import CAMERA_NAME, Camera, CameraError, Rig
 from scas4d_core.captures.capture import Capture
 from scas4d_core.captures.files import CaptureError, read_json, read_npz
-from scas4d_core.captures.fit import Fit, fitted_intrinsics
 from scas4d_core.captures.frame import InitialPoints
 from scas4d_core.captures.ground_truth import read_extent, read_ground_truth
 from scas4d_core.captures.images import ImageError, describe_pictures, picture_size, scaled_size
 from scas4d_core.captures.reader import FileReader, Files
+from scas4d_core.captures.size_mismatch import SizeMismatch, adapt_intrinsics
 
 TRAIN_META = "train_meta.json"
-STILL_TOLERANCE = 1e-6
+STATIC_TOLERANCE = 1e-6
 """Largest change of an entry of k or w2c over time that still counts as a camera standing still."""
 
 
@@ -39,7 +39,7 @@ def read_dynamic3dgs(
     fps: float | None = None,
     use_masks: bool = True,
     use_points: bool = True,
-    fit: Fit | None = None,
+    size_mismatch: SizeMismatch | None = None,
 ) -> Capture:
     """Opens a capture. Cameras are named ``str(cam_id)``; test cameras are those of ``test_meta.json``.
 
@@ -51,17 +51,17 @@ def read_dynamic3dgs(
         fps: frames per second; where None, those of ``train_meta.json`` (``scas4d import`` writes them), else 30.
         use_masks: False to leave ``seg/`` alone.
         use_points: False to leave ``init_pt_cld.npz`` alone.
-        fit: how pictures of another shape than ``w`` and ``h`` came about (`fitted_intrinsics`); None refuses them.
+        size_mismatch: how pictures of another shape than ``w``, ``h`` were made (`adapt_intrinsics`); None refuses.
 
     Raises:
         CaptureError: a file is missing, broken, or does not fit the others; or a camera moves.
     """
     folder = Path(folder)
-    train = _read_cameras(folder, TRAIN_META, fit)
+    train = _read_cameras(folder, TRAIN_META, size_mismatch)
     rate = train.fps if fps is None else fps
     if isinstance(rate, bool) or not isinstance(rate, int | float) or not (np.isfinite(rate) and rate > 0):
         raise CaptureError(f"{folder}: fps {rate!r} must be a positive number of frames per second")
-    test = _read_cameras(folder, "test_meta.json", fit) if (folder / "test_meta.json").exists() else None
+    test = _read_cameras(folder, "test_meta.json", size_mismatch) if (folder / "test_meta.json").exists() else None
     if test is not None:
         both = sorted(set(train.rig.names) & set(test.rig.names))
         if both:
@@ -80,7 +80,7 @@ def read_dynamic3dgs(
         name=folder.resolve().name,
         full_rig=train.rig,
         full_test_rig=test.rig if test else None,
-        pictures=FileReader(_joined([one.images for one in given]), _joined(masks), sizes),
+        pictures=FileReader(_merge_files([one.images for one in given]), _merge_files(masks), sizes),
         image_scale=image_scale,
         fps=float(rate),
         points=_read_points(folder / "init_pt_cld.npz") if use_points else None,
@@ -90,7 +90,7 @@ def read_dynamic3dgs(
     )
 
 
-def _joined(of: list[tuple[Files, ...]]) -> list[Files]:
+def _merge_files(of: list[tuple[Files, ...]]) -> list[Files]:
     """The files of training and test cameras, frame by frame."""
     return [{name: file for files in frame for name, file in files.items()} for frame in zip(*of, strict=True)]
 
@@ -112,16 +112,16 @@ def _remarks(given: list[_Cameras]) -> list[str]:
     return [remark for one in given for remark in one.remarks] + described
 
 
-def _read_cameras(folder: Path, file: str, fit: Fit | None) -> _Cameras:
+def _read_cameras(folder: Path, file: str, size_mismatch: SizeMismatch | None) -> _Cameras:
     path = folder / file
     meta = read_json(path)
     missing = [key for key in ("w", "h", "k", "w2c", "fn", "cam_id") if key not in meta]
     if missing:
         raise CaptureError(f"{path}: has no {', '.join(missing)}")
-    names = _names(path, meta["cam_id"])
+    names = _camera_names(path, meta["cam_id"])
     widths, heights = (_sizes(path, key, meta[key], len(names)) for key in ("w", "h"))
-    intrinsics = _still(path, "k", meta["k"], (len(meta["cam_id"]), len(names), 3, 3))
-    poses = _still(path, "w2c", meta["w2c"], (len(meta["cam_id"]), len(names), 4, 4))
+    intrinsics = _require_static(path, "k", meta["k"], (len(meta["cam_id"]), len(names), 3, 3))
+    poses = _require_static(path, "w2c", meta["w2c"], (len(meta["cam_id"]), len(names), 4, 4))
     try:
         rig = Rig(tuple(map(Camera, names, intrinsics, poses, widths, heights)))
     except CameraError as fault:
@@ -132,37 +132,39 @@ def _read_cameras(folder: Path, file: str, fit: Fit | None) -> _Cameras:
         absent = next((file for file in frame.values() if not file.is_file()), None)
         if absent:
             raise CaptureError(f"{absent}: no such file, but {file} names it")
-    fitted = [_fitted(camera, images[0][camera.name], fit) for camera in rig.cameras]
+    fitted = [_adapt_camera(camera, images[0][camera.name], size_mismatch) for camera in rig.cameras]
     remarks = [remark for _, remark in fitted if remark is not None]
     return _Cameras(Rig(tuple(camera for camera, _ in fitted)), images, relative, meta.get("fps", 30.0), remarks)
 
 
-def _fitted(camera: Camera, picture: Path, fit: Fit | None) -> tuple[Camera, str | None]:
+def _adapt_camera(camera: Camera, picture: Path, size_mismatch: SizeMismatch | None) -> tuple[Camera, str | None]:
     try:
         size = picture_size(picture)
     except ImageError as fault:
         raise CaptureError(str(fault)) from fault
     calibrated = (camera.width, camera.height)
-    k, remark = fitted_intrinsics(camera.intrinsics, calibrated, size, camera=camera.name, where=str(picture), fit=fit)
+    k, remark = adapt_intrinsics(
+        camera.intrinsics, calibrated, size, camera=camera.name, where=str(picture), size_mismatch=size_mismatch
+    )
     return replace(camera, intrinsics=k, width=size[0], height=size[1]), remark
 
 
 def _sizes(path: Path, key: str, value: Any, cameras: int) -> list[int]:
     """Widths or heights by camera; one number stands for all."""
     if not isinstance(value, list):
-        return [_whole(path, key, value)] * cameras
+        return [_parse_pixels(path, key, value)] * cameras
     if len(value) != cameras:
         raise CaptureError(f"{path}: {key} lists {len(value)} sizes and cam_id {cameras} cameras; give one a camera")
-    return [_whole(path, f"{key}[{number}]", one) for number, one in enumerate(value)]
+    return [_parse_pixels(path, f"{key}[{number}]", one) for number, one in enumerate(value)]
 
 
-def _whole(path: Path, key: str, value: Any) -> int:
+def _parse_pixels(path: Path, key: str, value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int | float) or value != round(value) or value < 1:
         raise CaptureError(f"{path}: {key} is {value!r}; give a whole number of pixels")
     return int(value)
 
 
-def _names(path: Path, cam_id: Any) -> list[str]:
+def _camera_names(path: Path, cam_id: Any) -> list[str]:
     if not isinstance(cam_id, list) or not cam_id or not all(isinstance(row, list) and row for row in cam_id):
         raise CaptureError(f"{path}: cam_id must be a list of frames, each a list of cameras, none empty")
     changed = next((t for t, row in enumerate(cam_id) if row != cam_id[0]), None)
@@ -180,14 +182,14 @@ def _names(path: Path, cam_id: Any) -> list[str]:
     return names
 
 
-def _still(path: Path, key: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _require_static(path: Path, key: str, value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as fault:
         raise CaptureError(f"{path}: {key} must be numbers of shape {list(shape)}, as cam_id has; {fault}") from fault
     if array.shape != shape:
         raise CaptureError(f"{path}: {key} must have shape {list(shape)}, as cam_id has; found {list(array.shape)}")
-    moved = np.abs(array - array[:1]).max(axis=(2, 3)) > STILL_TOLERANCE * np.maximum(1, np.abs(array[:1])).max()
+    moved = np.abs(array - array[:1]).max(axis=(2, 3)) > STATIC_TOLERANCE * np.maximum(1, np.abs(array[:1])).max()
     if moved.any():
         frame, camera = np.argwhere(moved)[0]
         raise CaptureError(

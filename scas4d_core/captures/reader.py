@@ -42,7 +42,7 @@ class PictureReader(Protocol):
     def mask(self, index: int, camera: str) -> NDArray[np.uint8]:
         """Decodes a mask, [H, W], 1 on the foreground."""
 
-    def encoded(self, index: int, camera: str) -> bytes:
+    def encoded_image(self, index: int, camera: str) -> bytes:
         """A picture as a file of 8 bits that the service takes: JPEG, PNG or WebP.
 
         Raises:
@@ -83,7 +83,7 @@ class FileReader:
         """Decodes a mask, [H, W]."""
         return decode_mask(self.masks[index][camera], size=self._sizes[camera])
 
-    def encoded(self, index: int, camera: str) -> bytes:
+    def encoded_image(self, index: int, camera: str) -> bytes:
         """The file as it is; one of 16 bits is rounded to 8."""
         return eight_bit_file(read_bytes(self.images[index][camera]), str(self.images[index][camera]))
 

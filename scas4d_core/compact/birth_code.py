@@ -9,19 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.compact.bounds import Bounds
-from scas4d_core.compact.cluster_motion import MOST_CLUSTERS, Clusters
+from scas4d_core.compact.cluster_motion import MAX_CLUSTERS, Clusters
 from scas4d_core.compact.columns import (
     LABELS,
     Columns,
-    by_green,
+    decorrelate_colours,
     label_of,
     levels_of,
-    of_green,
+    restore_colours,
+    rotation_vectors,
+    rotations_of_vectors,
     sizes_of,
-    turns_of,
-    vectors_of,
 )
-from scas4d_core.compact.frame_code import completed, lost_volume
+from scas4d_core.compact.frame_code import apply_exact, lost_volume
 from scas4d_core.compact.planes import Ints, PlaneError, pack, unpack
 from scas4d_core.compact.residuals import MARGIN, whole_steps
 from scas4d_core.compact.sections import (
@@ -93,7 +93,7 @@ def decode_born(body: bytes, count: int, bounds: Bounds) -> tuple[Columns, Clust
     """
     steps, offset = unpack(body, count)
     labels, offset = unpack(body, count, offset)
-    if labels.min(initial=0) < 0 or labels.max(initial=0) > MOST_CLUSTERS:
+    if labels.min(initial=0) < 0 or labels.max(initial=0) > MAX_CLUSTERS:
         raise PlaneError(f"clusters {labels.min(initial=0)} to {labels.max(initial=0)} cannot be")
     coded = {}
     for name, components in COMPONENTS.items():
@@ -106,12 +106,12 @@ def decode_born(body: bytes, count: int, bounds: Bounds) -> tuple[Columns, Clust
         if not 1 <= with_gloss <= count + 1:
             raise PlaneError(f"{with_gloss - 1} of {count} Gaussians cannot have gloss")
         planes, offset = read_residuals(body, offset, 3, int(with_gloss) - 1)
-        state = state.having(gloss=planes * np.float32(2 * bounds.gloss))
+        state = state.replace(gloss=planes * np.float32(2 * bounds.gloss))
     environment, offset = read_array(body, offset)
     if offset != len(body):
         raise PlaneError(f"{len(body) - offset} bytes follow the Gaussians")
-    values += np.float32(0)  # as in `Columns.placed`
-    return completed(state, rows, values, retired, environment), Clusters(labels.astype(np.int64))
+    values += np.float32(0)  # as in `Columns.replace_rows`
+    return apply_exact(state, rows, values, retired, environment), Clusters(labels.astype(np.int64))
 
 
 def _axis_step(bounds: Bounds) -> float:
@@ -132,8 +132,8 @@ def _planes(state: Columns, bounds: Bounds) -> dict[str, Float]:
             "lengths": np.nan_to_num(lengths),
             "axes": axes.reshape(9, -1),
             "means": means,
-            "rotations": np.rint(vectors_of(state.rotations.astype(np.float64)) / bounds.rotation_step),
-            "colours": by_green(np.rint(state.colours.astype(np.float64) / (2 * bounds.colour / FINER))),
+            "rotations": np.rint(rotation_vectors(state.rotations.astype(np.float64)) / bounds.rotation_step),
+            "colours": decorrelate_colours(np.rint(state.colours.astype(np.float64) / (2 * bounds.colour / FINER))),
             "labels": levels_of(state.foreground)[None].astype(np.float64),
             "opacities": np.rint(state.opacities.astype(np.float64) / (2 * bounds.opacity))[None],
         }
@@ -145,8 +145,8 @@ def _columns(coded: dict[str, Ints], ids: NDArray[np.int64], bounds: Bounds) -> 
         factors = (coded["axes"].reshape(3, 3, -1) * _axis_step(bounds) * lengths).reshape(9, -1)
         sizes = sizes_of(factors).astype(np.float64)
         means = (coded["means"] * (2 * bounds.position / FINER * MARGIN * sizes)).astype(np.float32)
-    colours = (of_green(coded["colours"]) * (2 * bounds.colour / FINER)).astype(np.float32)
-    rotations = turns_of(coded["rotations"] * bounds.rotation_step).astype(np.float32)
+    colours = (restore_colours(coded["colours"]) * (2 * bounds.colour / FINER)).astype(np.float32)
+    rotations = rotations_of_vectors(coded["rotations"] * bounds.rotation_step).astype(np.float32)
     foreground = label_of(np.clip(coded["labels"][0], 0, LABELS - 1))
     opacities = np.clip(coded["opacities"][0] * (2 * bounds.opacity), OPAQUE, 1 - OPAQUE).astype(np.float32)
     return Columns(

@@ -39,13 +39,13 @@ class Bounds:
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            value, least = getattr(self, item.name), LEAST_ROTATION if item.name == "rotation" else LEAST
+            value, least = getattr(self, item.name), MIN_ROTATION if item.name == "rotation" else LEAST
             if not least <= value <= 1:
                 raise InputError(f"bound {item.name}={value} is out of its range", f"give a number from {least} to 1")
 
     @property
     def rotation_step(self) -> float:
-        """The step of each component of ``vectors_of``; the bound is of the angle that three of them make."""
+        """The step of each component of ``rotation_vectors``; the bound is of the angle that three of them make."""
         return 2 * self.rotation / 3**0.5
 
     def record(self) -> dict[str, float]:
@@ -60,5 +60,5 @@ class Bounds:
 
 LEAST = 1e-6
 """Below it float32 has no digits left."""
-LEAST_ROTATION = 0.002
+MIN_ROTATION = 0.002
 """Below it the steps of a half turn are more than a plane holds."""

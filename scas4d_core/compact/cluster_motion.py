@@ -14,22 +14,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.compact.columns import Columns, mapped, products
+from scas4d_core.compact.columns import Columns, multiply_rows, products
 from scas4d_core.gaussians import Gaussians
 
 Array = NDArray[np.float32]
 Float = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-PER_CLUSTER, MOST_CLUSTERS = 100, 400
+PER_CLUSTER, MAX_CLUSTERS = 100, 400
 """Gaussians in a cluster on average, and most clusters: more cost more than they save (docs/format.md)."""
 ROUNDS, SAMPLE = 5, 20_000
 """Of k-means: rounds, and Gaussians whose centres are averaged."""
-STANDS = 0
+NO_CLUSTER = 0
 """Label of what does not move with a cluster; clusters count from 1."""
 SMALLEST = 1e-9
 """Metres; smaller Gaussians weigh no more."""
-STILL = (1.0, 0.0, 0.0, 0.0)
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
 """No turn."""
 RIDGE = 1e-3
 """Pull of A to zero, in units of the Gaussians' size: a flat or thin cluster does not determine A across its plane."""
@@ -71,14 +71,14 @@ class Clusters:
     def spread(self, values: NDArray[Any], stands: float) -> Array:
         """[N] float32, a value [count] of each Gaussian's cluster; ``stands`` for those that stand."""
         table = np.empty(self.count + 1, np.float32)
-        table[STANDS], table[1:] = stands, values
+        table[NO_CLUSTER], table[1:] = stands, values
         return table[self.labels]
 
     def rows(self, rows: NDArray[np.intp]) -> Clusters:
         """Those of some Gaussians: of all that move at least, so that each cluster is the same."""
         return Clusters(self.labels[rows])
 
-    def joined(self, labels: Ints) -> Clusters:
+    def concatenate(self, labels: Ints) -> Clusters:
         """With those of more Gaussians after them."""
         return Clusters(np.concatenate([self.labels, labels]))
 
@@ -87,7 +87,7 @@ class Clusters:
         """Clusters of the Gaussians that move, by their places."""
         moving = np.flatnonzero(state.moving)
         labels = np.zeros(len(state), np.int64)
-        count = min(MOST_CLUSTERS, -(-len(moving) // PER_CLUSTER))
+        count = min(MAX_CLUSTERS, -(-len(moving) // PER_CLUSTER))
         if count:
             labels[moving] = 1 + _k_means(state.means[moving].astype(np.float64), count)
         return cls(labels)
@@ -118,7 +118,7 @@ class ClusterMotion:
     shifts: Float
 
     @classmethod
-    def between(cls, clusters: Clusters, reference: Columns, state: Columns) -> ClusterMotion:
+    def fit(cls, clusters: Clusters, reference: Columns, state: Columns) -> ClusterMotion:
         """The maps of least squares, each Gaussian by its own size."""
         means = reference.means
         centres = clusters.means(means)
@@ -142,7 +142,7 @@ class ClusterMotion:
         maps[~np.isfinite(maps).all(axis=(1, 2))] = 0
         return cls(np.ascontiguousarray(maps[:, :3].transpose(0, 2, 1)), maps[:, 3])
 
-    def carried(self, clusters: Clusters, reference: Columns) -> Columns:
+    def predict(self, clusters: Clusters, reference: Columns) -> Columns:
         """The state that the maps predict; what stands has the reference's bits."""
         if not clusters.count:
             return reference
@@ -151,19 +151,19 @@ class ClusterMotion:
         spread = [[clusters.spread(maps[:, i, j], float(i == j)) for j in range(3)] for i in range(3)]
         arms = [mean - clusters.spread(centre, 0) for mean, centre in zip(reference.means, centres, strict=True)]
         ends = [clusters.spread(shift + centre, 0) for shift, centre in zip(self.shifts.T, centres, strict=True)]
-        means = np.stack([arm + end for arm, end in zip(mapped(spread, np.stack(arms)), ends, strict=True)])
-        factors = np.stack(mapped(spread, reference.factors))
+        means = np.stack([arm + end for arm, end in zip(multiply_rows(spread, np.stack(arms)), ends, strict=True)])
+        factors = np.stack(multiply_rows(spread, reference.factors))
         turns = polar_rotations(maps)
         own = np.stack(
-            [clusters.spread(one, stands) for one, stands in zip(quaternions_of(turns).T, STILL, strict=True)]
+            [clusters.spread(one, stands) for one, stands in zip(quaternions_of(turns).T, IDENTITY, strict=True)]
         )
         gloss = reference.gloss
         if gloss is not None:
             count = gloss.shape[1]
             t = [[clusters.spread(turns[:, i, j], float(i == j))[:count] for j in range(3)] for i in range(3)]
-            gloss = np.stack(mapped(t, gloss))
+            gloss = np.stack(multiply_rows(t, gloss))
         rotations = products(own, reference.rotations)
-        return reference.having(means=means, factors=factors, rotations=rotations, gloss=gloss)
+        return reference.replace(means=means, factors=factors, rotations=rotations, gloss=gloss)
 
 
 def polar_rotations(matrices: Float) -> Float:

@@ -81,32 +81,32 @@ class Columns:
             environment=self.environment,
         )
 
-    def having(self, **changes: Any) -> Columns:
+    def replace(self, **changes: Any) -> Columns:
         """The same with some arrays exchanged."""
         return replace(self, **changes)
 
-    def joined(self, born: Columns) -> Columns:
+    def concatenate(self, born: Columns) -> Columns:
         """With Gaussians after its own, which keep their ids and are dull."""
-        return self.having(
+        return self.replace(
             **{name: np.concatenate([getattr(self, name), getattr(born, name)], axis=-1) for name in BY_ROW}
         )
 
-    def after(self, count: int) -> Columns:
+    def from_row(self, count: int) -> Columns:
         """The Gaussians from row ``count`` on, dull."""
         rows = {name: getattr(self, name)[..., count:] for name in BY_ROW}
-        return self.having(**rows, gloss=None, environment=None)
+        return self.replace(**rows, gloss=None, environment=None)
 
     def rows(self, rows: NDArray[np.intp]) -> Columns:
         """Some of the Gaussians, dull."""
         taken = {name: np.take(getattr(self, name), rows, axis=-1) for name in BY_ROW}
-        return self.having(**taken, gloss=None, environment=None)
+        return self.replace(**taken, gloss=None, environment=None)
 
-    def placed(self, rows: NDArray[np.intp], part: Columns) -> Columns:
+    def replace_rows(self, rows: NDArray[np.intp], part: Columns) -> Columns:
         """The same with place and shape of some rows exchanged."""
         changed = {name: getattr(self, name).copy() for name in SHAPED}
         for name, array in changed.items():
             array[..., rows] = getattr(part, name) + np.float32(0)  # −0 to 0: whichever rows go through arithmetic
-        return self.having(**changed)
+        return self.replace(**changed)
 
     @property
     def moving(self) -> NDArray[np.bool_]:
@@ -161,14 +161,14 @@ def products(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
     return np.stack(product_components(a, b))
 
 
-def mapped(rows: Sequence[Sequence[NDArray[Any]]], planes: NDArray[Any]) -> list[NDArray[Any]]:
+def multiply_rows(rows: Sequence[Sequence[NDArray[Any]]], planes: NDArray[Any]) -> list[NDArray[Any]]:
     """The components, [N] each, of a matrix times vectors or matrices, one of each a Gaussian.
 
     Args:
         rows: of the matrices, three of three [N]. planes: [3, N] of vectors, or [9, N] of matrices row by row.
 
     >>> one, zero = np.ones(1), np.zeros(1)
-    >>> mapped([[zero, one, zero], [one, zero, zero], [zero, zero, one]], np.array([[5.0], [6], [7]]))
+    >>> multiply_rows([[zero, one, zero], [one, zero, zero], [zero, zero, one]], np.array([[5.0], [6], [7]]))
     [array([6.]), array([5.]), array([7.])]
     """
     width = len(planes) // 3
@@ -179,36 +179,36 @@ def mapped(rows: Sequence[Sequence[NDArray[Any]]], planes: NDArray[Any]) -> list
     ]
 
 
-def by_green(colours: NDArray[Any]) -> NDArray[Any]:
+def decorrelate_colours(colours: NDArray[Any]) -> NDArray[Any]:
     """[3, N] green, and what red and blue have more of it: channels change alike.
 
-    >>> by_green(np.array([[5], [3], [2]])).ravel(), of_green(np.array([[3], [2], [-1]])).ravel()
+    >>> decorrelate_colours(np.array([[5], [3], [2]])).ravel(), restore_colours(np.array([[3], [2], [-1]])).ravel()
     (array([ 3,  2, -1]), array([5, 3, 2]))
     """
     red, green, blue = colours
     return np.stack([green, red - green, blue - green])
 
 
-def of_green(planes: NDArray[Any]) -> NDArray[Any]:
-    """[3, N] red, green and blue of ``by_green``."""
+def restore_colours(planes: NDArray[Any]) -> NDArray[Any]:
+    """[3, N] red, green and blue of ``decorrelate_colours``."""
     green, red, blue = planes
     return np.stack([red + green, green, blue + green])
 
 
-def turns_between(after: Array, before: Array) -> Float:
+def relative_rotations(after: Array, before: Array) -> Float:
     """[4, N] what turns one rotation to another."""
     w, x, y, z = before.astype(np.float64)
     return np.asarray(products(after.astype(np.float64), np.stack([w, -x, -y, -z])))
 
 
-def vectors_of(turns: NDArray[Any]) -> NDArray[Any]:
+def rotation_vectors(turns: NDArray[Any]) -> NDArray[Any]:
     """[3, N] 2 tan(θ/2) about the axis of each turn [4, N]; near θ where it is small."""
     w = turns[0]
     return np.asarray(turns[1:] * (2 * np.where(w < 0, -1, 1) / np.maximum(np.abs(w), 1e-6)))
 
 
-def turns_of(vectors: NDArray[Any]) -> NDArray[Any]:
-    """[4, N] unit quaternions of ``vectors_of``."""
+def rotations_of_vectors(vectors: NDArray[Any]) -> NDArray[Any]:
+    """[4, N] unit quaternions of ``rotation_vectors``."""
     squares = 1 + np.square(vectors).sum(axis=0) / 4
     return np.asarray(np.concatenate([np.ones_like(vectors[:1]), vectors / 2]) / np.sqrt(squares))
 

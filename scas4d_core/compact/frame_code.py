@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from scas4d_core.compact.bounds import Bounds
 from scas4d_core.compact.cluster_motion import ClusterMotion, Clusters
-from scas4d_core.compact.columns import Columns, turns_between, vectors_of
+from scas4d_core.compact.columns import Columns, relative_rotations, rotation_vectors
 from scas4d_core.compact.planes import Ints, PlaneError, pack, unpack
-from scas4d_core.compact.residuals import LARGEST, SHAPE, DecodedState, coded_shape, looks, whole_steps
+from scas4d_core.compact.residuals import LARGEST, SHAPE, DecodedState, appearance_attributes, coded_shape, whole_steps
 from scas4d_core.compact.sections import (
     read_array,
     read_coded_rows,
@@ -32,7 +32,7 @@ from scas4d_core.compact.sections import (
 Array = NDArray[np.float32]
 Float = NDArray[np.float64]
 
-FLAT = 0.1
+MIN_VOLUME_RATIO = 0.1
 """A decoded Gaussian whose volume is not between this part of the true one and its inverse is coded exactly: thin ones,
 whose error in an axis is as large as the axis, would lose their volume or turn inside out."""
 SLACK = 1 + 1e-4
@@ -48,7 +48,7 @@ _STEPS = struct.Struct("<dd")
 
 
 @dataclass(frozen=True)
-class Coded:
+class EncodedFrame:
     """A state as bytes, and as a reader will have it.
 
     Attributes:
@@ -60,7 +60,7 @@ class Coded:
     errors: Mapping[str, float]
 
 
-def encode(reference: Columns, state: Columns, clusters: Clusters, bounds: Bounds) -> Coded:
+def encode(reference: Columns, state: Columns, clusters: Clusters, bounds: Bounds) -> EncodedFrame:
     """Codes a state of the same Gaussians as the reference.
 
     Args:
@@ -81,39 +81,41 @@ def encode(reference: Columns, state: Columns, clusters: Clusters, bounds: Bound
     before, true, own = reference, state, clusters
     if rows is not None:
         before, true, own = reference.rows(rows), state.rows(rows), clusters.rows(rows)
-    motion = ClusterMotion.between(own, before, true)
+    motion = ClusterMotion.fit(own, before, true)
     steps = _steps(own, before, bounds)
     planes = np.rint(np.concatenate([motion.matrices.reshape(-1, 9) / steps[0], motion.shifts / steps[1]], axis=1).T)
     planes = np.clip(planes, -LARGEST, LARGEST).astype(np.int64)
-    partial = DecodedState.of(bounds, _moved(before, own, planes, steps))
+    partial = DecodedState.of(bounds, _predict(before, own, planes, steps))
     exact = np.zeros(len(true), np.bool_)
     sections = [_STEPS.pack(*steps), *(pack(plane) for plane in planes)]
     for name in SHAPE:
         residual, beyond = whole_steps(partial.residual(name, true))
         exact |= beyond
         sections.append(write_residuals(residual, rows, len(state)))
-        partial = partial.having(name, residual)
-    exact |= _beyond(partial.state, true, bounds)
+        partial = partial.apply_residual(name, residual)
+    exact |= _out_of_bounds(partial.state, true, bounds)
     exactly, values = np.flatnonzero(exact), np.concatenate([true.means[:, exact], true.factors[:, exact]])
-    shaped = completed(partial.state, exactly, values)
-    errors = {name: max(float(each.max(initial=0)), still.get(name, 0)) for name, each in _apart(shaped, true).items()}
-    partial = replace(partial, state=shaped if rows is None else reference.placed(rows, shaped))
-    for name in looks(state):
+    shaped = apply_exact(partial.state, exactly, values)
+    errors = {
+        name: max(float(each.max(initial=0)), still.get(name, 0)) for name, each in _shape_errors(shaped, true).items()
+    }
+    partial = replace(partial, state=shaped if rows is None else reference.replace_rows(rows, shaped))
+    for name in appearance_attributes(state):
         residual, _ = whole_steps(partial.residual(name, state))
         sections.append(write_residuals(residual))
-        partial = partial.having(name, residual)
+        partial = partial.apply_residual(name, residual)
     sections.append(write_exact(exactly if rows is None else rows[exactly], values))
     retired, environment = state.retired, state.environment
     sections.append(write_mask(None if np.array_equal(reference.retired, retired) else retired))
     if environment is not None and reference.environment is not None:
         environment = None if np.array_equal(environment, reference.environment) else environment
     sections.append(write_array(environment))
-    decoded = completed(partial.state, retired=retired, environment=environment)
-    return Coded(b"".join(sections), decoded, errors | _unlike(decoded, state))
+    decoded = apply_exact(partial.state, retired=retired, environment=environment)
+    return EncodedFrame(b"".join(sections), decoded, errors | _appearance_errors(decoded, state))
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class FrameDelta:
     """Changes that the body of one state encodes.
 
     Attributes:
@@ -131,7 +133,7 @@ class Change:
     environment: Array | None
 
     @classmethod
-    def read(cls, body: bytes, reference: Columns, clusters: Clusters) -> Change:
+    def read(cls, body: bytes, reference: Columns, clusters: Clusters) -> FrameDelta:
         """Reads a body.
 
         Args:
@@ -149,7 +151,7 @@ class Change:
         for plane in motion:
             plane[:], offset = unpack(body, clusters.count, offset)
         residuals = {}
-        for name in (*SHAPE, *looks(reference)):
+        for name in (*SHAPE, *appearance_attributes(reference)):
             rows, planes, offset = read_coded_rows(body, offset, *coded_shape(reference, name))
             residuals[name] = rows, planes
         rows, values, offset = read_exact(body, offset, len(reference), 12)
@@ -167,19 +169,19 @@ class Change:
         Args:
             places: column of ``state`` of each row; None: they are the same.
         """
-        partial = DecodedState.of(bounds, _moved(state, clusters, self.motion, self.steps))
+        partial = DecodedState.of(bounds, _predict(state, clusters, self.motion, self.steps))
         for name in SHAPE:
             rows, planes = self.residuals[name]
             own = rows if places is None else places[rows]
-            partial = partial.having(name, scattered(own, planes, coded_shape(state, name)[1]))
-        return completed(partial.state, self.rows if places is None else places[self.rows], self.values)
+            partial = partial.apply_residual(name, scattered(own, planes, coded_shape(state, name)[1]))
+        return apply_exact(partial.state, self.rows if places is None else places[self.rows], self.values)
 
     def apply_appearance(self, state: Columns, bounds: Bounds) -> Columns:
         """A state with all other changes."""
         partial = DecodedState(bounds, state, np.zeros(0, np.float32))
-        for name in looks(state):
-            partial = partial.having(name, scattered(*self.residuals[name], coded_shape(state, name)[1]))
-        return completed(partial.state, retired=self.retired, environment=self.environment)
+        for name in appearance_attributes(state):
+            partial = partial.apply_residual(name, scattered(*self.residuals[name], coded_shape(state, name)[1]))
+        return apply_exact(partial.state, retired=self.retired, environment=self.environment)
 
 
 def decode(reference: Columns, clusters: Clusters, bounds: Bounds, body: bytes) -> Columns:
@@ -191,12 +193,12 @@ def decode(reference: Columns, clusters: Clusters, bounds: Bounds, body: bytes) 
     Raises:
         PlaneError: the bytes are no such state.
     """
-    return after(reference, clusters, bounds, [Change.read(body, reference, clusters)])
+    return apply_deltas(reference, clusters, bounds, [FrameDelta.read(body, reference, clusters)])
 
 
-def after(reference: Columns, clusters: Clusters, bounds: Bounds, changes: Sequence[Change]) -> Columns:
+def apply_deltas(reference: Columns, clusters: Clusters, bounds: Bounds, changes: Sequence[FrameDelta]) -> Columns:
     """A state after several changes, one by one, of the same Gaussians; what stands all the while is not touched."""
-    if _whole(reference, clusters):
+    if _codes_all_rows(reference, clusters):
         for change in changes:
             reference = change.apply_appearance(change.apply_shape(reference, clusters, bounds, None), bounds)
         return reference
@@ -208,7 +210,7 @@ def after(reference: Columns, clusters: Clusters, bounds: Bounds, changes: Seque
     state, own = reference.rows(rows), clusters.rows(rows)
     for change in changes:
         state = change.apply_shape(state, own, bounds, places)
-    state = reference.placed(rows, state)
+    state = reference.replace_rows(rows, state)
     for change in changes:
         state = change.apply_appearance(state, bounds)
     return state
@@ -216,14 +218,14 @@ def after(reference: Columns, clusters: Clusters, bounds: Bounds, changes: Seque
 
 def errors_of(decoded: Columns, state: Columns) -> dict[str, float]:
     """The largest error of each attribute of a decoded state, in the units of ``Bounds``."""
-    apart = {name: float(errors.max(initial=0)) for name, errors in _apart(decoded, state).items()}
-    return apart | _unlike(decoded, state)
+    apart = {name: float(errors.max(initial=0)) for name, errors in _shape_errors(decoded, state).items()}
+    return apart | _appearance_errors(decoded, state)
 
 
-def _apart(decoded: Columns, state: Columns) -> dict[str, Array]:
+def _shape_errors(decoded: Columns, state: Columns) -> dict[str, Array]:
     """[N] the error of each Gaussian in centre, axes and rotation."""
     sizes = np.maximum(state.sizes(), np.float32(1e-12))
-    turns = vectors_of(turns_between(state.rotations, decoded.rotations))
+    turns = rotation_vectors(relative_rotations(state.rotations, decoded.rotations))
     return {
         "position": np.abs(decoded.means - state.means).max(axis=0) / sizes,
         "axes": np.abs(decoded.factors - state.factors).max(axis=0) / sizes,
@@ -231,7 +233,7 @@ def _apart(decoded: Columns, state: Columns) -> dict[str, Array]:
     }
 
 
-def _unlike(decoded: Columns, state: Columns) -> dict[str, float]:
+def _appearance_errors(decoded: Columns, state: Columns) -> dict[str, float]:
     """The largest errors in what a Gaussian looks like."""
 
     def largest(found: Array, true: Array) -> float:
@@ -246,7 +248,7 @@ def _unlike(decoded: Columns, state: Columns) -> dict[str, float]:
     return found
 
 
-def _whole(reference: Columns, clusters: Clusters) -> bool:
+def _codes_all_rows(reference: Columns, clusters: Clusters) -> bool:
     """True where all rows are coded: if all move, or have gloss, a search for those that stand only takes time."""
     return reference.gloss is not None or bool(clusters.labels.all())
 
@@ -259,20 +261,20 @@ def _changing(
     Returns:
         And the largest errors of the others.
     """
-    if _whole(reference, clusters):
+    if _codes_all_rows(reference, clusters):
         return None, {}
-    errors = _apart(reference, state)
+    errors = _shape_errors(reference, state)
     changing = lost_volume(reference, state) | (clusters.labels > 0)
     for name, error in errors.items():
         changing |= ~(error <= getattr(bounds, name))
     return np.flatnonzero(changing), {name: float(error[~changing].max(initial=0)) for name, error in errors.items()}
 
 
-def _moved(reference: Columns, clusters: Clusters, planes: NDArray[np.int64], steps: tuple[float, float]) -> Columns:
+def _predict(reference: Columns, clusters: Clusters, planes: NDArray[np.int64], steps: tuple[float, float]) -> Columns:
     """The reference, moved with its clusters."""
     table = planes.T.astype(np.float64)
     motion = ClusterMotion(table[:, :9].reshape(-1, 3, 3) * steps[0], table[:, 9:] * steps[1])
-    return motion.carried(clusters, reference)
+    return motion.predict(clusters, reference)
 
 
 def _steps(clusters: Clusters, reference: Columns, bounds: Bounds) -> tuple[float, float]:
@@ -286,7 +288,7 @@ def _steps(clusters: Clusters, reference: Columns, bounds: Bounds) -> tuple[floa
     return min(shift / radius, COARSEST), shift
 
 
-def _beyond(found: Columns, true: Columns, bounds: Bounds) -> NDArray[np.bool_]:
+def _out_of_bounds(found: Columns, true: Columns, bounds: Bounds) -> NDArray[np.bool_]:
     """[N] bool: the Gaussians whose centre or axes are further off than the bounds, or whose volume is lost."""
     sizes = true.sizes()
     with np.errstate(over="ignore", invalid="ignore"):
@@ -299,11 +301,14 @@ def lost_volume(found: Columns, true: Columns) -> NDArray[np.bool_]:
     """[N] bool: the Gaussians whose decoded volume is another than the true one, where that has any."""
     with np.errstate(over="ignore", invalid="ignore"):
         volumes, volumes_decoded = true.volumes(), found.volumes()
-        low, high = np.minimum(FLAT * volumes, volumes / FLAT), np.maximum(FLAT * volumes, volumes / FLAT)
+        low, high = (
+            np.minimum(MIN_VOLUME_RATIO * volumes, volumes / MIN_VOLUME_RATIO),
+            np.maximum(MIN_VOLUME_RATIO * volumes, volumes / MIN_VOLUME_RATIO),
+        )
         return np.asarray(~((volumes_decoded >= low) & (volumes_decoded <= high)) & (volumes != 0))
 
 
-def completed(
+def apply_exact(
     state: Columns,
     rows: NDArray[np.intp] | None = None,
     values: Array | None = None,
@@ -318,7 +323,7 @@ def completed(
     if rows is not None and values is not None and len(rows):
         means, factors = state.means.copy(), state.factors.copy()
         means[:, rows], factors[:, rows] = values[:3], values[3:]
-        state = state.having(means=means, factors=factors)
+        state = state.replace(means=means, factors=factors)
     if environment is not None:
-        state = state.having(environment=environment)
-    return state if retired is None else state.having(retired=retired)
+        state = state.replace(environment=environment)
+    return state if retired is None else state.replace(retired=retired)

@@ -25,7 +25,7 @@ class FileHeader:
         world: from the user's world to that of the states. bounds: of every state.
         background: RGB in 0…1 behind everything. rig: the cameras in the user's world, None where it is not known.
         frames_per_second: nominal, None where it is not known: each frame has its own time.
-        remark: about the file, JSON values.
+        metadata: about the file, JSON values.
 
     >>> head = FileHeader(WorldFrame(np.zeros(3)))
     >>> FileHeader.read(head.text(), "a file").bounds == head.bounds
@@ -37,7 +37,7 @@ class FileHeader:
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rig: Rig | None = None
     frames_per_second: float | None = None
-    remark: Mapping[str, Any] = field(default_factory=dict)
+    metadata: Mapping[str, Any] = field(default_factory=dict)
 
     def text(self) -> bytes:
         """As it is written."""
@@ -52,7 +52,7 @@ class FileHeader:
             "background": list(self.background),
             "cameras": cameras,
             "frames_per_second": self.frames_per_second,
-            "remark": dict(self.remark),
+            "metadata": dict(self.metadata),
         }
         return json.dumps(record, allow_nan=False).encode()
 
@@ -88,7 +88,7 @@ class FileHeader:
                 (red, green, blue),
                 Rig(tuple(map(_camera, cameras))) if cameras else None,
                 None if rate is None else float(rate),
-                dict(record["remark"]),
+                dict(record["metadata"]),
             )
         except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
             raise FileError(f"{name}: its head lacks something or is wrong ({error})") from None

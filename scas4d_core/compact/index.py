@@ -10,7 +10,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import zstandard
 
-from scas4d_core.compact.planes import deflated, inflated
+from scas4d_core.compact.planes import compress, decompress
 from scas4d_core.compact.records import HEAD_SIZE, Record, RecordKind, parse_head, read_body
 
 FOOTER_MAGIC = b"s4dINDEX"
@@ -27,7 +27,7 @@ _ROW = np.dtype(
 def index_body(records: Sequence[Record], about: bytes) -> bytes:
     """The body of an index: number of records, their table, and JSON about the whole file."""
     rows = [(one.kind, one.frame, one.time, one.offset, one.size, one.checksum) for one in records]
-    return _COUNT.pack(len(rows)) + deflated(np.array(rows, _ROW).tobytes() + about)
+    return _COUNT.pack(len(rows)) + compress(np.array(rows, _ROW).tobytes() + about)
 
 
 def footer(offset: int) -> bytes:
@@ -60,7 +60,7 @@ def _parsed(body: bytes, end: int) -> tuple[list[Record], dict[str, Any]] | None
     size = zstandard.frame_content_size(body[_COUNT.size :])
     if not count * _ROW.itemsize <= size <= end:  # a table is never longer than the records that it lists
         return None
-    data = inflated(body[_COUNT.size :], size)
+    data = decompress(body[_COUNT.size :], size)
     rows = np.frombuffer(data, _ROW, count)
     if (rows["offset"] > end).any() or (rows["offset"] + rows["size"].astype(np.uint64) > end).any():
         return None

@@ -54,12 +54,12 @@ def _packed(unsigned: Unsigned) -> bytes:
         return _HEAD.pack(0, 0, 0)
     bits = _bits(unsigned)
     if bits == WIDE:
-        squeezed = deflated((unsigned & 255).astype(np.uint8).tobytes())
+        squeezed = compress((unsigned & 255).astype(np.uint8).tobytes())
         return _HEAD.pack(WIDE, 0, len(squeezed)) + squeezed + _packed(unsigned >> np.uint32(8))
     most = (1 << bits) - 1
     escaped = unsigned[unsigned >= most]
     small = np.minimum(unsigned, most).astype(np.uint8)
-    squeezed = deflated(_joined(small, bits).tobytes() + escaped.astype("<u4").tobytes())
+    squeezed = compress(_joined(small, bits).tobytes() + escaped.astype("<u4").tobytes())
     return _HEAD.pack(bits, len(escaped), len(squeezed)) + squeezed
 
 
@@ -85,11 +85,11 @@ def _unpacked(data: bytes | memoryview, count: int, offset: int, wider: int) -> 
     if bits not in (*NARROW, WIDE) or escapes > count or len(data) < end or wider == 0:
         raise PlaneError(f"a plane of {bits} bits, {escapes} escapes and {size} bytes cannot be at byte {offset}")
     if bits == WIDE:
-        low = np.frombuffer(inflated(data[offset:end], count), np.uint8)
+        low = np.frombuffer(decompress(data[offset:end], count), np.uint8)
         high, end = _unpacked(data, count, end, wider - 1)
         return low.astype(np.uint32) | (high << np.uint32(8)), end
     packed = (count * bits + 7) // 8
-    body = inflated(data[offset:end], packed + 4 * escapes)
+    body = decompress(data[offset:end], packed + 4 * escapes)
     small = _split(np.frombuffer(body, np.uint8, packed), bits, count)
     unsigned = small.astype(np.uint32)
     if escapes:
@@ -100,12 +100,12 @@ def _unpacked(data: bytes | memoryview, count: int, offset: int, wider: int) -> 
     return unsigned, end
 
 
-def deflated(data: bytes) -> bytes:
+def compress(data: bytes) -> bytes:
     """Bytes as one frame of zstandard, which has their number."""
     return zstandard.ZstdCompressor(level=LEVEL, write_content_size=True).compress(data)
 
 
-def inflated(data: bytes | memoryview, size: int) -> bytes:
+def decompress(data: bytes | memoryview, size: int) -> bytes:
     """The ``size`` bytes in a frame of zstandard.
 
     Raises:

@@ -15,7 +15,7 @@ from scas4d_core.compact.birth_code import decode_born
 from scas4d_core.compact.cluster_motion import Clusters
 from scas4d_core.compact.columns import Columns
 from scas4d_core.compact.encoder_state import EncoderState
-from scas4d_core.compact.frame_code import Change, after
+from scas4d_core.compact.frame_code import FrameDelta, apply_deltas
 from scas4d_core.compact.head import FileHeader
 from scas4d_core.compact.index import read_index
 from scas4d_core.compact.planes import PlaneError, unpack
@@ -39,7 +39,7 @@ __all__ = ["CompactReader", "DamagedFileError", "FileError"]
 STATES = (RecordKind.KEY, RecordKind.DELTA)
 AT_ONCE = 8
 """States whose changes are held at a time."""
-MOST_PER_BYTE = 4
+MAX_PER_BYTE = 4
 """Gaussians per byte at most; a wrong count must not fill the memory."""
 
 
@@ -163,13 +163,13 @@ class CompactReader:
             begin -= 1
         state = self._last[1] if self._last is not None and self._last[0] == begin else None
         wanted = range(begin if state is None else begin + 1, place + 1)
-        for _, places in groupby(wanted, lambda one: (self._births_by(one), one // AT_ONCE)):
+        for _, places in groupby(wanted, lambda one: (self._count_births(one), one // AT_ONCE)):
             state = self._decoded(list(places), state)
         assert state is not None
         self._last = (place, state)
         return state.gaussians()
 
-    def copied(self, first: int, last: int, file: BinaryIO) -> list[int]:
+    def copy_records(self, first: int, last: int, file: BinaryIO) -> list[int]:
         """Copies the records of some frames to another file, which has no index then: their states keep their bits.
 
         Args:
@@ -219,7 +219,7 @@ class CompactReader:
             raise self._damaged(records[-1], error) from None
 
     @property
-    def whole(self) -> bool:
+    def is_closed(self) -> bool:
         """True for a file that was closed: it ends with its index."""
         return self._whole
 
@@ -229,7 +229,7 @@ class CompactReader:
         self.state(self._frames[place])
         record, columns = self._states[place], self._last
         assert columns is not None
-        born, clusters = self._born_by(record.frame)
+        born, clusters = self._newborn_until(record.frame)
         key = next(i for i in range(place, -1, -1) if i == 0 or self._states[i].kind is RecordKind.KEY)
         behind = (record.end, *(one.end for one in self._parts if one.frame == record.frame))
         records = tuple(one for one in self._records if one.end <= max(behind))
@@ -277,7 +277,7 @@ class CompactReader:
         elif record.kind is RecordKind.NOTE:
             self._notes[record.frame] = record
 
-    def _births_by(self, place: int) -> int:
+    def _count_births(self, place: int) -> int:
         """Times that Gaussians were born by a state; −1 for that which they are themselves."""
         state = self._states[place]
         return -1 if state.kind is RecordKind.BORN else sum(birth.frame <= state.frame for birth in self._births)
@@ -285,20 +285,20 @@ class CompactReader:
     def _decoded(self, places: list[int], before: Columns | None) -> Columns:
         """The last of some states of the same Gaussians, of which only the first may be a key; ``before`` them."""
         first = self._states[places[0]]
-        born, clusters = self._born_by(first.frame)
+        born, clusters = self._newborn_until(first.frame)
         if first.kind is RecordKind.BORN:
             return born
         if first.kind is RecordKind.KEY or before is None:
             before = born
         elif len(before) < len(born):
-            before = before.joined(born.after(len(before)))
+            before = before.concatenate(born.from_row(len(before)))
         changes = [self._change(place, before, clusters) for place in places]
         try:
-            return after(before, clusters, self.head.bounds, changes)
+            return apply_deltas(before, clusters, self.head.bounds, changes)
         except ValueError as error:
             raise self._damaged(self._states[places[-1]], error) from None
 
-    def _change(self, place: int, reference: Columns, clusters: Clusters) -> Change:
+    def _change(self, place: int, reference: Columns, clusters: Clusters) -> FrameDelta:
         """Changes that the record of a state encodes."""
         record = self._states[place]
         body = read_body(self._file, record, self.path.name)
@@ -308,11 +308,11 @@ class CompactReader:
                 raise self._damaged(record, PlaneError("the state before it is another one"))
             body = body[len(expected) :]
         try:
-            return Change.read(body, reference, clusters)
+            return FrameDelta.read(body, reference, clusters)
         except ValueError as error:
             raise self._damaged(record, error) from None
 
-    def _born_by(self, index: int) -> tuple[Columns, Clusters]:
+    def _newborn_until(self, index: int) -> tuple[Columns, Clusters]:
         """All Gaussians that are born up to a frame, as they were coded then, and their clusters."""
         wanted = [record for record in self._births if record.frame <= index]
         if not wanted:
@@ -326,8 +326,8 @@ class CompactReader:
                 own, labels = decode_born(body[4:], self._counted(body, record), self.head.bounds)
             except (PlaneError, ValueError) as error:
                 raise self._damaged(record, error) from None
-            state = own if state is None else state.joined(own)
-            clusters = labels if clusters is None else clusters.joined(labels.labels)
+            state = own if state is None else state.concatenate(own)
+            clusters = labels if clusters is None else clusters.concatenate(labels.labels)
         assert state is not None
         assert clusters is not None
         self._born = (count, state, clusters)
@@ -340,7 +340,7 @@ class CompactReader:
     def _counted(self, body: bytes, record: Record) -> int:
         """The number of Gaussians that a body begins with; what it holds takes some bits each."""
         count = int.from_bytes(body[:4], "little")
-        if len(body) < 4 or count > MOST_PER_BYTE * len(body) + 1024:
+        if len(body) < 4 or count > MAX_PER_BYTE * len(body) + 1024:
             raise self._damaged(record, PlaneError(f"{count} Gaussians in {len(body)} bytes"))
         return count
 

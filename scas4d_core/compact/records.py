@@ -15,7 +15,7 @@ from enum import IntEnum
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from scas4d_core.compact.planes import PlaneError, deflated, inflated
+from scas4d_core.compact.planes import PlaneError, compress, decompress
 
 MAGIC = b"s4dR"
 """First bytes of each record; of the file, too."""
@@ -192,7 +192,7 @@ def note_bytes(note: Mapping[str, Any]) -> bytes:
     text = json.dumps(dict(note), allow_nan=False).encode()
     if len(text) > LONGEST:
         raise ValueError(f"a note of {len(text)} bytes is too long; {LONGEST} are the most")
-    return len(text).to_bytes(COUNT_BYTES, "little") + deflated(text)
+    return len(text).to_bytes(COUNT_BYTES, "little") + compress(text)
 
 
 def read_note(body: bytes) -> dict[str, Any]:
@@ -205,7 +205,7 @@ def read_note(body: bytes) -> dict[str, Any]:
     if len(body) <= COUNT_BYTES or size > LONGEST:
         raise PlaneError(f"a note of {size} bytes in {len(body)}")
     try:
-        note = json.loads(inflated(body[COUNT_BYTES:], size))
+        note = json.loads(decompress(body[COUNT_BYTES:], size))
     except (ValueError, RecursionError) as error:
         raise PlaneError(f"the note is no JSON ({error})") from None
     if not isinstance(note, dict):

@@ -12,15 +12,15 @@ from scas4d_core.compact.bounds import Bounds
 from scas4d_core.compact.columns import (
     LABELS,
     Columns,
-    by_green,
+    decorrelate_colours,
     label_of,
     levels_of,
-    mapped,
-    of_green,
+    multiply_rows,
     products,
-    turns_between,
-    turns_of,
-    vectors_of,
+    relative_rotations,
+    restore_colours,
+    rotation_vectors,
+    rotations_of_vectors,
 )
 from scas4d_core.compact.planes import Ints
 from scas4d_core.gaussians import rotation_rows
@@ -37,7 +37,7 @@ SHAPE = ("sizes", "rotations", "factors", "means")
 """Attributes that are coded first, in this order: each helps the next."""
 
 
-def looks(state: Columns) -> tuple[str, ...]:
+def appearance_attributes(state: Columns) -> tuple[str, ...]:
     """Attributes that are coded after the shape, each by itself."""
     return ("colours", "foreground") if state.gloss is None else ("colours", "foreground", "gloss")
 
@@ -84,38 +84,38 @@ class DecodedState:
             if name == "foreground":
                 return np.asarray(levels_of(state.foreground) - levels_of(self.state.foreground))[None]
             if name == "rotations":
-                vectors = vectors_of(turns_between(state.rotations, self.state.rotations))
+                vectors = rotation_vectors(relative_rotations(state.rotations, self.state.rotations))
                 return np.asarray(np.rint(vectors / self._step(name)))
             levels = np.rint((getattr(state, name) - getattr(self.state, name)) / self._step(name))
-        return np.asarray(by_green(levels) if name == "colours" else levels)
+        return np.asarray(decorrelate_colours(levels) if name == "colours" else levels)
 
-    def having(self, name: str, residual: Ints) -> DecodedState:
+    def apply_residual(self, name: str, residual: Ints) -> DecodedState:
         """The same with another attribute."""
         if not residual.any():
             return self
         if name == "sizes":
             scales = np.exp(np.float32(SCALE_STEP) * np.clip(residual[0], -500, 500).astype(np.float32))
             return replace(
-                self, state=self.state.having(factors=self.state.factors * scales), sizes=self.sizes * scales
+                self, state=self.state.replace(factors=self.state.factors * scales), sizes=self.sizes * scales
             )
         if name == "foreground":
             levels = np.clip(levels_of(self.state.foreground) + residual[0], 0, LABELS - 1)
-            return replace(self, state=self.state.having(foreground=label_of(levels)))
+            return replace(self, state=self.state.replace(foreground=label_of(levels)))
         if name == "rotations":
             return self._turned(residual.astype(np.float32) * self._step(name))
         if name == "colours":
-            residual = of_green(residual)
+            residual = restore_colours(residual)
         changed = getattr(self.state, name) + residual.astype(np.float32) * self._step(name)
-        return replace(self, state=self.state.having(**{name: changed}))
+        return replace(self, state=self.state.replace(**{name: changed}))
 
     def _turned(self, vectors: Array) -> DecodedState:
-        turns = turns_of(vectors)
-        factors = np.stack(mapped(rotation_rows(turns), self.state.factors))
+        turns = rotations_of_vectors(vectors)
+        factors = np.stack(multiply_rows(rotation_rows(turns), self.state.factors))
         rotations = products(turns, self.state.rotations)
         rotations /= np.sqrt(np.square(rotations).sum(axis=0))
         # What does not turn keeps its bits, whichever other rows are coded with it.
         rotations = np.where(vectors.any(axis=0), rotations, self.state.rotations)
-        return replace(self, state=self.state.having(rotations=rotations, factors=factors))
+        return replace(self, state=self.state.replace(rotations=rotations, factors=factors))
 
 
 def whole_steps(found: NDArray[Any]) -> tuple[Ints, NDArray[np.bool_]]:

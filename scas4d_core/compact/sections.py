@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.compact.planes import Ints, PlaneError, deflated, inflated, pack, unpack
+from scas4d_core.compact.planes import Ints, PlaneError, compress, decompress, pack, unpack
 
 Floats = NDArray[np.float32]
 
@@ -81,7 +81,7 @@ def read_coded_rows(body: bytes, offset: int, components: int, rows: int) -> tup
 
 def write_mask(mask: NDArray[np.bool_] | None) -> bytes:
     """[N] bool, a bit each; None: unchanged."""
-    return bytes([NONE]) if mask is None else bytes([SOME]) + _sized(deflated(np.packbits(mask).tobytes()))
+    return bytes([NONE]) if mask is None else bytes([SOME]) + _sized(compress(np.packbits(mask).tobytes()))
 
 
 def read_mask(body: bytes, offset: int, rows: int) -> tuple[NDArray[np.bool_] | None, int]:
@@ -100,7 +100,7 @@ def write_array(array: NDArray[Any] | None) -> bytes:
     if array is None:
         return bytes([NONE])
     shape = struct.pack(f"<B{array.ndim}I", array.ndim, *array.shape)
-    return bytes([ALL]) + shape + _sized(deflated(array.astype("<f4").tobytes()))
+    return bytes([ALL]) + shape + _sized(compress(array.astype("<f4").tobytes()))
 
 
 def read_array(body: bytes, offset: int) -> tuple[Floats | None, int]:
@@ -126,7 +126,7 @@ def write_exact(rows: NDArray[np.intp], values: NDArray[Any]) -> bytes:
     if not len(rows):
         return bytes([NONE])
     data = rows.astype("<u4").tobytes() + values.astype("<f4").tobytes()
-    return bytes([ALL]) + struct.pack("<I", len(rows)) + _sized(deflated(data))
+    return bytes([ALL]) + struct.pack("<I", len(rows)) + _sized(compress(data))
 
 
 def read_exact(body: bytes, offset: int, most: int, width: int) -> tuple[NDArray[np.intp], Floats, int]:
@@ -162,10 +162,10 @@ def _sized(data: bytes) -> bytes:
 
 
 def _read_sized(body: bytes, offset: int, size: int) -> tuple[bytes, int]:
-    """The ``size`` bytes that were ``deflated``, and where they end."""
+    """The ``size`` bytes that ``compress`` returned, and where they end."""
     if len(body) < offset + 4:
         raise PlaneError(f"the data end at byte {len(body)}, within a size")
     (length,) = struct.unpack_from("<I", body, offset)
     if len(body) < offset + 4 + length:
         raise PlaneError(f"{length} bytes at byte {offset + 4} end after the data, at {len(body)}")
-    return inflated(body[offset + 4 : offset + 4 + length], size), offset + 4 + length
+    return decompress(body[offset + 4 : offset + 4 + length], size), offset + 4 + length

@@ -99,7 +99,7 @@ class CompactWriter:
             FileNotFoundError: it is not there. FileError: it has its index already, or no state, or is damaged.
         """
         with CompactReader(path) as reader:
-            if reader.whole:
+            if reader.is_closed:
                 raise FileError(f"{reader.path.name}: it is whole, with its index; begin another file")
             if reader.damage is not None or not reader.frames:
                 raise FileError(f"{reader.path.name}: it cannot be gone on with ({reader.damage or 'it has no state'})")
@@ -145,7 +145,9 @@ class CompactWriter:
         note_bytes(note or {})
         columns, before = Columns.of(state), self._last
         self._opacities = columns.opacities.copy() if self._opacities is None else self._opacities
-        records = [] if before is not None and len(state) == len(before) else [(RecordKind.BORN, self._bear(columns))]
+        records = (
+            [] if before is not None and len(state) == len(before) else [(RecordKind.BORN, self._add_newborn(columns))]
+        )
         born = self._born
         assert born is not None
         if before is None:
@@ -153,7 +155,7 @@ class CompactWriter:
             errors: Mapping[str, float] = errors_of(born, columns)
         else:
             if len(before) < len(born):
-                before = before.joined(born.after(len(before)))
+                before = before.concatenate(born.from_row(len(before)))
             key = self._since_key + 1 >= self._key_every
             self._since_key = 0 if key else self._since_key + 1
             coded = encode(born if key else before, columns, self._clusters, self.head.bounds)
@@ -242,17 +244,17 @@ class CompactWriter:
         with suppress(OSError):
             self._file.close()
 
-    def _bear(self, state: Columns) -> bytes:
+    def _add_newborn(self, state: Columns) -> bytes:
         """Takes in the Gaussians that are not known yet; returns the body of their record."""
         if self._last is None:
             born = state
             clusters = Clusters.of(state.gaussians()) if self._clustered else Clusters(np.zeros(len(state), np.int64))
         else:
-            born = state.after(len(self._last))
+            born = state.from_row(len(self._last))
             clusters = Clusters(self._clusters.nearest(self._last, born))
         body, decoded = encode_born(born, clusters, self.head.bounds)
-        self._born = decoded if self._born is None else self._born.joined(decoded)
-        self._clusters = self._clusters.joined(clusters.labels)
+        self._born = decoded if self._born is None else self._born.concatenate(decoded)
+        self._clusters = self._clusters.concatenate(clusters.labels)
         self._opacities = state.opacities.copy()
         return len(born).to_bytes(4, "little") + body
 

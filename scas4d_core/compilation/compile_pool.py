@@ -1,6 +1,6 @@
 """Processes that compile kernels side by side, and those who wait for them.
 
-Each process of a crew takes the first kernel that nobody compiles, until none is left. At most one process a core
+Each process of the pool takes the first kernel that nobody compiles, until none is left. At most one process a core
 compiles for one cache at a time, for service, tests and commands alike. Which process compiled a kernel changes
 no bit of its results.
 """
@@ -17,46 +17,46 @@ import threading
 import time
 from collections.abc import Callable, Iterable
 
-from scas4d_core.compilation.compiled_markers import CompiledMarkers, here
+from scas4d_core.compilation.compiled_markers import CompiledMarkers, open_markers
 from scas4d_core.compilation.compiling import compile_kernel
 from scas4d_core.compilation.manifest import KernelGroup, kernels_of
 
 log = logging.getLogger("scas4d.kernels")
 
-MOST = 4
-"""Processes of a crew at most: each takes some 350 MB, and the longest kernel takes a sixth of the time of all."""
+MAX_PROCESSES = 4
+"""Processes of the pool at most: each takes some 350 MB, and the longest kernel takes a sixth of the time of all."""
 NICE = 10
 """Added to the niceness of a process that compiles what nobody waits for yet: frames, views and requests go ahead."""
-SELDOM = (200_000, 20, 1000)
+GC_THRESHOLDS = (200_000, 20, 1000)
 """Thresholds of Python's garbage collection: a compiler makes millions of objects that live. With the defaults it
 costs a tenth of the time; without any, a process takes half as much memory again."""
 POLL_S = 0.05
 PARENT_EVERY_S = 0.5
 TRIES = 2
-"""Crews that are started for the same kernels: the first may have been killed."""
+"""Pools that are started for the same kernels: the first may have been killed."""
 
 OnProgress = Callable[[int, int], None]
 """Called with the number of kernels that are compiled, and that of all which are waited for."""
 
-_crew: list[subprocess.Popen[bytes]] = []
+_pool: list[subprocess.Popen[bytes]] = []
 """The processes that this one has started."""
 
 
 def processes() -> int:
     """Returns how many processes compile at a time: one a core."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(cores, MOST)
+    return min(cores, MAX_PROCESSES)
 
 
-def work(wanted: Iterable[str], then: Iterable[str]) -> int:
-    """Compiles what nobody else does, in a process of a crew; returns how many kernels could not be compiled."""
+def compile_kernels(wanted: Iterable[str], then: Iterable[str]) -> int:
+    """Compiles what nobody else does, in a process of the pool; returns how many kernels could not be compiled."""
     _end_with_parent()
     gc.freeze()
-    gc.set_threshold(*SELDOM)
-    marks, failed = here(), 0
+    gc.set_threshold(*GC_THRESHOLDS)
+    marks, failed = open_markers(), 0
     if marks is None:
         return 0
-    with marks.place(processes()) as taken:
+    with marks.slot(processes()) as taken:
         if not taken:
             return 0
         failed += _compile_all(marks, map(KernelGroup, wanted))
@@ -97,7 +97,7 @@ def wait_for_kernels(
     wanted, then = tuple(wanted), tuple(then)
     kernels = kernels_of(wanted)
     try:
-        marks = here()
+        marks = open_markers()
     except OSError:
         marks = None
     if marks is None:
@@ -111,8 +111,8 @@ def wait_for_kernels(
         later = missing == 0 and tries == 0 and marks.missing(kernels_of(then))
         if missing == 0 and not later:
             return True
-        _crew[:] = [process for process in _crew if process.poll() is None]
-        if not _crew and not marks.busy(processes()):
+        _pool[:] = [process for process in _pool if process.poll() is None]
+        if not _pool and not marks.is_compiling(processes()):
             if tries == TRIES:
                 log.warning("kernels could not be compiled beforehand; the first frames wait for them")
                 return False
@@ -129,7 +129,7 @@ def _start(wanted: Iterable[KernelGroup], then: Iterable[KernelGroup]) -> bool:
     program = (
         "import sys; groups = [given.split(';') if given else [] for given in sys.argv[1:3]]; "
         "sys.path[:] = sys.argv[3:]; "
-        "from scas4d_core.compilation.compile_pool import work; sys.exit(work(*groups) > 0)"
+        "from scas4d_core.compilation.compile_pool import compile_kernels; sys.exit(compile_kernels(*groups) > 0)"
     )
     command = [sys.executable or "python3", "-c", program, ";".join(wanted), ";".join(then), *sys.path]
     for _ in range(processes()):
@@ -138,7 +138,7 @@ def _start(wanted: Iterable[KernelGroup], then: Iterable[KernelGroup]) -> bool:
         except OSError:  # no interpreter to be found from inside another program
             return False
         threading.Thread(target=process.wait, daemon=True).start()  # else it would stay a zombie
-        _crew.append(process)
+        _pool.append(process)
     return True
 
 

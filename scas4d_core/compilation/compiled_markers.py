@@ -16,11 +16,11 @@ from pathlib import Path
 from scas4d_core.compilation.manifest import Kernel
 from scas4d_core.kernels.cache import locked
 
-PLACE_S = 1.0
+SLOT_WAIT_S = 1.0
 """For so long a process tries to get a place: somebody may just look whether it is taken."""
 
 
-def here() -> CompiledMarkers | None:
+def open_markers() -> CompiledMarkers | None:
     """Returns the marks for this process; None where there is no cache."""
     import numba
     from llvmlite import binding
@@ -57,7 +57,7 @@ class CompiledMarkers:
         return [kernel for kernel in kernels if kernel.key not in there]
 
     def add(self, kernel: Kernel) -> None:
-        """CompiledMarkers a kernel as compiled."""
+        """Marks a kernel as compiled."""
         with suppress(OSError):  # for want of room: it is compiled all the same
             (self.folder / kernel.key).touch()
 
@@ -68,12 +68,12 @@ class CompiledMarkers:
             yield mine
 
     @contextmanager
-    def place(self, places: int) -> Iterator[bool]:
-        """Yields True to as many processes at a time as there are places, and False to the others."""
-        until = time.monotonic() + PLACE_S
+    def slot(self, slots: int) -> Iterator[bool]:
+        """Yields True to as many processes at a time as there are slots, and False to the others."""
+        until = time.monotonic() + SLOT_WAIT_S
         while True:
-            for number in range(places):
-                with locked(self._place(number), wait=False) as mine:
+            for number in range(slots):
+                with locked(self._slot_file(number), wait=False) as mine:
                     if mine:
                         yield True
                         return
@@ -82,13 +82,13 @@ class CompiledMarkers:
                 return
             time.sleep(0.05)
 
-    def busy(self, places: int) -> bool:
+    def is_compiling(self, slots: int) -> bool:
         """Returns whether any process has a place."""
-        for number in range(places):
-            with locked(self._place(number), wait=False) as mine:
+        for number in range(slots):
+            with locked(self._slot_file(number), wait=False) as mine:
                 if not mine:
                     return True
         return False
 
-    def _place(self, number: int) -> Path:
-        return self.folder / f"place-{number}.lock"
+    def _slot_file(self, number: int) -> Path:
+        return self.folder / f"slot-{number}.lock"

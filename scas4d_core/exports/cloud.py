@@ -43,11 +43,11 @@ class Cloud:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def turned(self) -> Cloud:
+    def half_turned(self) -> Cloud:
         """The same Gaussians in axes that are turned by 180° about x: y up, z towards the viewer.
 
         >>> seen = cloud_of(Gaussians.of_points([[1, 2, 3]], radius=0.1), WorldFrame(np.zeros(3)))
-        >>> seen.turned().splats.means
+        >>> seen.half_turned().splats.means
         array([[ 1., -2., -3.]])
         """
         w, x, y, z = self.splats.rotations.T
@@ -61,11 +61,11 @@ class Cloud:
             harmonics=self.harmonics * HARMONIC_SIGNS[: self.harmonics.shape[1], None],
         )
 
-    def in_units(self, length: float) -> Cloud:
+    def scaled(self, length: float) -> Cloud:
         """The same Gaussians with all lengths multiplied by ``length``, as by metres in one of the user's units.
 
         >>> seen = cloud_of(Gaussians.of_points([[1, 2, 3]], radius=0.5), WorldFrame(np.zeros(3)))
-        >>> seen.in_units(100).splats.scales
+        >>> seen.scaled(100).splats.scales
         array([[50., 50., 50.]])
         """
         return replace(

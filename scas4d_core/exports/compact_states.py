@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from scas4d_core.cameras import Rig, WorldFrame
 from scas4d_core.compact import CompactWriter, FileError, FileHeader
 from scas4d_core.errors import InputError
+from scas4d_core.exports.atomic_files import atomic_path, translate_write_errors
 from scas4d_core.exports.part_motion import part_labels
-from scas4d_core.exports.whole_files import whole_file, writing
 from scas4d_core.gaussians import Gaussians
 
 Colour = tuple[float, float, float]
@@ -58,7 +58,7 @@ class CompactSequence:
         self._stack = ExitStack()
         head = FileHeader(world, background=background, rig=rig, frames_per_second=frames_per_second)
         try:
-            beside = self._stack.enter_context(whole_file(self.path))
+            beside = self._stack.enter_context(atomic_path(self.path))
             self._writer = self._stack.enter_context(CompactWriter(beside, head))
         except BaseException as error:
             if not self._stack.__exit__(type(error), error, error.__traceback__):
@@ -70,7 +70,7 @@ class CompactSequence:
         Raises:
             InputError: it cannot follow those before, or has values that are not finite.
         """
-        with writing(self.path):
+        with translate_write_errors(self.path):
             try:
                 self._writer.add(index, time, gaussians)
             except FileError as error:
@@ -81,7 +81,7 @@ class CompactSequence:
     def finish(self) -> None:
         """Completes the file and gives it its name."""
         if self._labels is not None and self._count:
-            with writing(self.path):
+            with translate_write_errors(self.path):
                 self._writer.add_parts(self._latest, part_labels(self._labels, self._count))
         self._stack.close()
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.errors import InputError
-from scas4d_core.exports.whole_files import whole_file
+from scas4d_core.exports.atomic_files import atomic_path
 
 COMPONENTS = {np.dtype("<f4"): 5126, np.dtype("<u2"): 5123, np.dtype("u1"): 5121}
 """Component types of glTF by dtype."""
@@ -107,7 +107,7 @@ class Binary:
         total = 12 + 8 + len(text) + (8 + self.length if self._arrays else 0)
         if total > LONGEST:
             raise InputError(f"out {str(path)!r} would have {total:,} bytes, and a .glb ends at 4 GiB", "export as ply")
-        with whole_file(path) as beside, beside.open("wb") as file:
+        with atomic_path(path) as beside, beside.open("wb") as file:
             file.write(struct.pack("<4sII", b"glTF", 2, total))
             file.write(struct.pack("<I4s", len(text), b"JSON") + text)
             if self._arrays:

@@ -48,7 +48,7 @@ def write_glb(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None
     ...     b"KHR_gaussian_splatting:ROTATION" in Path(f"{folder}/a.glb").read_bytes()
     True
     """
-    cloud = cloud_of(gaussians, world).in_units(world.metres_per_unit).turned()
+    cloud = cloud_of(gaussians, world).scaled(world.metres_per_unit).half_turned()
     binary = Binary()
     document: dict[str, Any] = {"scene": 0, "scenes": [{}], "asset_extras": asset_extras(world)}
     if len(cloud):  # an accessor of no elements is not allowed

@@ -21,18 +21,18 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.errors import InputError
+from scas4d_core.exports.atomic_files import check_writable
 from scas4d_core.exports.cloud import HALF_TURN, Cloud, cloud_of
 from scas4d_core.exports.glb import Binary
 from scas4d_core.exports.gltf import EXTENSION, asset_extras, splat_primitive
 from scas4d_core.exports.part_motion import PartMotion, PartPose, quaternion_of
-from scas4d_core.exports.whole_files import check_writable
 from scas4d_core.gaussians import Gaussians
 
 Float = NDArray[np.float64]
 
 
 @dataclass
-class _Keys:
+class _Keyframes:
     """The keys of one part's animation, in the axes and the unit of glTF, and its residuals in the user's."""
 
     times: list[float] = field(default_factory=list)
@@ -81,7 +81,7 @@ class PartAsset:
         self._motion: PartMotion | None = None
         self._first: Gaussians | None = None
         self._begin = self._latest = 0.0
-        self._keys: dict[int, _Keys] = {}
+        self._keys: dict[int, _Keyframes] = {}
 
     def add(self, index: int, time: float, gaussians: Gaussians) -> None:
         """Adds a frame.
@@ -95,7 +95,7 @@ class PartAsset:
         if self._motion is None:
             self._motion = PartMotion(self._labels, gaussians, self._world)
             self._first, self._begin = gaussians, time
-            self._keys = {part: _Keys() for part in self._motion.parts}
+            self._keys = {part: _Keyframes() for part in self._motion.parts}
         elif not time > self._latest:
             raise InputError(
                 f"time {time:g} s of frame {index} is not later than {self._latest:g} s of the frame before",
@@ -113,7 +113,7 @@ class PartAsset:
         """
         if self._motion is None or self._first is None:
             raise InputError("there is no frame to export", "give at least one frame")
-        cloud = cloud_of(self._first, self._world, retired=True).in_units(self._world.metres_per_unit).turned()
+        cloud = cloud_of(self._first, self._world, retired=True).scaled(self._world.metres_per_unit).half_turned()
         binary = Binary()
         nodes: list[dict[str, Any]] = []
         meshes: list[dict[str, Any]] = []
@@ -160,7 +160,7 @@ class PartAsset:
         """Gives the frames up; nothing was written."""
         self._first, self._motion, self._keys = None, None, {}
 
-    def _residuals(self, keys: _Keys) -> dict[str, Any]:
+    def _residuals(self, keys: _Keyframes) -> dict[str, Any]:
         """The extras of a part: what its rigid motion leaves."""
         assert self._motion is not None
         after = np.array(keys.residuals[1:] or [0.0])

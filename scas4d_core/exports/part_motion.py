@@ -99,11 +99,11 @@ class PartMotion:
             rows = rows[gaussians.present[rows]]
             if rows.size:
                 before, weights = self._start[rows] - self.origins[part], self._weights[rows]
-                material = self._material_turn(gaussians, rows, weights)
+                material = self._mean_material_rotation(gaussians, rows, weights)
                 part_poses.append(PartPose(part, *majority_motion(before, means[rows], weights, material)))
         return part_poses
 
-    def _material_turn(self, gaussians: Gaussians, rows: NDArray[np.intp], weights: Float) -> Float:
+    def _mean_material_rotation(self, gaussians: Gaussians, rows: NDArray[np.intp], weights: Float) -> Float:
         """[3, 3] weighted mean of the Gaussians' rotations since the first frame; about a rotation."""
         now = quaternions_to_matrices(gaussians.rotations[rows].astype(np.float64))
         then = quaternions_to_matrices(self._first_turns[rows].astype(np.float64))

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from scas4d_core.cameras import Rig, WorldFrame
 from scas4d_core.errors import InputError
+from scas4d_core.exports.atomic_files import atomic_path, translate_write_errors
 from scas4d_core.exports.compact_states import Colour, CompactSequence
 from scas4d_core.exports.formats import Format, check_suffix, format_of
 from scas4d_core.exports.gltf import write_glb
@@ -23,7 +24,6 @@ from scas4d_core.exports.splat import write_splat
 from scas4d_core.exports.spz import write_spz
 from scas4d_core.exports.tables import PoseTable, TrackTable
 from scas4d_core.exports.usd import UsdSequence
-from scas4d_core.exports.whole_files import whole_file, writing
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.ply import write_ply
 
@@ -116,7 +116,7 @@ def export_sequence(
     done = 0
     paths: list[Path] = []
     try:
-        for index, time, state in _chained(waiting, coming):
+        for index, time, state in _chain(waiting, coming):
             writer.add(index, float(time), state)
             done += 1
             if isinstance(writer, _Folder):
@@ -143,7 +143,7 @@ def other_frames(out: Path, format: Format, frames: Collection[int]) -> list[Pat
     return [path for path, match in names if match and int(match[1]) not in frames]
 
 
-def _chained(
+def _chain(
     waiting: list[tuple[int, float, Gaussians]], coming: Iterator[tuple[int, float, Gaussians]]
 ) -> Iterator[tuple[int, float, Gaussians]]:
     """The frame that waits and then the others; no reference to a frame is kept."""
@@ -178,7 +178,7 @@ class _Folder:
 
     def __init__(self, folder: Path, format: Format, world: WorldFrame) -> None:
         self.folder, self._format, self._world = folder, format, world
-        with writing(folder):
+        with translate_write_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
 
     def path_of(self, index: int) -> Path:
@@ -187,7 +187,7 @@ class _Folder:
 
     def add(self, index: int, time: float, gaussians: Gaussians) -> None:
         """Writes the file of a frame."""
-        with writing(self.folder):
+        with translate_write_errors(self.folder):
             FRAME_WRITERS[self._format.name](self.path_of(index), gaussians, self._world)
 
     def finish(self) -> None:
@@ -205,7 +205,7 @@ class _Zip:
         self._output = _zip_written(path)
         self._archive = self._output.__enter__()
         try:
-            with writing(path):
+            with translate_write_errors(path):
                 self._beside = tempfile.TemporaryDirectory(prefix=".part-", dir=path.parent)
             self._folder = _Folder(Path(self._beside.name), format, world)
         except BaseException as error:
@@ -216,7 +216,7 @@ class _Zip:
         """Adds the file of a frame."""
         self._folder.add(index, time, gaussians)
         file = self._folder.path_of(index)
-        with writing(self._path):
+        with translate_write_errors(self._path):
             self._archive.write(file, file.name)
             file.unlink()
 
@@ -233,5 +233,5 @@ class _Zip:
 
 @contextmanager
 def _zip_written(path: Path) -> Iterator[zipfile.ZipFile]:
-    with whole_file(path) as beside, zipfile.ZipFile(beside, "w", zipfile.ZIP_STORED) as archive:
+    with atomic_path(path) as beside, zipfile.ZipFile(beside, "w", zipfile.ZIP_STORED) as archive:
         yield archive

@@ -14,8 +14,8 @@ import numpy as np
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.errors import InputError
+from scas4d_core.exports.atomic_files import atomic_path
 from scas4d_core.exports.cloud import cloud_of
-from scas4d_core.exports.whole_files import whole_file
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.ply import Splats
 
@@ -52,7 +52,7 @@ def write_splat(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> No
     turns = of.rotations[order]
     largest = np.take_along_axis(turns, np.abs(turns).argmax(axis=1)[:, None], axis=1)
     rows["rotation"] = np.clip(np.rint(turns * np.where(largest > 0, -128, 128) + 128), 0, 255)
-    with whole_file(path) as beside:
+    with atomic_path(path) as beside:
         rows.tofile(beside)
 
 

@@ -19,8 +19,8 @@ import numpy as np
 
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.errors import InputError
+from scas4d_core.exports.atomic_files import atomic_path, import_optional
 from scas4d_core.exports.cloud import Cloud, cloud_of
-from scas4d_core.exports.whole_files import package, whole_file
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.ply import OPACITY_MARGIN, SH_DEGREE_0, Splats
 
@@ -28,7 +28,7 @@ VERSIONS = (3, 4)
 """Containers that gsply writes: 3 is read by most viewers, 4 by recent ones."""
 POSITION_BITS = 23
 """Bits of a position beside its sign."""
-MOST_FRACTIONAL_BITS = 24
+MAX_FRACTIONAL_BITS = 24
 """The most that gsply takes."""
 
 
@@ -49,10 +49,10 @@ def write_spz(path: Path | str, gaussians: Gaussians, world: WorldFrame, version
     """
     if version not in VERSIONS:
         raise InputError(f"version {version} of SPZ is not written", "give 3 or 4")
-    gsply = package("gsply", "spz")
+    gsply = import_optional("gsply", "spz")
     if version == 4:
-        package("zstandard", "spz4")
-    cloud = cloud_of(gaussians, world).in_units(world.metres_per_unit).turned()
+        import_optional("zstandard", "spz4")
+    cloud = cloud_of(gaussians, world).scaled(world.metres_per_unit).half_turned()
     of = cloud.splats
     opacities = np.clip(of.opacities, OPACITY_MARGIN, 1 - OPACITY_MARGIN)
     rest = cloud.harmonics[:, 1:]
@@ -66,7 +66,7 @@ def write_spz(path: Path | str, gaussians: Gaussians, world: WorldFrame, version
         format="ply",
     )
     bits = fractional_bits(cloud)
-    with whole_file(path) as beside:
+    with atomic_path(path) as beside:
         gsply.write_spz(beside, data, version=version, fractional_bits=bits)
 
 
@@ -80,7 +80,7 @@ def fractional_bits(cloud: Cloud) -> int:
     20
     """
     farthest = float(np.abs(cloud.splats.means).max(initial=0.0))
-    for bits in range(MOST_FRACTIONAL_BITS, 0, -1):
+    for bits in range(MAX_FRACTIONAL_BITS, 0, -1):
         if round(farthest * 2**bits) < 2**POSITION_BITS:
             return bits
     raise InputError(
@@ -102,7 +102,7 @@ def read_spz(path: Path | str, metres_per_unit: float = 1.0) -> Splats:
     Traceback (most recent call last):
     scas4d_core.errors.InputError: README.md: no SPZ file (...); ...
     """
-    gsply = package("gsply", "spz")
+    gsply = import_optional("gsply", "spz")
     try:
         data = gsply.read_spz(path)
     except (OSError, ValueError) as error:
@@ -118,4 +118,4 @@ def read_spz(path: Path | str, metres_per_unit: float = 1.0) -> Splats:
         opacities=1 / (1 + np.exp(-logits)),
         colours=0.5 + SH_DEGREE_0 * base,
     )
-    return Cloud(given, base[:, None], np.arange(len(given))).turned().in_units(1 / metres_per_unit).splats
+    return Cloud(given, base[:, None], np.arange(len(given))).half_turned().scaled(1 / metres_per_unit).splats

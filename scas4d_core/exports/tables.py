@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from scas4d_core.cameras import WorldFrame
+from scas4d_core.exports.atomic_files import atomic_path, translate_write_errors
 from scas4d_core.exports.part_motion import PartMotion
-from scas4d_core.exports.whole_files import whole_file, writing
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.tracks import Tracks
 
@@ -32,7 +32,7 @@ class _Table:
         self.path = Path(path)
         self._stack = ExitStack()
         try:
-            beside = self._stack.enter_context(whole_file(self.path))
+            beside = self._stack.enter_context(atomic_path(self.path))
             self._file = self._stack.enter_context(beside.open("w", newline="", encoding="utf-8"))
             self._rows = csv.writer(self._file, lineterminator="\n")
             self._rows.writerow(columns)
@@ -41,7 +41,7 @@ class _Table:
                 raise
 
     def write(self, rows: Iterable[Sequence[Any]]) -> None:
-        with writing(self.path):
+        with translate_write_errors(self.path):
             self._rows.writerows(rows)
 
     def finish(self) -> None:

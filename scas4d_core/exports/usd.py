@@ -5,7 +5,7 @@ retired. By the schema, scales and opacities are linear, harmonics lie together 
 pictures (sRGB); the schema has no place for that, so ``colorSpace`` of the harmonics names it. ``primvars:scas4d:id``
 and ``primvars:scas4d:part`` have the ids and the parts. ``/World/Parts/part_k`` are Xforms with the rigid motion of
 each part since the first frame, and its residual (``part_motion``). ``/World/Tracks`` are the centres of up to
-``MOST_TRACKS`` moving Gaussians as UsdGeomPoints, a guide. ``/World/Cameras`` are those of the rig.
+``MAX_TRACKS`` moving Gaussians as UsdGeomPoints, a guide. ``/World/Cameras`` are those of the rig.
 
 The stage is y up: the user's world is turned by 180° about x. Its unit is the user's, ``metersPerUnit`` gives it. A
 time code is seconds since the first frame times ``timeCodesPerSecond``.
@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import Rig, WorldFrame
 from scas4d_core.errors import InputError
+from scas4d_core.exports.atomic_files import atomic_path, import_optional, translate_write_errors
 from scas4d_core.exports.cloud import Cloud, cloud_of, linear_light
 from scas4d_core.exports.part_motion import PartMotion, part_labels, quaternion_of
 from scas4d_core.exports.usd_values import (
@@ -33,15 +34,14 @@ from scas4d_core.exports.usd_values import (
     floats_of,
     points_of,
     quaternions_of,
-    reported,
     set_camera,
-    turned_pose,
+    to_stage_pose,
+    translate_usd_errors,
 )
-from scas4d_core.exports.whole_files import package, whole_file, writing
 from scas4d_core.gaussians import Gaussians
 
 SUFFIXES = (".usdc", ".usda", ".usdz", ".usd")
-MOST_TRACKS = 500
+MAX_TRACKS = 500
 """Gaussians that are shown as tracks, evenly over the rows of those that move in the first frame."""
 TRACK_WIDTH = 0.005
 """Diameter of a track's point, of the extent of the tracks."""
@@ -87,18 +87,20 @@ class UsdSequence:
         self.path = Path(path)
         if self.path.suffix not in SUFFIXES:
             raise InputError(f"out {self.path.name!r} has no suffix of USD", f"give one of {', '.join(SUFFIXES)}")
-        self._usd = package("pxr.Usd", "usd")
-        self._geometry, volume = package("pxr.UsdGeom", "usd"), package("pxr.UsdVol", "usd")
-        self._sdf, self._tf, self._vt, self._gf = (package(f"pxr.{name}", "usd") for name in ("Sdf", "Tf", "Vt", "Gf"))
+        self._usd = import_optional("pxr.Usd", "usd")
+        self._geometry, volume = import_optional("pxr.UsdGeom", "usd"), import_optional("pxr.UsdVol", "usd")
+        self._sdf, self._tf, self._vt, self._gf = (
+            import_optional(f"pxr.{name}", "usd") for name in ("Sdf", "Tf", "Vt", "Gf")
+        )
         if not hasattr(volume, "ParticleField3DGaussianSplat"):
             raise InputError("usd-core has no ParticleField3DGaussianSplat", "pip install 'usd-core>=26.3'")
         self._world, self._labels, self._rate = world, labels, frames_per_second
         self._rig = rig
         self._splat = volume.ParticleField3DGaussianSplat
-        with writing(self.path):
+        with translate_write_errors(self.path):
             self._folder = Path(tempfile.mkdtemp(prefix=f".part-{self.path.stem}-", dir=self.path.parent))
         try:
-            with reported(self.path):
+            with translate_usd_errors(self.path):
                 self._layer = self._sdf.Layer.CreateNew(str(self._folder / f"{self.path.stem}.usdc"))
                 self._stage = self._usd.Stage.Open(self._layer)
             self._motion: PartMotion | None = None
@@ -128,7 +130,7 @@ class UsdSequence:
                 f"time {time:g} s of frame {index} is not later than {self._latest:g} s of the frame before",
                 "give frames in the order of their times",
             )
-        cloud = cloud_of(gaussians, self._world, retired=True).turned()
+        cloud = cloud_of(gaussians, self._world, retired=True).half_turned()
         if self._first_index is None:
             self._first_index, self._begin = index, time
             self._define(gaussians, cloud)
@@ -164,9 +166,9 @@ class UsdSequence:
         try:
             if self._first_index is None:
                 raise InputError("there is no frame to export", "give at least one frame")
-            with reported(self.path):
+            with translate_usd_errors(self.path):
                 self._complete()
-                with whole_file(self.path) as beside:
+                with atomic_path(self.path) as beside:
                     self._convert(beside)
         finally:
             self.discard()
@@ -181,7 +183,7 @@ class UsdSequence:
 
     def _save(self) -> None:
         """Writes what is new to the disk and frees it: USD reads saved arrays from the file when it needs them."""
-        with reported(self.path):
+        with translate_usd_errors(self.path):
             self._layer.Save()
 
     def _head(self) -> None:
@@ -221,7 +223,7 @@ class UsdSequence:
             "extent": AnimatedValues(gaussians.CreateExtentAttr(), points_of),
         }
         moving = np.flatnonzero(first.moving)
-        even = np.linspace(0, len(moving) - 1, min(MOST_TRACKS, len(moving))).round().astype(np.intp)
+        even = np.linspace(0, len(moving) - 1, min(MAX_TRACKS, len(moving))).round().astype(np.intp)
         self._tracked = moving[even]
         if self._tracked.size:
             means = cloud.splats.means[self._tracked]
@@ -248,7 +250,7 @@ class UsdSequence:
         """Sets the transforms of the parts at a time code."""
         for pose in self._motion.poses(gaussians) if self._motion is not None else ():
             translate, orient, residual = self._poses[pose.part]
-            rotation, position = turned_pose(pose.rotation, pose.position)
+            rotation, position = to_stage_pose(pose.rotation, pose.position)
             translate.Set(self._gf.Vec3d(*position.tolist()), code)
             orient.Set(self._gf.Quatd(*quaternion_of(rotation).tolist()), code)
             residual.Set(pose.residual, code)
@@ -258,7 +260,7 @@ class UsdSequence:
         for channel in self._channels.values():
             for _ in channel.lengthen():
                 self._layer.Save()
-            channel.settle()
+            channel.store_constant_as_default()
         primvars = self._geometry.PrimvarsAPI(self._stage.GetPrimAtPath("/World/Gaussians"))
         attributes = {"scas4d:id": (self._sdf.ValueTypeNames.Int64Array, self._vt.Int64Array.FromNumpy(self._ids))}
         if self._labels is not None:
@@ -277,7 +279,7 @@ class UsdSequence:
     def _convert(self, beside: Path) -> None:
         """Brings the stage to the format of the target."""
         if beside.suffix == ".usdz":
-            done = package("pxr.UsdUtils", "usd").CreateNewUsdzPackage(self._layer.realPath, str(beside))
+            done = import_optional("pxr.UsdUtils", "usd").CreateNewUsdzPackage(self._layer.realPath, str(beside))
         else:
             done = self._layer.Export(str(beside))  # without the samples that were replaced
         if not done:

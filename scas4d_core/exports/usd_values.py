@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from scas4d_core.cameras import Camera
 from scas4d_core.errors import InputError, message_of
+from scas4d_core.exports.atomic_files import import_optional, translate_write_errors
 from scas4d_core.exports.cloud import HALF_TURN
-from scas4d_core.exports.whole_files import package, writing
 
 Array = NDArray[Any]
 
@@ -47,7 +47,7 @@ class AnimatedValues:
         if len(given) > self._born:
             self._births.append(given[self._born :].copy())
             self._born = len(given)
-        if self._last is not None and self._is_told(self._last, given):
+        if self._last is not None and self._is_stored(self._last, given):
             self._last, self._unwritten = given, code
             return
         if self._unwritten is not None and self._last is not None:
@@ -55,7 +55,7 @@ class AnimatedValues:
         self._attribute.Set(self._typed(given), code)
         self._last, self._unwritten = given, None
 
-    def _is_told(self, before: Array, after: Array) -> bool:
+    def _is_stored(self, before: Array, after: Array) -> bool:
         """True where the samples before, lengthened, have these values already."""
         grown = len(after) > len(before)
         return not (grown and self._unborn is not None) and np.array_equal(before, after[: len(before)])
@@ -73,7 +73,7 @@ class AnimatedValues:
                 self._attribute.Set(self._typed(np.concatenate([sample, full[len(sample) :]])), code)
                 yield
 
-    def settle(self) -> None:
+    def store_constant_as_default(self) -> None:
         """Makes a lone sample the default value, which readers without time see."""
         codes = self._attribute.GetTimeSamples()
         if len(codes) == 1:
@@ -84,23 +84,23 @@ class AnimatedValues:
 
 def points_of(values: Array) -> Any:
     """[N, 3] as an array of USD."""
-    return package("pxr.Vt", "usd").Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))
+    return import_optional("pxr.Vt", "usd").Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))
 
 
 def floats_of(values: Array) -> Any:
     """[N] as an array of USD."""
-    return package("pxr.Vt", "usd").FloatArray.FromNumpy(np.ascontiguousarray(values, np.float32))
+    return import_optional("pxr.Vt", "usd").FloatArray.FromNumpy(np.ascontiguousarray(values, np.float32))
 
 
 def quaternions_of(values: Array) -> Any:
     """[N, 4] (x, y, z, w), as USD has them in memory, as an array of USD."""
-    return package("pxr.Vt", "usd").QuatfArray.FromNumpy(np.ascontiguousarray(values, np.float32))
+    return import_optional("pxr.Vt", "usd").QuatfArray.FromNumpy(np.ascontiguousarray(values, np.float32))
 
 
-def turned_pose(rotation: Array, position: Array) -> tuple[Array, Array]:
+def to_stage_pose(rotation: Array, position: Array) -> tuple[Array, Array]:
     """A pose in the user's world, [3, 3] and [3], in the axes of the stage; the part's own axes turn as well.
 
-    >>> turned_pose(np.eye(3), np.array([1.0, 2, 3]))[1]
+    >>> to_stage_pose(np.eye(3), np.array([1.0, 2, 3]))[1]
     array([ 1., -2., -3.])
     """
     return HALF_TURN @ rotation @ HALF_TURN, HALF_TURN @ position
@@ -112,7 +112,7 @@ def set_camera(prim: Any, camera: Camera, metres_per_unit: float) -> None:
     A camera of USD looks along −z with y up, the half turn of one of OpenCV. Its window at the focal length f has the
     size (w/fx, h/fy)·f and lies off the axis by ((w/2 − cx)/fx, (cy − h/2)/fy)·f.
     """
-    gf, geometry = package("pxr.Gf", "usd"), package("pxr.UsdGeom", "usd")
+    gf, geometry = import_optional("pxr.Gf", "usd"), import_optional("pxr.UsdGeom", "usd")
     pose = np.eye(4)
     pose[:3, :3] = HALF_TURN @ camera.rotation.T @ HALF_TURN
     pose[:3, 3] = HALF_TURN @ camera.centre
@@ -128,11 +128,11 @@ def set_camera(prim: Any, camera: Camera, metres_per_unit: float) -> None:
 
 
 @contextmanager
-def reported(path: Path) -> Iterator[None]:
+def translate_usd_errors(path: Path) -> Iterator[None]:
     """Turns errors of USD and of the system, while a file is written, into an ``InputError`` that names the output."""
-    failure = package("pxr.Tf", "usd").ErrorException
+    failure = import_optional("pxr.Tf", "usd").ErrorException
     try:
-        with writing(path):
+        with translate_write_errors(path):
             yield
     except failure as error:
         raise InputError(

@@ -18,21 +18,21 @@ import numpy as np
 from scas4d_core.first_frame.time_limit import TimeLimit
 from scas4d_core.fit.gaussian_fit import FitStep
 
-FEWEST = 500
+MIN_ITERATIONS = 500
 """Iterations that are made however little time there is."""
 FIRST_TIMED = 10
 """Iterations before those that are timed: they load kernels and fill caches."""
 PLAN_EVERY = 25
 """Iterations between two plans; of so many the pace is measured."""
-ENOUGH = 1.03
+TIME_TOLERANCE = 1.03
 """Predicted time over the time left, up to which nothing is shortened: predictions are not better."""
-NOTEWORTHY = 0.02
+MIN_PLAN_CHANGE = 0.02
 """Relative change of the number of iterations from which a plan is noted as another one."""
-FEWER = 0.05
+REPORTED_SHORTFALL = 0.05
 """Share of the iterations from which on a report says that they were too few: fewer are lost
 in what the seed does. The sample at half size, two seeds each: 35.33 dB, with 5, 10 and 20 % fewer 35.20, 35.29 and
 35.24, with half of them 35.03; *cloth* at half size, one seed: 28.91 dB, with 5 and 20 % fewer 28.91 and 28.88."""
-VARIED = 1.3
+MIN_COUNT_RATIO = 1.3
 """Ratio of numbers of Gaussians from which the cost of one can be separated from that of the pixels."""
 
 
@@ -59,12 +59,12 @@ class FitSchedule:
 
     Attributes:
         done: iterations made. at: how far these are in the full schedule. stride: by how much the next goes on.
-        again: whether another whole fit is to follow in the same time. end: of this fit, in the full schedule.
+        fits_again: whether another whole fit is to follow in the same time. end: of this fit, in the full schedule.
         shortened: whether an iteration has gone on by more than one.
         planned: (iteration, iterations in all) whenever what is planned changed.
 
     >>> schedule = FitSchedule(4, TimeLimit(None), lambda at: 100.0)
-    >>> [(step := schedule.next()).begun for _ in range(2)], step.ended, schedule.planned
+    >>> [(step := schedule.begin_iteration()).begun for _ in range(2)], step.ended, schedule.planned
     ([0.0, 1.0], 2.0, [(0, 4)])
     """
 
@@ -72,7 +72,7 @@ class FitSchedule:
         self.iterations = iterations
         self._limit, self._expected = limit, expected
         self.done, self.at, self.stride = 0, 0.0, 1.0
-        self.again = self.shortened = False
+        self.fits_again = self.shortened = False
         self.planned: list[tuple[int, int]] = [(0, iterations)]
         self.seconds: float | None = None
         self.end = float(iterations)
@@ -81,14 +81,14 @@ class FitSchedule:
         self._counts: list[float] = []
         self._spent: list[float] = []
 
-    def next(self) -> FitStep:
+    def begin_iteration(self) -> FitStep:
         """Begins the next iteration."""
         self._began = self._limit.clock()
         begun, self.at = self.at, min(float(self.iterations), self.at + self.stride)
         self.shortened |= self.stride != 1
         return FitStep(begun, self.at)
 
-    def took(self, count: int) -> None:
+    def end_iteration(self, count: int) -> None:
         """Ends an iteration of so many Gaussians, and plans anew from time to time."""
         self.done += 1
         if self.done <= FIRST_TIMED:
@@ -116,19 +116,19 @@ class FitSchedule:
 
     def _plan(self) -> None:
         """Sets the stride by the time that is left, and predicts the seconds that remain."""
-        whole = self._seconds(self.at, self.end) + (self._seconds(0.0, self.iterations) if self.again else 0.0)
-        over = whole / max(self._limit.left_for_fit, 1e-3)
-        longest = max(1.0, self.iterations / FEWEST)
-        self.stride = 1.0 if over <= ENOUGH else min(over, longest)
+        whole = self._seconds(self.at, self.end) + (self._seconds(0.0, self.iterations) if self.fits_again else 0.0)
+        over = whole / max(self._limit.seconds_left_for_fit, 1e-3)
+        longest = max(1.0, self.iterations / MIN_ITERATIONS)
+        self.stride = 1.0 if over <= TIME_TOLERANCE else min(over, longest)
         self.seconds = whole / self.stride
-        if abs(self.total - self.planned[-1][1]) > NOTEWORTHY * self.planned[-1][1]:
+        if abs(self.total - self.planned[-1][1]) > MIN_PLAN_CHANGE * self.planned[-1][1]:
             self.planned.append((self.done, self.total))
 
     def _seconds(self, begin: float, end: float) -> float:
         """Seconds of the iterations between two moments of the full schedule, with as many Gaussians as then."""
         times, counts = np.array(self._times), np.array(self._counts)
         each, more = times[-1], 0.0
-        if counts.max() >= VARIED * counts.min():
+        if counts.max() >= MIN_COUNT_RATIO * counts.min():
             # An iteration costs so much for its pixels, and so much for each Gaussian; one that was slow for what
             # else ran beside it weighs little beside the many.
             more = max(0.0, float(np.polyfit(counts, times, 1)[0]))

@@ -12,14 +12,14 @@ from scipy.spatial import cKDTree
 
 from scas4d_core.cameras import Rig
 from scas4d_core.captures.frame import InitialPoints
-from scas4d_core.first_frame.points.agreement import Search, agreed_points
+from scas4d_core.first_frame.points.agreement import PointSearch, find_agreeing_points
 from scas4d_core.first_frame.points.merging import SPACING
 from scas4d_core.first_frame.points.plane import plane_points
 from scas4d_core.first_frame.points.silhouettes import backdrop, plain_background, with_silhouettes
 from scas4d_core.first_frame.points.stereo import ITERATIONS
 from scas4d_core.first_frame.points.surroundings import Stage, surroundings
-from scas4d_core.first_frame.points.triangulation import matched_tracks, triangulate
-from scas4d_core.first_frame.points.visual_hull import pixel_at
+from scas4d_core.first_frame.points.triangulation import match_tracks, triangulate
+from scas4d_core.first_frame.points.visual_hull import pixel_size_at
 from scas4d_core.first_frame.points.volume import shared_volume, stage_distances
 from scas4d_core.first_frame.time_limit import TimeLimit
 from scas4d_core.frame_outcome import COVERS_LITTLE
@@ -40,27 +40,27 @@ MIN_VIEWS = 3
 """Cameras that must agree on a point: two always meet somewhere on an epipolar line."""
 CELLS = 32
 """Cells along the longer side of a picture, in which points are looked for."""
-ENOUGH = COVERS_LITTLE
+ENOUGH_COVERAGE = COVERS_LITTLE
 """Share of the cells of most pictures that hold a point, from which a cloud is enough and no other way is tried.
 Captures of eighteen cameras and more have 0.99 to 1, rigs of four to seven, wide apart, 0 to 0.4 without other ways."""
-LITTLE = 0.05
+LITTLE_COVERAGE = 0.05
 """The same, up to which unconfirmed points are worth more than none."""
 
 
 @dataclass(eq=False)
-class FoundPoints(InitialPoints):
+class InitialCloud(InitialPoints):
     """Initial points, and how they were found.
 
     Attributes:
-        way: "agreement" (of three cameras or more), "backdrop" (silhouettes before a plain backdrop), "pairs" (two
+        method: "agreement" (of three cameras or more), "backdrop" (silhouettes before a plain backdrop), "pairs" (two
             cameras agree), "plane" (a floor or table on which pictures agree), "surroundings" (what each camera sees,
             far behind) or "volume" (what cameras share; no point is confirmed); several are joined by " + ".
-        covered: share of the pictures' cells that hold a point that cameras have agreed on, median over the cameras.
+        coverage: share of the pictures' cells that hold a point that cameras have agreed on, median over the cameras.
         stage: that the surroundings lie beyond; None without these.
     """
 
-    way: str = "agreement"
-    covered: float = 0.0
+    method: str = "agreement"
+    coverage: float = 0.0
     stage: Stage | None = None
 
 
@@ -75,7 +75,7 @@ def initial_points(
     stereo_iterations: int = ITERATIONS,
     seed: int = 0,
     limit: TimeLimit | None = None,
-) -> FoundPoints:
+) -> InitialCloud:
     """Finds points on the surfaces that the pictures of one moment show.
 
     Triangulated features bound the scene and support walls and floors; PatchMatch stereo, kept where at least
@@ -109,7 +109,7 @@ def initial_points(
     >>> cloud = initial_points(capture.rig, frame.images, frame.masks, stereo=False)
     >>> cloud.positions.shape == cloud.colours.shape, bool((cloud.foreground <= 1).all())
     (True, True)
-    >>> cloud.way, cloud.covered > 0.9
+    >>> cloud.method, cloud.coverage > 0.9
     ('agreement', True)
     """
     on_progress: OnProgress = progress or (lambda stage, done, total: None)
@@ -118,47 +118,47 @@ def initial_points(
     views = labelled if background is None else with_silhouettes(labelled, background)
     on_progress("triangulation", 0, 1)
     limit = limit or TimeLimit(None)
-    tracks = matched_tracks(labelled, limit)
-    first = Search(
+    tracks = match_tracks(labelled, limit)
+    first = PointSearch(
         labelled, views, tracks, background is not None, min(MIN_VIEWS, len(views)), stereo, stereo_iterations,
         max_points, rig.radius, seed, limit,
     )  # fmt: skip
-    spacing = SPACING * pixel_at(labelled, look_at_point(labelled))
-    points: FoundPoints | None = None
-    ways = _ways(first, masked=bool(masks))
-    for way, search in ways:
-        points = _found(points, way, partial(agreed_points, search, on_progress), search.views, spacing)
-        if way != "pairs" and points is not None and points.covered >= ENOUGH:
+    spacing = SPACING * pixel_size_at(labelled, look_at_point(labelled))
+    points: InitialCloud | None = None
+    ways = _search_methods(first, masked=bool(masks))
+    for method, search in ways:
+        points = _add_points(points, method, partial(find_agreeing_points, search, on_progress), search.views, spacing)
+        if method != "pairs" and points is not None and points.coverage >= ENOUGH_COVERAGE:
             return points
     on_progress("plane", 0, 1)
-    points = _found(points, "plane", partial(plane_points, labelled), views, spacing)
-    before = next((search.views for way, search in ways if way == "backdrop"), views)
+    points = _add_points(points, "plane", partial(plane_points, labelled), views, spacing)
+    before = next((search.views for method, search in ways if method == "backdrop"), views)
     known = triangulate(before, tracks, min_views=2, seed=seed).positions
     distances = stage_distances(before, known, rig.radius)
-    confirmed = 0.0 if points is None else points.covered
-    if points is None or confirmed <= LITTLE:
-        points = joined(points, shared_volume(before, distances, seed), "volume", before, 4 * spacing)
+    confirmed = 0.0 if points is None else points.coverage
+    if points is None or confirmed <= LITTLE_COVERAGE:
+        points = merge_points(points, shared_volume(before, distances, seed), "volume", before, 4 * spacing)
     if before is views and not first.backdrop:  # else the backdrop's colour is what lies behind
-        points = joined(points, surroundings(before, distances), "surroundings", before, 0.0)
+        points = merge_points(points, surroundings(before, distances), "surroundings", before, 0.0)
         points = replace(points, stage=Stage.of(before, distances))
-    return replace(points, covered=confirmed)
+    return replace(points, coverage=confirmed)
 
 
-def _found(
-    found: FoundPoints | None,
-    way: str,
+def _add_points(
+    found: InitialCloud | None,
+    method: str,
     search: Callable[[], InitialPoints],
     views: Sequence[PosedPicture],
     spacing: float,
-) -> FoundPoints | None:
+) -> InitialCloud | None:
     """The points found before with those of a way; alone where it finds none."""
     try:
-        return joined(found, search(), way, views, spacing)
+        return merge_points(found, search(), method, views, spacing)
     except InitialPointsError:
         return found
 
 
-def _ways(first: Search, masked: bool) -> list[tuple[str, Search]]:
+def _search_methods(first: PointSearch, masked: bool) -> list[tuple[str, PointSearch]]:
     """The ways to points that cameras agree on, the surest first."""
     ways = [("agreement", first)]
     if not masked and not first.backdrop:
@@ -171,26 +171,26 @@ def _ways(first: Search, masked: bool) -> list[tuple[str, Search]]:
     return ways
 
 
-def joined(
-    found: FoundPoints | None, cloud: InitialPoints, way: str, views: Sequence[PosedPicture], spacing: float
-) -> FoundPoints:
+def merge_points(
+    found: InitialCloud | None, cloud: InitialPoints, method: str, views: Sequence[PosedPicture], spacing: float
+) -> InitialCloud:
     """The points found before, and those of a cloud that are farther from them than ``spacing``, world units."""
     if found is None:
-        both = FoundPoints(cloud.positions, cloud.colours, cloud.foreground, way)
+        both = InitialCloud(cloud.positions, cloud.colours, cloud.foreground, method)
     else:
         new = np.asarray(cKDTree(found.positions).query(cloud.positions)[0]) > spacing
         labels = [found.foreground, None if cloud.foreground is None else cloud.foreground[new]]
-        both = FoundPoints(
+        both = InitialCloud(
             np.concatenate([found.positions, cloud.positions[new]]),
             np.concatenate([found.colours, cloud.colours[new]]),
             # Silhouettes that one way found for itself label its points alone: then nothing is known of what moves.
             None if any(label is None for label in labels) else np.concatenate(labels),  # type: ignore[arg-type]
-            f"{found.way} + {way}",
+            f"{found.method} + {method}",
         )
-    return replace(both, covered=covered(views, both))
+    return replace(both, coverage=image_coverage(views, both))
 
 
-def covered(views: Sequence[PosedPicture], cloud: InitialPoints) -> float:
+def image_coverage(views: Sequence[PosedPicture], cloud: InitialPoints) -> float:
     """Share of the cells of a picture, or of its mask, that hold a point; median over the views.
 
     Args:

@@ -20,13 +20,13 @@ class FirstCloud:
     """Where the first cloud of points came from.
 
     Attributes:
-        way: "given", or as in ``initial_points.FoundPoints``. points: how many.
-        covered: share of the pictures that points cover on which cameras agree; None of a cloud that was given.
+        method: "given", or as in ``initial_points.InitialCloud``. points: how many.
+        coverage: share of the pictures that points cover on which cameras agree; None of a cloud that was given.
     """
 
-    way: str
+    method: str
     points: int
-    covered: float | None = None
+    coverage: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class StaticResult:
         evidence: that was found for effects, by name.
         cloud: where the first cloud came from; None where it is not known.
         planned: (iteration, iterations in all) whenever the time that was left changed what was planned.
-        hurried: whether an iteration has gone on by more than one of the schedule.
+        ran_short_of_time: whether an iteration has gone on by more than one of the schedule.
         shortened: what the time of frame 0 was too short for, in words.
     """
 
@@ -52,5 +52,5 @@ class StaticResult:
     evidence: Mapping[str, Evidence] | None = None
     cloud: FirstCloud | None = None
     planned: Sequence[tuple[int, int]] = ()
-    hurried: bool = False
+    ran_short_of_time: bool = False
     shortened: Sequence[str] = ()

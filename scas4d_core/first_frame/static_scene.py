@@ -100,12 +100,14 @@ class StaticTrainer:
         self.schedule = FitSchedule(settings.iterations, limit or TimeLimit(None), self._expected)
 
     def train(
-        self, progress: Callable[[FitProgress], None] | None = None, enough: Callable[[FitStep], bool] | None = None
+        self,
+        progress: Callable[[FitProgress], None] | None = None,
+        should_stop: Callable[[FitStep], bool] | None = None,
     ) -> list[float]:
         """Runs all iterations, or fewer by the stop rule or for want of time; returns their losses.
 
         Args:
-            progress: called after each iteration. enough: called after each; True ends the fit.
+            progress: called after each iteration. should_stop: called after each; True ends the fit.
         """
         schedule = self.schedule
 
@@ -113,10 +115,10 @@ class StaticTrainer:
             self._after(now, last)
             if progress is not None:
                 progress(FitProgress(schedule.done, schedule.total, last.loss, schedule.seconds))
-            return now.ended >= self._last or (enough is not None and enough(now))
+            return now.ended >= self._last or (should_stop is not None and should_stop(now))
 
         order = view_order(len(self.views), self.settings.iterations, self.random)
-        self.fit.run(order, self.scalars, lambda done: schedule.next(), end)
+        self.fit.run(order, self.scalars, lambda done: schedule.begin_iteration(), end)
         return self.fit.losses
 
     def _after(self, now: FitStep, last: FitLoss) -> None:
@@ -128,12 +130,12 @@ class StaticTrainer:
             self.control_density(self._target(now.ended))
         if now.reaches(until) or now.reaches((until + settings.iterations) // 2):
             self.remove_unseen()
-        if now.ended > until and self._last == settings.iterations and self._settled():
+        if now.ended > until and self._last == settings.iterations and self._has_converged():
             self._last = min(self._last, now.ended + len(self.views) * schedule.stride)
             self.remove_unseen()
         if settings.exposure == "auto" and now.reaches(round(TRIAL * settings.iterations)):
             self.exposures.assess()
-        schedule.took(len(self.fit))
+        schedule.end_iteration(len(self.fit))
 
     def _target(self, at: float) -> int:
         """Gaussians that density control aims at, at a moment of the schedule."""
@@ -145,7 +147,7 @@ class StaticTrainer:
         aim, now = self._target(min(at, self._until)) if at >= DENSIFY_FROM else self._start, self.schedule.at
         return aim if at < now else len(self.fit) if now >= self._until else max(len(self.fit), aim)
 
-    def _settled(self) -> bool:
+    def _has_converged(self) -> bool:
         """True once rounds over all views no longer lower the loss; one more round of them follows."""
         losses, window = self.fit.losses, STOP_ROUNDS * len(self.views)
         if self.settings.stop_gain == 0 or len(losses) % window or len(losses) < 2 * window:
@@ -231,7 +233,13 @@ class StaticTrainer:
         """Of the iterations so far."""
         exposures, planned, shortened = self.exposures.found(), self.schedule.record, self.schedule.shortened
         return StaticResult(
-            self.gaussians(), exposures, losses, self.fit.psnr, self.cameras, planned=planned, hurried=shortened
+            self.gaussians(),
+            exposures,
+            losses,
+            self.fit.psnr,
+            self.cameras,
+            planned=planned,
+            ran_short_of_time=shortened,
         )
 
 
@@ -247,7 +255,7 @@ def first_trainer(
     stage: Stage | None = None,
     device: str = "cpu",
 ) -> StaticTrainer:
-    """The trainer of ``start.fit_static_scene``, before its first iteration; arguments and errors are the same.
+    """The trainer of ``fit_static_scene`` before its first iteration; arguments and errors are the same.
 
     ``stage``: inside world, that surroundings lie beyond, which one camera alone may see; None without these.
     """

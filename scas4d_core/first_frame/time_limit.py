@@ -31,10 +31,10 @@ class TimeLimit:
 
     >>> now = [0.0]
     >>> limit = TimeLimit(100.0, clock=lambda: now[0])
-    >>> limit.left(0.5), limit.chosen(0.5, [80.0, 40.0, 10.0])
+    >>> limit.seconds_left(0.5), limit.choose(0.5, [80.0, 40.0, 10.0])
     (50.0, 1)
     >>> now[0] = 30.0
-    >>> limit.left(0.5), limit.chosen(0.5, [80.0, 40.0, 10.0]), TimeLimit(None).chosen(0.5, [80.0, 40.0])
+    >>> limit.seconds_left(0.5), limit.choose(0.5, [80.0, 40.0, 10.0]), TimeLimit(None).choose(0.5, [80.0, 40.0])
     (20.0, 2, 0)
     """
 
@@ -47,20 +47,20 @@ class TimeLimit:
         """True where there is a limit."""
         return self.seconds is not None
 
-    def left(self, share: float = 1.0) -> float:
+    def seconds_left(self, share: float = 1.0) -> float:
         """Seconds until a share of the time is over, less than 0 once it is; infinity without a limit."""
         return inf if self.seconds is None else self._began + share * self.seconds - self.clock()
 
     @property
-    def left_for_fit(self) -> float:
+    def seconds_left_for_fit(self) -> float:
         """Seconds until the last iteration has to be over."""
-        return inf if self.seconds is None else self.left() - min(AFTER_S, AFTER_SHARE * self.seconds)
+        return inf if self.seconds is None else self.seconds_left() - min(AFTER_S, AFTER_SHARE * self.seconds)
 
-    def chosen(self, share: float, costs: Sequence[float]) -> int:
+    def choose(self, share: float, costs: Sequence[float]) -> int:
         """Index of the first of several ways that ends before a share of the time is over; else their number.
 
         Args:
             costs: predicted seconds of each, the best way first.
         """
-        left = self.left(share)
+        left = self.seconds_left(share)
         return next((index for index, cost in enumerate(costs) if cost <= left), len(costs))

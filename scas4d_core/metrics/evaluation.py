@@ -39,7 +39,7 @@ CHANGED = 0.1
 """In 0…1: a pixel that differs more from frame 0 in some channel has changed."""
 STILL_LEVELS = 6
 """Of 255: the true pictures' own noise; a pixel that stays within them in every channel does not change."""
-FEWEST_STILL = 500
+MIN_STILL = 500
 """Still pixels over all test cameras from which flicker is measured; fewer are chance."""
 
 Scores = dict[str, float | None]
@@ -164,7 +164,7 @@ def measure_flicker(reconstruction: Committed, capture: Capture, indices: Sequen
     flicker = np.concatenate(deviations)
     return {
         "still_pixels": float(len(flicker)),
-        "flicker": float(flicker.mean()) if len(flicker) >= FEWEST_STILL else None,
+        "flicker": float(flicker.mean()) if len(flicker) >= MIN_STILL else None,
     }
 
 

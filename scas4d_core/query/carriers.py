@@ -13,9 +13,9 @@ WEISZFELD_ROUNDS = 12
 """Rounds of the geometric median: by then it moves by a small part of the carriers' spread."""
 BYTES_AT_ONCE = 64e6
 """Working memory of the search for carriers."""
-NOT_THERE = -1e9
+ABSENT = -1e9
 """Logarithm of the opacity of a retired Gaussian: it carries nothing, wherever it was."""
-LEAST_THERE = 0.05
+MIN_PRESENT_WEIGHT = 0.05
 """Of the weight of a point's carriers, that has to be there: the few at its edge do not determine its place."""
 
 
@@ -46,7 +46,7 @@ def carriers(
     whiten = np.linalg.cholesky(np.linalg.inv(covariance)).transpose(0, 2, 1)  # m² = |whiten (p − μ)|²
     whitened_means = np.einsum("nij,nj->ni", whiten, gaussians.means)[:, :, None]
     log_opacity = np.log(np.maximum(gaussians.opacities.astype(np.float64), 1e-12))
-    log_opacity[gaussians.retired] = NOT_THERE
+    log_opacity[gaussians.retired] = ABSENT
 
     rows = np.empty((len(points), count), dtype=np.intp)
     logs = np.empty((len(points), count))
@@ -86,12 +86,12 @@ def geometric_median(points: Float, weights: Float) -> Float:
     return centre
 
 
-def of_those_there(answers: Float, weights: Float, there: NDArray[np.bool_]) -> tuple[Float, Float, NDArray[np.bool_]]:
+def drop_absent(answers: Float, weights: Float, there: NDArray[np.bool_]) -> tuple[Float, Float, NDArray[np.bool_]]:
     """Answers [Q, K, 3] and weights of the carriers that are there, and [Q] whether any is that weighs."""
     if there.all():
         return answers, weights, np.ones(len(answers), np.bool_)
     shares = np.where(there, weights, 0)
     total = shares.sum(axis=1)
-    some: NDArray[np.bool_] = total > LEAST_THERE
+    some: NDArray[np.bool_] = total > MIN_PRESENT_WEIGHT
     shares = np.where(some[:, None], shares / np.where(some, total, 1)[:, None], weights)
     return np.where(there[..., None], answers, 0), shares, some

@@ -24,7 +24,7 @@ from scas4d_core.storage.history import History
 
 Features = NDArray[np.float32]
 
-STANDING = -1
+NO_PART = -1
 """The label of Gaussians that do not move: they belong to no part."""
 SILHOUETTE_SAMPLE = 1000
 """Gaussians on which the count of parts is chosen: the silhouette takes all distances between them."""
@@ -38,11 +38,11 @@ LAMBDA_ROTATION = 1.0
 position only those that turn alike: with more of it long parts are cut across."""
 LAMBDA_INITIAL = 0.25
 """λp0, of p at the first frame, repeated as in the paper."""
-MOST_FRAMES = 32
+MAX_FRAMES = 32
 """Frames that the features take, evenly over the history: memory stays bounded."""
 SAMPLE = 20_000
 """Gaussians that are clustered, at most; all are labelled."""
-MOST_PARTS = 12
+MAX_PARTS = 12
 """Largest count that is tried when none is given."""
 STAY = 0.05
 """Share of the inertia that a fresh clustering has to gain for the previous parts to be given up."""
@@ -66,7 +66,7 @@ def parts(
 
     Args:
         history: at least one committed frame; with a single frame only its positions separate parts.
-        count: of parts; None: the count from 2 to ``MOST_PARTS`` with the largest mean silhouette
+        count: of parts; None: the count from 2 to ``MAX_PARTS`` with the largest mean silhouette
             (Rousseeuw 1987) on up to 1,000 Gaussians.
         previous: [N] labels found from fewer frames with the same ``count`` (or None). Parts that continue keep their
             labels then, whatever their size; with a count chosen anew, a label may be left out.
@@ -106,7 +106,7 @@ def parts(
     rng = np.random.default_rng(SEED)
     chosen = rows if rows.size <= SAMPLE else np.sort(rng.choice(rows, SAMPLE, replace=False))
     extent = moving_extent(newest)
-    positions, rotations = motion(history, rows, MOST_FRAMES)
+    positions, rotations = motion(history, rows, MAX_FRAMES)
     weights = coverage(newest)
     inside = np.searchsorted(rows, chosen)
     features = part_features(positions[:, inside], rotations[:, inside], extent)
@@ -120,7 +120,7 @@ def parts(
     size = np.bincount(labels, weights[rows], minlength=model.n_clusters)
     rank = np.empty(model.n_clusters, dtype=np.int64)
     rank[np.argsort(-size, kind="stable")] = np.arange(model.n_clusters)
-    result = np.full(len(newest), STANDING, dtype=np.int64)
+    result = np.full(len(newest), NO_PART, dtype=np.int64)
     result[rows] = rank[labels]
     return result if previous is None else match_labels(result, previous, weights)
 
@@ -252,7 +252,7 @@ def _best_count(features: Features, known: int) -> int:
     from sklearn.metrics import silhouette_score
 
     best, best_score = 1, 0.0
-    for count in range(2, min(MOST_PARTS, len(features) - 1) + 1):
+    for count in range(2, min(MAX_PARTS, len(features) - 1) + 1):
         labels = _kmeans(count).fit_predict(features)
         score = float(silhouette_score(features, labels)) + STAY_COUNT * (count == known)
         if score > best_score:

@@ -20,7 +20,7 @@ from scas4d_core.cameras import Camera, WorldFrame
 from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.errors import InputError
 from scas4d_core.gaussians import moving_extent, quaternions_to_matrices
-from scas4d_core.query.carriers import carriers, geometric_median, of_those_there
+from scas4d_core.query.carriers import carriers, drop_absent, geometric_median
 from scas4d_core.query.ray_depth import ray_depths
 from scas4d_core.storage.history import History
 
@@ -61,7 +61,7 @@ class Tracks:
             and where the position is NaN.
         ids: [Q] int64: the Gaussian that carries the point most; −1 for a pixel query that met no surface.
         indices: [T] int64 frames.
-        visibility: by camera name, [T, Q] bool, for the cameras queried; see ``seen``.
+        visibility: by camera name, [T, Q] bool, for the cameras queried; see ``find_visibility``.
     """
 
     positions: Float
@@ -75,8 +75,8 @@ class Tracks:
         return camera.project(self.positions)[0]
 
     def with_visibility(self, camera: Camera, render_depth: RenderDepth, tolerance: float) -> Tracks:
-        """Adds the visibility in one more camera; the arguments are those of ``seen``."""
-        visible = seen(self.positions, self.indices, camera, render_depth, tolerance)
+        """Adds the visibility in one more camera; the arguments are those of ``find_visibility``."""
+        visible = find_visibility(self.positions, self.indices, camera, render_depth, tolerance)
         return replace(self, visibility={**self.visibility, camera.name: visible})
 
 
@@ -132,7 +132,7 @@ def tracks_of_points(
     for t, frame in enumerate(indices):
         means = history.stacked("means", [frame], rows)[0].astype(np.float64)
         turned = np.einsum("qkij,qkj->qki", _matrices(history.stacked("rotations", [frame], rows)[0]), offsets)
-        answers, shares, there = of_those_there(means + turned, weights, history.present(frame)[rows])
+        answers, shares, there = drop_absent(means + turned, weights, history.present(frame)[rows])
         result[t] = geometric_median(answers, shares)
         apart = np.einsum("qk,qk->q", shares, np.linalg.norm(answers - result[t][:, None], axis=-1))
         confidence[t] = covered / (1 + np.square(apart / max(AGREEMENT * extent, 1e-12)))
@@ -232,11 +232,11 @@ def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indice
 
 
 def depth_tolerance(history: History, world: WorldFrame, index: int) -> float:
-    """Tolerance of ``seen`` in the user's units: ``DEPTH_TOLERANCE`` of the moving Gaussians' extent at one frame."""
+    """Tolerance of ``find_visibility``, user's units: ``DEPTH_TOLERANCE`` × extent of the moving Gaussians."""
     return DEPTH_TOLERANCE * moving_extent(history.gaussians(index)) / world.metres_per_unit
 
 
-def seen(
+def find_visibility(
     positions: Float, indices: Sequence[int] | NDArray[Any], camera: Camera, render_depth: RenderDepth, tolerance: float
 ) -> NDArray[np.bool_]:
     """Visibility of points in a camera, [T, Q] bool: inside the picture, in front of the camera, and not hidden.

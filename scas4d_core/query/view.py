@@ -18,7 +18,7 @@ from scas4d_core.query.tracks import ALPHA_OF_A_SURFACE
 
 Array = NDArray[np.float32]
 
-MOST_LABEL = 254
+MAX_LABEL = 254
 """Parts are painted into 8 bits; 0 means no part."""
 
 
@@ -103,9 +103,9 @@ class ViewRenderer:
 
     def _parts_picture(self, gaussians: Gaussians, labels: NDArray[Any], camera: CameraArrays) -> NDArray[np.uint8]:
         """[H, W] uint8: the label whose Gaussians weigh most in the pixel, plus 1. A pass has ``CHANNELS`` labels."""
-        if labels.shape != (len(gaussians),) or not ((labels >= -1) & (labels <= MOST_LABEL)).all():
+        if labels.shape != (len(gaussians),) or not ((labels >= -1) & (labels <= MAX_LABEL)).all():
             raise ValueError(
-                f"labels {labels.shape} must be [{len(gaussians)}], one a Gaussian, each in -1...{MOST_LABEL}"
+                f"labels {labels.shape} must be [{len(gaussians)}], one a Gaussian, each in -1...{MAX_LABEL}"
             )
         painted = np.zeros((camera.height, camera.width), np.uint8)
         most = np.full(painted.shape, -1.0, np.float32)

@@ -130,7 +130,7 @@ def lives_of(events: Int, wanted: Iterable[int], first: int) -> list[Life]:
     return lives
 
 
-def grown_roots(roots: Gaussians, state: Gaussians, parents: Int | None) -> Gaussians:
+def extend_roots(roots: Gaussians, state: Gaussians, parents: Int | None) -> Gaussians:
     """The roots of a state: Θ_0 with each Gaussian born since at the place that it would have had there.
 
     Clusters and neighbours are made of them. A born Gaussian goes back as its parent has come, rigidly; one without

@@ -25,7 +25,7 @@ from scas4d_core.compact import CompactReader, FileError, FormatError
 from scas4d_core.errors import message_of
 from scas4d_core.storage.births import Int
 from scas4d_core.storage.frame_arrays import EVENTS, Arrays, Stamp
-from scas4d_core.storage.npz import written_whole
+from scas4d_core.storage.npz import open_atomically
 
 REPORT = "report"
 """Name of the report in a frame's note."""
@@ -66,7 +66,7 @@ class Chunks:
         directory: of the history.
 
     Attributes:
-        known: chunks by the index of their first frame, as of the last ``look``.
+        known: chunks by the index of their first frame, as of the last ``refresh``.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -76,22 +76,22 @@ class Chunks:
         self._readers: OrderedDict[Path, tuple[Chunk, CompactReader]] = OrderedDict()
         weakref.finalize(self, _close_all, self._readers)
 
-    def look(self) -> None:
+    def refresh(self) -> None:
         """Picks up chunks that are new, grew or are gone; others stay unopened."""
         firsts = sorted(first for name in os.listdir(self.directory) if (first := chunk_of(name)) is not None)
-        known = {first: chunk for first in firsts if (chunk := self._looked_at(first)) is not None}
+        known = {first: chunk for first in firsts if (chunk := self._load_chunk(first)) is not None}
         for first in self.known.keys() - known.keys():
             self._close(self.known[first].path)
         self.known, self._firsts = known, list(known)
 
-    def look_at(self, first: int) -> None:
+    def refresh_chunk(self, first: int) -> None:
         """Picks up the chunk that begins with a frame, which is new or grew."""
-        if (chunk := self._looked_at(first)) is not None:
+        if (chunk := self._load_chunk(first)) is not None:
             self.known[first] = chunk
             if first not in self._firsts:
                 insort(self._firsts, first)
 
-    def _looked_at(self, first: int) -> Chunk | None:
+    def _load_chunk(self, first: int) -> Chunk | None:
         path = self.directory / chunk_file(first)
         try:
             status = path.stat()
@@ -127,7 +127,7 @@ class Chunks:
         return {index: stamp for first in self._firsts for index, stamp in self.known[first].stamps.items()}
 
     @property
-    def damages(self) -> list[str]:
+    def damaged(self) -> list[str]:
         """A sentence for each chunk that is damaged so that frames of it are not listed."""
         return [chunk.damage for chunk in self.known.values() if chunk.damage is not None]
 
@@ -145,7 +145,7 @@ class Chunks:
         try:
             return self._read(index, names, optional)
         except FileNotFoundError:  # new since the last look, or deleted
-            self.look()
+            self.refresh()
             return self._read(index, names, optional)
 
     def _read(self, index: int, names: Sequence[str], optional: Sequence[str]) -> Arrays:
@@ -213,7 +213,7 @@ class Chunks:
         """Deletes the chunk that begins with a frame."""
         (self.directory / chunk_file(first)).unlink(missing_ok=True)
 
-    def cut(self, index: int) -> None:
+    def truncate(self, index: int) -> None:
         """Takes a frame, and those after it, out of the chunk that holds it, which has no index then."""
         if (chunk := self.of(index)) is None:
             return
@@ -225,9 +225,9 @@ class Chunks:
                 end = reader.end_before(index)
             beside = chunk.path.with_name(f".{chunk.path.name}.part")
             # A new file in its place: the old one may have other links (server/storage/fencing.py).
-            with chunk.path.open("rb") as old, written_whole(chunk.path, beside) as file:
+            with chunk.path.open("rb") as old, open_atomically(chunk.path, beside) as file:
                 file.write(old.read(end))
-        self.look()
+        self.refresh()
 
 
 def _close_all(readers: OrderedDict[Path, tuple[Chunk, CompactReader]]) -> None:
@@ -235,7 +235,7 @@ def _close_all(readers: OrderedDict[Path, tuple[Chunk, CompactReader]]) -> None:
         reader.close()
 
 
-def note_of(report: Mapping[str, Any], log: Int, before: int) -> dict[str, Any]:
+def make_note(report: Mapping[str, Any], log: Int, before: int) -> dict[str, Any]:
     """The note on a frame: its report, and the events of its log.
 
     Args:

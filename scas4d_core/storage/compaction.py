@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from scas4d_core.compact import CompactWriter, FileError, FileHeader
-from scas4d_core.storage.chunks import chunk_file, note_of
+from scas4d_core.storage.chunks import chunk_file, make_note
 from scas4d_core.storage.frame_files import frame_of
 from scas4d_core.storage.history import NEWEST_KEPT, History
 from scas4d_core.storage.npz import sync_folder
@@ -68,7 +68,7 @@ class Compaction:
     def due(self) -> int:
         """Number of states to be moved, as far as is known: at least one where any is."""
         if not self._queue:
-            self._queue.extend(self._history.older(self.exact, self._passed))
+            self._queue.extend(self._history.older_than_newest(self.exact, self._passed))
         return len(self._queue)
 
     def step(self) -> int | None:
@@ -83,11 +83,11 @@ class Compaction:
                 if index in self._history:  # retention may have deleted it
                     self._move(index)
             except OSError:
-                self._drop()
+                self._release_writer()
                 raise
             except NOT_ENCODED as error:  # damaged, or it cannot be encoded: it stays as it is
                 log.warning("frame %d is not compacted: %s", index, error)
-                self._drop()
+                self._release_writer()
             else:
                 self._passed = self._queue.popleft()
                 return index
@@ -96,7 +96,7 @@ class Compaction:
 
     def close(self) -> None:
         """Leaves the chunk that is being written as it is; another ``Compaction`` goes on with it."""
-        self._drop()
+        self._release_writer()
 
     def _complete(self) -> None:
         """Deletes files of frames that are in a chunk, whole and on disk: a stop left them beside it."""
@@ -108,41 +108,41 @@ class Compaction:
         for index in own:
             if self._files.chunks.fault(index) is None:
                 self._files.path(index).unlink()
-                self._history.restamp(index)
+                self._history.mark_compacted(index)
 
     def _move(self, index: int) -> None:
         history, files = self._history, self._files
         if self._writer is not None and self._first not in files.chunks.known:  # retention has deleted it
-            self._drop()
+            self._release_writer()
         state, time = history.gaussians(index), history.time(index)
         report, log = history.report(index), history.log_at(index)
-        writer = self._writer or self._resumed()
+        writer = self._writer or self._resume_chunk()
         if writer is None or not self._fits(writer, index):
             self._finish(writer)
-            writer = self._begun(index)
+            writer = self._begin_chunk(index)
         self._writer = writer
         if writer.last_frame < index:  # else the disk did not confirm it the last time
             try:
-                writer.add(index, time, state, note=note_of(report, log, writer.last_frame))
+                writer.add(index, time, state, note=make_note(report, log, writer.last_frame))
             except FileError:
                 if not writer.frames:
-                    self._drop()
+                    self._release_writer()
                     writer.path.unlink(missing_ok=True)
                     raise
                 self._finish(writer)  # other Gaussians than before: a chunk of its own may hold it
-                writer = self._writer = self._begun(index)
-                writer.add(index, time, state, note=note_of(report, log, -1))
+                writer = self._writer = self._begin_chunk(index)
+                writer.add(index, time, state, note=make_note(report, log, -1))
         writer.sync()
-        files.chunks.look_at(self._first)
+        files.chunks.refresh_chunk(self._first)
         if index not in files.chunks:
             raise FileError(f"{writer.path.name}: frame {index} is not in it after it was written")
         files.path(index).unlink(missing_ok=True)
-        history.restamp(index)
+        history.mark_compacted(index)
 
     def _fits(self, writer: CompactWriter, index: int) -> bool:
         return writer.last_frame == index or (writer.frames < CHUNK_FRAMES and writer.last_frame < index)
 
-    def _resumed(self) -> CompactWriter | None:
+    def _resume_chunk(self) -> CompactWriter | None:
         """The newest chunk, to go on with, where it has not ended and was begun with the same bounds."""
         known = self._files.chunks.known
         if not known:
@@ -157,7 +157,7 @@ class Compaction:
             return None
         return writer
 
-    def _begun(self, index: int) -> CompactWriter:
+    def _begin_chunk(self, index: int) -> CompactWriter:
         self._first = index
         path: Path = self._files.directory / chunk_file(index)
         path.unlink(missing_ok=True)  # one without a whole state: a stop came between its beginning and its end
@@ -170,10 +170,10 @@ class Compaction:
         if writer is not None:
             writer.close()
             _confirm(writer.path)
-            self._files.chunks.look()
+            self._files.chunks.refresh()
         self._writer = None
 
-    def _drop(self) -> None:
+    def _release_writer(self) -> None:
         """Lets go of the chunk that is being written; a half-written record is cut off when it is gone on with."""
         if self._writer is not None:
             self._writer.abandon()

@@ -23,10 +23,10 @@ EffectArrays = Mapping[str, Mapping[str, NDArray[Any]]]
 """Arrays of effects, by effect and name."""
 
 
-def packed(effects: EffectArrays) -> NDArray[np.uint8] | None:
+def pack_effects(effects: EffectArrays) -> NDArray[np.uint8] | None:
     """Arrays of effects as one array of bytes; None of none.
 
-    >>> unpacked(packed({"shadows": {"c.0": np.arange(3)}}))
+    >>> unpack_effects(pack_effects({"shadows": {"c.0": np.arange(3)}}))
     {'shadows': {'c.0': array([0, 1, 2])}}
     """
     arrays: dict[str, Any] = {f"{name}.{key}": array for name, own in effects.items() for key, array in own.items()}
@@ -37,8 +37,8 @@ def packed(effects: EffectArrays) -> NDArray[np.uint8] | None:
     return np.frombuffer(file.getvalue(), np.uint8)
 
 
-def unpacked(given: NDArray[np.uint8] | None) -> dict[str, Arrays]:
-    """The arrays of effects, by effect and name, that were ``packed``."""
+def unpack_effects(given: NDArray[np.uint8] | None) -> dict[str, Arrays]:
+    """The arrays of effects, by effect and name, that ``pack_effects`` packed."""
     effects: dict[str, Arrays] = {}
     if given is not None:
         with np.load(BytesIO(given.tobytes()), allow_pickle=False) as file:
@@ -48,7 +48,7 @@ def unpacked(given: NDArray[np.uint8] | None) -> dict[str, Arrays]:
     return effects
 
 
-def as_written(
+def frame_file_arrays(
     frame: Mapping[str, NDArray[Any]], time: float, report: bytes, log: Int, left: NDArray[np.uint8] | None
 ) -> dict[str, Any]:
     """The arrays of a frame's file.

@@ -63,7 +63,7 @@ class FrameFiles:
         """Path of the file of a frame."""
         return self.directory / frame_file(index)
 
-    def listed(self) -> dict[int, Stamp]:
+    def list_stamps(self) -> dict[int, Stamp]:
         """Stamps of the frames in the directory, rising; the first one is listed also where only its copy exists."""
         stamps: dict[int, Stamp] = {}
         with os.scandir(self.directory) as entries:
@@ -74,14 +74,14 @@ class FrameFiles:
                     stamps[index] = _stamp(entry.stat())
                 except FileNotFoundError:  # deleted, or compacted, meanwhile
                     continue
-        self.chunks.look()  # after the files: a frame goes to a chunk before its own file goes
+        self.chunks.refresh()  # after the files: a frame goes to a chunk before its own file goes
         stamps = self.chunks.stamps() | stamps
         first = self._first()
         if stamps and first is not None and first[1] < min(stamps):
             stamps[first[1]] = first[0]
         return dict(sorted(stamps.items()))
 
-    def stamped(self, indices: Iterable[int]) -> dict[int, Stamp]:
+    def stamps_of(self, indices: Iterable[int]) -> dict[int, Stamp]:
         """Stamps of the given frames that exist, without listing the directory."""
         stamps: dict[int, Stamp] = {}
         absent: list[int] = []
@@ -95,7 +95,7 @@ class FrameFiles:
                 else:
                     absent.append(index)
         if absent:
-            self.chunks.look()
+            self.chunks.refresh()
         stamps |= {index: stamp for index in absent if (stamp := self.chunks.stamp(index)) is not None}
         return dict(sorted(stamps.items()))
 
@@ -221,7 +221,7 @@ class FrameFiles:
             except FileNotFoundError:
                 raise UnreadableFrameError(reason) from error
 
-    def mend_copies(self, first: int, fixed: Arrays, born: Mapping[int, Arrays]) -> dict[str, str]:
+    def repair_copies(self, first: int, fixed: Arrays, born: Mapping[int, Arrays]) -> dict[str, str]:
         """Writes ``fixed.npz``, the born, the first frame and their copies anew where they are damaged or gone.
 
         Args:
@@ -254,14 +254,14 @@ class FrameFiles:
     def remove(self, index: int) -> None:
         """Deletes a frame, if it is there; out of a chunk, with those after it."""
         self.path(index).unlink(missing_ok=True)
-        self.chunks.cut(index)
+        self.chunks.truncate(index)
 
-    def compacted(self, index: int) -> bool:
+    def is_compacted(self, index: int) -> bool:
         """True for a frame that is in a chunk, and has no file of its own."""
         if self.path(index).exists():
             return False
         if index not in self.chunks:
-            self.chunks.look()
+            self.chunks.refresh()
         return index in self.chunks
 
     def chunk_of(self, index: int) -> list[int]:
@@ -283,7 +283,7 @@ class FrameFiles:
         for first in firsts:
             self.chunks.remove(first)
         if firsts:
-            self.chunks.look()
+            self.chunks.refresh()
 
     def sync(self) -> None:
         """Syncs the directory: deleted files stay deleted after a power cut."""

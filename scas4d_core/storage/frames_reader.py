@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scas4d_core.gaussians import FIXED
 from scas4d_core.storage.births import NO_EVENTS, Int
 from scas4d_core.storage.faults import DamagedFrameError, HistoryError, OtherFormatError, UnreadableFrameError
-from scas4d_core.storage.frame_arrays import EFFECTS, EVENTS, Arrays, Stamp, unpacked
+from scas4d_core.storage.frame_arrays import EFFECTS, EVENTS, Arrays, Stamp, unpack_effects
 from scas4d_core.storage.frame_files import FrameFiles, frame_file
 
 FRAMES_KEPT = 4
@@ -39,8 +39,8 @@ class FramesReader:
         self._stamps: dict[int, Stamp] = {}
         self._texts: dict[int, bytes] = {}
         """Reports of the frames that are in memory."""
-        self._reports_aside: dict[int, Mapping[str, NDArray[np.uint8]]] = {}
-        """Those of frames without a file that are not (``History.put_aside``)."""
+        self._scratch_reports: dict[int, Mapping[str, NDArray[np.uint8]]] = {}
+        """Those of frames without a file that are not (``History.move_to_scratch``)."""
         self._packed: dict[int, NDArray[np.uint8]] = {}
         """What effects left of the frames that were written here and are in memory, packed."""
         self._frames: OrderedDict[int, Mapping[str, NDArray[Any]]] = OrderedDict()
@@ -88,7 +88,7 @@ class FramesReader:
         if self._files is None:
             return [], []
         looked_at = {*self._times, *self.damaged} if only is None else set(only)
-        listed = self._files.listed() if only is None else self._files.stamped(looked_at)
+        listed = self._files.list_stamps() if only is None else self._files.stamps_of(looked_at)
         gone = sorted(index for index in looked_at if index in self._times and index not in listed)
         changed = [index for index, stamp in listed.items() if self._stamps.get(index) != stamp]
         for index in [*gone, *changed]:
@@ -114,29 +114,29 @@ class FramesReader:
             self._fixed = self._files.read_fixed(FIXED)
         return added, gone
 
-    def older(self, newest: int, after: int) -> list[int]:
+    def older_than_newest(self, newest: int, after: int) -> list[int]:
         """The frames after one that are older than so many newest, rising, without the first of all."""
         first = next(iter(self._times), -1)
         frames = takewhile(lambda index: index > max(after, first), islice(reversed(self._times), newest, None))
         return list(frames)[::-1]
 
     @property
-    def unlisted(self) -> list[str]:
+    def damaged_chunks(self) -> list[str]:
         """A sentence for each compact file that is damaged so that frames of it are not among ``indices``."""
-        return [] if self._files is None else self._files.chunks.damages
+        return [] if self._files is None else self._files.chunks.damaged
 
-    def compacted(self, index: int) -> bool:
+    def is_compacted(self, index: int) -> bool:
         """True for a committed frame that is in a chunk by now."""
-        return index in self._times and self._files is not None and self._files.compacted(index)
+        return index in self._times and self._files is not None and self._files.is_compacted(index)
 
-    def restamp(self, index: int) -> None:
+    def mark_compacted(self, index: int) -> None:
         """Notes that the state of a frame went to a chunk, from which it is read from now on."""
         if self._files is not None and index in self._times and (stamp := self._files.chunks.stamp(index)) is not None:
             self._stamps[index] = stamp
             for kept in (self._frames, self._texts, self._packed):
                 kept.pop(index, None)
 
-    def take_faults(self) -> dict[str, str]:
+    def pop_faults(self) -> dict[str, str]:
         """Files found damaged or gone since the last call, by name with the reason."""
         if self._files is None:
             return {}
@@ -183,13 +183,13 @@ class FramesReader:
         self._require(index)
         text = self._texts.get(index)
         if text is None:
-            kept = self._reports_aside.get(index)
+            kept = self._scratch_reports.get(index)
             text = (self._from_file(index, ("report",)) if kept is None else kept)["report"].tobytes()
         try:
             report: dict[str, Any] = json.loads(text)
         except ValueError as error:
             raise HistoryError(f"{frame_file(index)}: its report is no JSON ({error})") from error
-        if index in self._frames and index not in self._reports_aside:
+        if index in self._frames and index not in self._scratch_reports:
             self._texts[index] = text
         return report
 
@@ -217,7 +217,7 @@ class FramesReader:
 
     def effects(self, index: int) -> dict[str, Arrays]:
         """What effects left of a committed frame for a cold start, by effect; nothing where it cannot be read."""
-        return unpacked(self._left(index))
+        return unpack_effects(self._left(index))
 
     def _left(self, index: int) -> NDArray[np.uint8] | None:
         """The same, packed; None: nothing."""
@@ -304,7 +304,7 @@ class FramesReader:
 
     def _forget(self, index: int) -> None:
         self._times.pop(index, None)
-        self._reports_aside.pop(index, None)
+        self._scratch_reports.pop(index, None)
         self._stamps.pop(index, None)
         self._texts.pop(index, None)
         self._packed.pop(index, None)

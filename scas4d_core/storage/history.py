@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scas4d_core.gaussians import FIXED, PER_FRAME, UNBORN, WHOLES, Gaussians
 from scas4d_core.storage.births import NO_PARENT, Event, Int, births_in, events_of, retired_after
 from scas4d_core.storage.faults import DamagedFrameError, HistoryError, UnreadableFrameError
-from scas4d_core.storage.frame_arrays import Arrays, EffectArrays, as_written, packed
+from scas4d_core.storage.frame_arrays import Arrays, EffectArrays, frame_file_arrays, pack_effects
 from scas4d_core.storage.frame_files import FrameFiles
 from scas4d_core.storage.frames_reader import FRAMES_KEPT
 from scas4d_core.storage.history_reader import ROOT, ROOTS, HistoryReader
@@ -44,7 +44,7 @@ class History(HistoryReader):
 
     Args:
         directory: made when missing; without it states are in memory, and older ones in a scratch file
-            (``put_aside``). One that holds states is opened with ``History.load`` or ``History.open``.
+            (``move_to_scratch``). One that holds states is opened with ``History.load`` or ``History.open``.
 
     Attributes:
         record_seconds: seconds that the last ``append`` spent on the report: encoding it, and its share of writing, by
@@ -73,7 +73,7 @@ class History(HistoryReader):
         self._scratch: ScratchFile | None = None
         if self._files is not None:
             self._files.directory.mkdir(parents=True, exist_ok=True)
-            if self._files.listed():
+            if self._files.list_stamps():
                 raise HistoryError(f"{self._files.directory.name} already holds a history; History.load opens it")
 
     @classmethod
@@ -91,9 +91,9 @@ class History(HistoryReader):
 
     def save(self, directory: Path | str) -> None:
         """Writes a copy of this history into another directory, one frame at a time."""
-        self.copied(self.indices, directory)
+        self.copy_frames(self.indices, directory)
 
-    def copied(self, indices: Iterable[int], directory: Path | str | None = None) -> History:
+    def copy_frames(self, indices: Iterable[int], directory: Path | str | None = None) -> History:
         """A copy of some committed frames, in memory or in another directory; ids, births and lives are the same."""
         copy = History(directory)
         for index in sorted(set(indices)):
@@ -124,7 +124,7 @@ class History(HistoryReader):
                 they have no ids yet, and get theirs here. The arrays are copied.
             report: made of JSON values (finite numbers, strings, lists, mappings).
             parents: [B] rows of the parents of the born; None: none has one.
-            roots: of all Gaussians (``births.grown_roots``); None: the born have theirs where they are.
+            roots: of all Gaussians (``births.extend_roots``); None: the born have theirs where they are.
             effects: arrays that a cold start needs, by effect.
 
         Raises:
@@ -171,7 +171,7 @@ class History(HistoryReader):
             ]
         )
         log = log if len(log) > len(before) else before
-        self._write(index, time, frame, text, log, births, self._fixed or fixed, packed(effects))
+        self._write(index, time, frame, text, log, births, self._fixed or fixed, pack_effects(effects))
 
     def _birth(self, index: int, born: Gaussians, parents: Int | None, roots: Gaussians | None) -> Arrays:
         """All that is kept of a birth.
@@ -209,7 +209,7 @@ class History(HistoryReader):
         """
         if self._files is not None:
             encoded = text.encode()
-            written = as_written(frame, time, encoded, log, left)
+            written = frame_file_arrays(frame, time, encoded, log, left)
             if not self._fixed:
                 self._files.write_fixed(fixed, index, written)
             for born_in, arrays in births.items():
@@ -231,7 +231,7 @@ class History(HistoryReader):
         self.damaged.pop(index, None)
         self._keep(index, frame)
         if self._files is None and len(self._times) > IN_MEMORY:
-            self.put_aside(None, IN_MEMORY)
+            self.move_to_scratch(None, IN_MEMORY)
 
     def retain(self, *, last: int | None = None, size_bytes: int | None = None) -> list[int]:
         """Deletes the oldest states until the rules hold. Without a rule all stay.
@@ -262,7 +262,7 @@ class History(HistoryReader):
             self._files.remove_oldest(deleted, self._times)
         return deleted
 
-    def put_aside(self, folder: Path | None, keep_newest: int = 1) -> None:
+    def move_to_scratch(self, folder: Path | None, keep_newest: int = 1) -> None:
         """Moves states from memory to a scratch file, but for the first and the newest; their bits stay the same.
 
         Args:
@@ -272,14 +272,14 @@ class History(HistoryReader):
         """
         self._scratch = self._scratch or ScratchFile(folder)
         for index in reversed(self.indices[1:-keep_newest] if self._files is None else ()):
-            if (moved := self._scratch.moved(self._frames[index])) is self._frames[index]:
+            if (moved := self._scratch.store(self._frames[index])) is self._frames[index]:
                 break  # it is there already, and so are all before it; or there is no room
             self._frames[index] = moved
-            self._reports_aside[index] = self._scratch.moved(
+            self._scratch_reports[index] = self._scratch.store(
                 {"report": np.frombuffer(self._texts.pop(index), np.uint8)}
             )
 
-    def cut(self, after: int) -> list[int]:
+    def truncate(self, after: int) -> list[int]:
         """Takes back every commit after frame ``after``.
 
         Returns:
@@ -308,12 +308,12 @@ class History(HistoryReader):
         for birth in births_in(self._events()):
             with suppress(DamagedFrameError):  # neither in memory nor whole in one of its files
                 births[birth[0]] = self._born(birth)
-        mended = self._files.mend_copies(first, self._fixed, births)
+        mended = self._files.repair_copies(first, self._fixed, births)
         if self._files.path(first).name in mended:
-            self._stamps.update(self._files.stamped((first,)))
+            self._stamps.update(self._files.stamps_of((first,)))
         return mended
 
-    def write_again(self, index: int) -> bool:
+    def rewrite(self, index: int) -> bool:
         """Writes the file of a committed frame anew, the same bits.
 
         Returns:
@@ -323,7 +323,7 @@ class History(HistoryReader):
         if self._files is None or frame is None or text is None or index not in self._times:
             return False
         self._stamps[index] = self._files.write(
-            index, as_written(frame, self._times[index], text, self.log_at(index), self._left(index))
+            index, frame_file_arrays(frame, self._times[index], text, self.log_at(index), self._left(index))
         )
         return True
 
@@ -347,6 +347,6 @@ class History(HistoryReader):
         frame = {name: np.asarray(arrays[name]) for name in (*PER_FRAME, *WHOLES) if name in arrays}
         text = json.dumps(dict(report), allow_nan=False).encode()
         self._forget(index)
-        self._stamps[index] = self._files.write(index, as_written(frame, time, text, log, packed(effects)))
+        self._stamps[index] = self._files.write(index, frame_file_arrays(frame, time, text, log, pack_effects(effects)))
         self.damaged.pop(index, None)
         self._times = dict(sorted([*self._times.items(), (index, float(time))]))

@@ -69,7 +69,7 @@ class HistoryReader(FramesReader):
         return self.gaussians(self.indices[0])
 
     def roots(self, index: int | None = None) -> Gaussians:
-        """The first frame, with the Gaussians born since where they would have been in it (``births.grown_roots``).
+        """The first frame, with the Gaussians born since where they would have been in it (``births.extend_roots``).
 
         Args:
             index: of a frame: those born by then, and retired as then; None: the newest.
@@ -88,7 +88,7 @@ class HistoryReader(FramesReader):
         fixed = self._fixed_after(births)
         return roots.replace(ids=fixed["ids"], retired=retired_after(log, fixed["ids"]))
 
-    def completed(self, index: int, state: Gaussians) -> Gaussians:
+    def complete_state(self, index: int, state: Gaussians) -> Gaussians:
         """A state that was made again for a frame, with what was born in it, as it was then, and what came back in it.
 
         Where that came back is not kept apart: it is shown as in the next frame that can be read.

@@ -33,7 +33,7 @@ checksum of its array, and may ask for an impossible array."""
 DIGEST = 16
 """Bytes of a checksum."""
 PIECE = 1 << 20
-"""Bytes that ``verified`` reads at a time."""
+"""Bytes that ``iter_verified`` reads at a time."""
 
 
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
@@ -45,12 +45,12 @@ def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
     ...     read_npz(Path(folder) / "a.npz")["means"].shape
     (2, 3)
     """
-    with written_whole(path, path.with_name(f".{path.name}.{os.getpid()}.part")) as file:
+    with open_atomically(path, path.with_name(f".{path.name}.{os.getpid()}.part")) as file:
         _save(file, arrays)
 
 
 @contextmanager
-def written_whole(path: Path, beside: Path) -> Iterator[BinaryIO]:
+def open_atomically(path: Path, beside: Path) -> Iterator[BinaryIO]:
     """Opens a file ``beside`` to write to; in the end it is whole and on disk at ``path``, or not there at all."""
     try:
         with beside.open("wb") as file:
@@ -87,17 +87,17 @@ def _comment(checksums: Mapping[str, str]) -> bytes:
 
 
 def _digest(array: NDArray[Any]) -> str:
-    digest = _begun(array.dtype, array.shape)
+    digest = _start_checksum(array.dtype, array.shape)
     digest.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
     return digest.hexdigest()
 
 
-def _agrees(kept: str, found: str) -> bool:
+def _checksum_matches(kept: str, found: str) -> bool:
     """True where a stored checksum, whole or shortened, matches the one of the array that was read."""
     return len(kept) >= 4 and found.startswith(kept)
 
 
-def _begun(dtype: np.dtype[Any], shape: tuple[int, ...]) -> hashlib.blake2b:
+def _start_checksum(dtype: np.dtype[Any], shape: tuple[int, ...]) -> hashlib.blake2b:
     return hashlib.blake2b(f"{dtype.str} {tuple(shape)}".encode(), digest_size=DIGEST)
 
 
@@ -154,7 +154,7 @@ def read_npz(path: Path, names: Sequence[str] | None = None, optional: Sequence[
             wanted = file.files if names is None else [*names, *(name for name in optional if name in file.files)]
             arrays = {name: np.asarray(file[member(name)]) for name in wanted}
             for name, array in arrays.items():
-                if not _agrees(checksums[name], _digest(array)):
+                if not _checksum_matches(checksums[name], _digest(array)):
                     raise ValueError(f"{name} fails its checksum")
             return arrays
     except FileNotFoundError:
@@ -163,7 +163,7 @@ def read_npz(path: Path, names: Sequence[str] | None = None, optional: Sequence[
         raise _damage(path, error) from error
 
 
-def verified(path: Path) -> Iterator[int]:
+def iter_verified(path: Path) -> Iterator[int]:
     """Reads all of an npz piece by piece and yields the bytes of each; a damaged file raises on the way.
 
     Raises:
@@ -177,7 +177,7 @@ def verified(path: Path) -> Iterator[int]:
                 with archive.open(member) as file:
                     digest = yield from _streamed(file)
                 name = member.filename.removesuffix(".npy")
-                if not _agrees(checksums[name], digest):
+                if not _checksum_matches(checksums[name], digest):
                     raise ValueError(f"{name} fails its checksum")
     except FileNotFoundError:
         raise
@@ -186,8 +186,8 @@ def verified(path: Path) -> Iterator[int]:
 
 
 def verify(path: Path) -> None:
-    """Reads all of an npz at once; raises as ``verified``."""
-    for _ in verified(path):
+    """Reads all of an npz at once; raises as ``iter_verified``."""
+    for _ in iter_verified(path):
         pass
 
 
@@ -200,7 +200,7 @@ def _streamed(file: IO[bytes]) -> Generator[int, None, str]:
         values = file.read()
         yield len(values)
         return _digest(np.frombuffer(values, dtype).reshape(shape, order="F"))
-    digest = _begun(dtype, shape)
+    digest = _start_checksum(dtype, shape)
     while piece := file.read(PIECE):
         digest.update(piece)
         yield len(piece)

@@ -36,7 +36,7 @@ class ScratchFile:
         self._full = False
         self._one_at_a_time = Lock()
 
-    def moved(self, frame: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
+    def store(self, frame: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
         """The arrays of a frame, in the file; as they were once there is no room, which is asked for once."""
         if isinstance(frame, ScratchFrame) or self._full:
             return frame
@@ -56,7 +56,7 @@ class ScratchFile:
             if self._file is None:
                 self._file = TemporaryFile(dir=self._within, buffering=0)  # noqa: SIM115
                 finalize(self, self._file.close)
-            size = _room(array.nbytes)
+            size = _size_class(array.nbytes)
             free = self._free.get(size)
             begins = free.pop() if free else self._end
             self._write(array.tobytes(), begins)
@@ -85,10 +85,10 @@ class ScratchFile:
     def free(self, places: Mapping[str, tuple[int, int]]) -> None:
         """Has places, each where it begins and its bytes, used again. Without the lock: a collection may call this."""
         for begins, size in places.values():
-            self._free.setdefault(_room(size), []).append(begins)
+            self._free.setdefault(_size_class(size), []).append(begins)
 
 
-def _room(size: int) -> int:
+def _size_class(size: int) -> int:
     """Bytes that are taken for an array: places of about one size take the place of one another."""
     return -(-size // ROUNDED) * ROUNDED
 
@@ -102,7 +102,7 @@ class ScratchFrame(Mapping[str, NDArray[Any]]):
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
     ...     frame = {"means": np.arange(6.0).reshape(2, 3), "weights": np.ones(2, "f4")}
-    ...     dict(ScratchFile(Path(folder)).moved(frame))
+    ...     dict(ScratchFile(Path(folder)).store(frame))
     {'means': array([[0., 1., 2.],
            [3., 4., 5.]]), 'weights': array([1., 1.], dtype=float32)}
     """

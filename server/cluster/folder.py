@@ -13,7 +13,7 @@ import ray
 from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from scas4d_core.storage.npz import written_whole
+from scas4d_core.storage.npz import open_atomically
 from server.cluster.marks import appears
 from server.cluster.nodes import living_nodes
 from server.storage.fencing import PART
@@ -62,7 +62,7 @@ def probe_here(data: Path, word: str, id: str) -> str | None:
         if not appears(data / f"{PROBE}-{word}", word):
             return f"does not see what the service writes to {data}"
         beside, path = (data / f"{PROBE}-{word}-{id[:8]}{end}" for end in (PART, ""))
-        with written_whole(path, beside) as file:
+        with open_atomically(path, beside) as file:
             file.write(word.encode())
         link, symbolic = path.with_suffix(".link"), path.with_suffix(".symbolic")
         with contextlib.suppress(OSError):  # states are copied then

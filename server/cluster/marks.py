@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-from scas4d_core.storage.npz import written_whole
+from scas4d_core.storage.npz import open_atomically
 from server.storage.fencing import PART
 
 MARK = ".service"
@@ -15,7 +15,7 @@ SEEN_S = 10.0
 
 def mark(data: Path, word: str) -> None:
     """Marks the folder as that of the service whose word it is. Blocking."""
-    with written_whole(data / MARK, data / f"{MARK}{PART}") as file:
+    with open_atomically(data / MARK, data / f"{MARK}{PART}") as file:
         file.write(word.encode())
 
 

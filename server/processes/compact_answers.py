@@ -10,7 +10,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from scas4d_core.compact import CompactWriter, FileError, FileHeader
-from scas4d_core.first_frame.calibration.record import in_use
+from scas4d_core.first_frame.calibration.report import effective_rig
 from scas4d_core.storage.history import History
 from server.messages import SceneSpec
 from server.processes.part_labels import fitted
@@ -21,9 +21,9 @@ def compact_head(spec: SceneSpec, history: History) -> FileHeader:
     return FileHeader(
         spec.rig.world_frame(spec.settings.scene.metres_per_unit),
         background=history.background,
-        rig=in_use(spec.rig, history.first_report),
+        rig=effective_rig(spec.rig, history.first_report),
         frames_per_second=spec.frames_per_second,
-        remark={"scene": spec.folder.name},
+        metadata={"scene": spec.folder.name},
     )
 
 
@@ -48,7 +48,7 @@ def write_compact(
     frames = [index for index in asked if index in history] or list(asked[:1])
     last = _copied(file, history, frames)
     if last is None:
-        frames = list(takewhile(lambda index: index == frames[0] or not history.compacted(index), frames))
+        frames = list(takewhile(lambda index: index == frames[0] or not history.is_compacted(index), frames))
         with CompactWriter(file, head, clustered=len(frames) > 1) as writer:
             for index in frames:
                 writer.add(index, history.time(index), history.gaussians(index))
@@ -62,11 +62,11 @@ def write_compact(
 
 def _copied(file: Path, history: History, frames: Sequence[int]) -> int | None:
     """Copies frames out of the compact file that holds the first of them; returns the last, None where none does."""
-    if history.files is None or not history.compacted(frames[0]):
+    if history.files is None or not history.is_compacted(frames[0]):
         return None
     try:
         with file.open("wb") as copy:
-            return history.files.chunks.reader(frames[0]).copied(frames[0], frames[-1], copy)[-1]
+            return history.files.chunks.reader(frames[0]).copy_records(frames[0], frames[-1], copy)[-1]
     except (FileError, FileNotFoundError):  # reading the states says what is wrong, and reports it
         file.unlink(missing_ok=True)
         return None

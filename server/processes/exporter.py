@@ -116,7 +116,7 @@ def _export(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
             progress=progress,
         )
     finally:
-        if history is not None and (faults := history.take_faults()):
+        if history is not None and (faults := history.pop_faults()):
             connection.send(Damaged(faults))
 
 

@@ -89,7 +89,7 @@ def _serve(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
             break
         if isinstance(message, AskedQuery):
             answer = renderer.answer(message)
-            if faults := renderer.take_faults():  # before a refused query is asked again
+            if faults := renderer.pop_faults():  # before a refused query is asked again
                 connection.send(Damaged(faults))
             connection.send(answer)
     logging.shutdown()
@@ -134,9 +134,9 @@ class Renderer:
         """Returns [N] part labels from all committed states."""
         return self._parts.of(self.reader, self.history, count)
 
-    def take_faults(self) -> dict[str, str]:
+    def pop_faults(self) -> dict[str, str]:
         """Returns files that were found damaged or gone since the last call, by name with the reason."""
-        return {} if self._history is None else self._history.take_faults()
+        return {} if self._history is None else self._history.pop_faults()
 
     def _note_missing(self, query: Query) -> None:
         """Notes frames that the service takes for committed and that are missing; it knows if they were deleted."""

@@ -42,7 +42,7 @@ def _replay(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
         for index in (spec.first, spec.base):
             history.gaussians(index)
     finally:
-        if faults := history.take_faults():
+        if faults := history.pop_faults():
             connection.send(Damaged(faults))
     from scas4d_core.replay import replay  # in this process only: the one that imports this module stays light
     from scas4d_core.warm_up import warm_up_elsewhere

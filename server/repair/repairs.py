@@ -39,7 +39,7 @@ def mend_at_start(history: History) -> list[str]:
     except OSError as error:  # states can be read all the same: a disk that takes nothing must not keep them away
         log.warning("what every frame needs cannot be mended: %s", error)
         return []
-    history.take_faults()  # of files that were just written again, or that `History.damaged` names
+    history.pop_faults()  # of files that were just written again, or that `History.damaged` names
     return [f"{reason}; it was written again from its copy" for reason in mended.values()]
 
 
@@ -72,7 +72,7 @@ def _mend(
     if index is not None:
         if index not in known and index not in history.damaged:
             return RepairOutcome.GONE, ""
-        if history.write_again(index):
+        if history.rewrite(index):
             return RepairOutcome.WRITTEN, fault
         return _written_in_part(history, files, index, message), fault
     checkpoint = checkpoint_of(name)

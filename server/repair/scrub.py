@@ -28,7 +28,7 @@ from scas4d_core.storage.frame_files import (
     checkpoint_of,
 )
 from scas4d_core.storage.history import FRAMES_KEPT
-from scas4d_core.storage.npz import verified
+from scas4d_core.storage.npz import iter_verified
 from server import counters
 from server.repair.repair_queue import DamageKind, DamageLog, RepairQueue
 from server.storage.definition import Definition, check_definition, write_definition
@@ -143,7 +143,7 @@ class Scrub:
         newest = checkpoint_file(ledger.committed[-1])
         if listed and not self._ledger.updating and not await asyncio.to_thread((folder / newest).exists):
             self._repair_queue.noticed({newest: f"{newest} is gone"})
-        await asyncio.to_thread(files.chunks.look)
+        await asyncio.to_thread(files.chunks.refresh)
         for index in reversed(committed):
             if index in files.chunks and not files.path(index).exists():
                 continue
@@ -165,13 +165,13 @@ class Scrub:
     def _expected(self, files: FrameFiles, index: int) -> bool:
         """True for a committed frame that has not gone to a chunk since it was listed."""
         if index in self._ledger.committed:
-            files.chunks.look()
+            files.chunks.refresh()
             return index not in files.chunks
         return False
 
     async def _state(self, path: Path, expected: Callable[[], bool]) -> None:
         """Scrubs one file; `expected`: returns whether a missing file is damage."""
-        fault = await self._read(verified(path))
+        fault = await self._read(iter_verified(path))
         if fault == GONE and await asyncio.to_thread(expected):
             self._repair_queue.noticed({path.name: f"{path.name} is gone"})
         elif fault is not None and fault != GONE:
@@ -179,7 +179,7 @@ class Scrub:
 
     async def _scrub_points(self) -> None:
         path = self._folder.points
-        fault = await self._read(verified(path))
+        fault = await self._read(iter_verified(path))
         if fault is None or fault == GONE:
             return
         used = "the first frame is committed, and needs it no more" if self._ledger.committed else "put it again"

@@ -11,7 +11,7 @@ from itertools import chain
 from client.wire import Budget, FrameReportModel, FrameState, SceneBudget, SceneEdit, SceneState, SceneStatus
 from scas4d_core.cameras import Camera
 from scas4d_core.errors import message_of
-from scas4d_core.first_frame.calibration.record import in_use
+from scas4d_core.first_frame.calibration.report import effective_rig
 from scas4d_core.rig_checks import RigError, check_start
 from server.background import Background
 from server.hub import Hub, Publisher
@@ -208,7 +208,7 @@ class Scene:
 
     def camera(self, name: str) -> Camera:
         """Returns a camera of the rig, as frame 0 refined it where that was asked for; see `camera_of`."""
-        return camera_of(in_use(self.rig, self.updates.first), name)
+        return camera_of(effective_rig(self.rig, self.updates.first), name)
 
     def committed_frame(self, index: int | None, field: str = "frame") -> int:
         """Returns the index, or the last one for None, once it is checked that its state can be read.

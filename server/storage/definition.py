@@ -15,7 +15,7 @@ from blake3 import blake3
 from client.wire import SceneCreate
 from scas4d_core.errors import message_of
 from scas4d_core.settings import Settings
-from scas4d_core.storage.npz import written_whole
+from scas4d_core.storage.npz import open_atomically
 from server.storage.events import JournalEvent, ReconstructionBegun, SceneCreated
 from server.storage.journal import replay
 from server.storage.layout import SceneFolder
@@ -102,7 +102,7 @@ def write_definition(folder: SceneFolder, definition: Definition) -> None:
     """Writes `scene.json`: the scene exists from here on."""
     text = json.dumps(definition.as_json(), indent=1)
     path = folder.definition
-    with written_whole(path, path.with_suffix(".part")) as file:
+    with open_atomically(path, path.with_suffix(".part")) as file:
         file.write(json.dumps({"blake3": _digest(text), "scene": json.loads(text)}, indent=1).encode())
 
 

@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 from pydantic import ValidationError
 
-from scas4d_core.storage.npz import sync_folder, written_whole
+from scas4d_core.storage.npz import open_atomically, sync_folder
 from server.problems import Problem
 from server.storage.disk import no_room
 from server.storage.events import JournalEvent, SceneCreated, WorkerDied, parse_event, why_no_event
@@ -111,7 +111,7 @@ def write_journal(path: Path, events: Iterator[JournalEvent]) -> int:
     """
     beside = path.with_name(f".{path.name}.part")
     size, batch = 0, []
-    with written_whole(path, beside) as file:
+    with open_atomically(path, beside) as file:
         for event in events:
             batch.append(event)
             if len(batch) == TOGETHER:

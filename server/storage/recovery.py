@@ -290,11 +290,11 @@ def _states(folder: Path, damage: list[str]) -> _States:
     except OtherFormatError as error:  # not damage: the folder stays as it is
         raise DefinitionError(str(error)) from None
     except HistoryError as error:
-        if folder.exists() and FrameFiles(folder).listed():
+        if folder.exists() and FrameFiles(folder).list_stamps():
             damage.append(f"the committed states cannot be read: {error}")
         return _States()
     damage.extend(f"frame {index}: its state is damaged: {reason}" for index, reason in history.damaged.items())
-    damage.extend(history.unlisted)
+    damage.extend(history.damaged_chunks)
     newest: dict[str, Any] = {}
     if history.indices:
         with contextlib.suppress(HistoryError):  # the worker loads the state, or says why it cannot

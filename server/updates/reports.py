@@ -80,4 +80,4 @@ class FrameReports:
 
     def _take_faults(self) -> dict[str, str]:
         with self._turn:
-            return {} if self._history is None else self._history.take_faults()
+            return {} if self._history is None else self._history.pop_faults()

@@ -12,7 +12,7 @@ import numpy as np
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.compact import CompactWriter, FileHeader
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.storage.chunks import chunk_file, note_of
+from scas4d_core.storage.chunks import chunk_file, make_note
 from scas4d_core.storage.compaction import CHUNK_FRAMES
 from scas4d_core.storage.history import History
 
@@ -54,6 +54,6 @@ def _fill(folder: Path, frames: int) -> None:
     for first in range(1, exact, CHUNK_FRAMES):
         with CompactWriter(folder / chunk_file(first), FileHeader(WorldFrame(np.zeros(3)))) as writer:
             for index in range(first, min(exact, first + CHUNK_FRAMES)):
-                writer.add(index, index / 30, state, note=note_of({}, history.log_at(0), writer.last_frame))
+                writer.add(index, index / 30, state, note=make_note({}, history.log_at(0), writer.last_frame))
     for index in range(exact, frames):
         history.append(index, index / 30, state, report={})

@@ -89,7 +89,7 @@ def _start(capture: Path, checkout: Path) -> Start:
             if source.points is not None:
                 client.put_points(scene, source.points)
             for index in range(2):
-                client.put_frame(scene, index, {name: source.encoded(index, name) for name in source.rig.names})
+                client.put_frame(scene, index, {name: source.encoded_image(index, name) for name in source.rig.names})
             committed = [0.0, 0.0]
             for index in range(2):
                 while (client.scene(scene).last_committed or 0) < index or client.scene(scene).committed == 0:

@@ -45,7 +45,7 @@ def first_frame_key(capture: Capture, settings: Settings) -> str:
     for camera in capture.full_rig.cameras:
         hasher.update(f"{camera.name} {camera.width} {camera.height}".encode())
         hasher.update(camera.intrinsics.tobytes() + camera.world_to_camera.tobytes())
-    for kind, files in (("image", capture.encoded), ("mask", capture.encoded_mask)):
+    for kind, files in (("image", capture.encoded_image), ("mask", capture.encoded_mask)):
         for name in sorted(capture.full_rig.names):
             data = files(0, name)
             hasher.update(b"" if data is None else f"{kind} {name} ".encode() + data)

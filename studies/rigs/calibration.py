@@ -18,9 +18,9 @@ from client.cli.evaluate import Report, recorded
 from client.cli.scores import Column, Row, digest, kept_row, markdown
 from client.importers.open_source import open_source
 from scas4d_core.cameras import Camera, Rig
-from scas4d_core.first_frame.calibration.matches import Matches, matches_by_appearance
-from scas4d_core.first_frame.calibration.refine import refined_rig
-from scas4d_core.first_frame.calibration.residuals import residuals
+from scas4d_core.first_frame.calibration.matches import Matches, match_by_appearance
+from scas4d_core.first_frame.calibration.refine import refine_rig
+from scas4d_core.first_frame.calibration.residuals import measure_residuals
 from scas4d_core.metrics.evaluation import measure_pictures
 from scas4d_core.posed_pictures import collect_views
 from scas4d_core.reconstruction import Reconstruction
@@ -98,9 +98,9 @@ def run(
     measured_rows, fitted = [], []
     for folder in captures:
         capture = open_source(folder)
-        matches = matches_by_appearance(collect_views(capture.rig, dict(capture.frame(0).images), {}))
+        matches = match_by_appearance(collect_views(capture.rig, dict(capture.frame(0).images), {}))
         measured_rows += _measured(capture.name, matches)
-        report(f"{capture.name}, as given: {refined_rig(capture.rig, matches).text}")
+        report(f"{capture.name}, as given: {refine_rig(capture.rig, matches).text}")
         for way, pixels in RIGS if fit and capture.test_rig is not None else ():
             settings = recorded(settings_of("scas4d", None, 0, list(changes)), ())
             path = (
@@ -126,7 +126,7 @@ def _row(known: Row, folder: Path, rig: Rig, changes: Sequence[str]) -> Row:
 
 def _measured(name: str, matches: Matches) -> list[Row]:
     """Residuals of the rig as it is given, and of each camera in turn with each fault."""
-    given, off = residuals(matches)
+    given, off = measure_residuals(matches)
     known = np.array([fit.pixels for fit in given.values()])
     rows: list[Row] = [_told_row(name, "none", known, f"{len(off)} of {len(known)}", 0)]
     if np.isnan(known).all():
@@ -135,7 +135,7 @@ def _measured(name: str, matches: Matches) -> list[Row]:
         own, named, others = [], 0, 0
         for camera in matches.cameras:
             cameras = [faulty(c, kind, size) if c is camera else c for c in matches.cameras]
-            fit, off = residuals(matches.seen_by(cameras))
+            fit, off = measure_residuals(matches.with_cameras(cameras))
             own.append(fit[camera.name].pixels)
             named += camera.name in off
             others += len(set(off) - {camera.name})

@@ -39,8 +39,8 @@ COLUMNS = (
     Column("cameras", "cameras", "d"),
     Column("pixels", "pixels"),
     Column("frames", "frames", "d"),
-    Column("first points", "way"),
-    Column("covered", "covered", ".2f"),
+    Column("first points", "method"),
+    Column("covered", "coverage", ".2f"),
     Column("Gaussians", "gaussians", ",d"),
     Column("frame 0 s", "seconds_first", ".0f"),
     Column("update s", "seconds_update", ".1f"),
@@ -123,8 +123,8 @@ def measured(
         "cameras": len(names),
         "pixels": " and ".join(sorted({f"{camera.width}×{camera.height}" for camera in truth.rig.cameras})),
         "frames": count,
-        "way": None if cloud is None else cloud.way,
-        "covered": None if cloud is None else cloud.covered,
+        "method": None if cloud is None else cloud.method,
+        "coverage": None if cloud is None else cloud.coverage,
         "gaussians": len(scene.history.first),
         "seconds_first": first,
         "shortened": list(scene.history.report(0).get("shortened") or []),
@@ -147,7 +147,7 @@ def measured(
         }
     if count > 1:
         row |= flow_consistency(scene, truth, count)
-    seen = truth if truth.test_rig is not None else truth.measured_on_training()
+    seen = truth if truth.test_rig is not None else truth.with_training_as_test()
     for index in sorted({0, count - 1}):
         save_comparisons(scene, seen, index, pictures)
     if (folder / "joints.npz").is_file():

@@ -62,7 +62,7 @@ def encoded_frames(capture: Capture, count: int) -> list[Files]:
 
 
 def _files(capture: Capture, index: int) -> Files:
-    images = {name: capture.encoded(index, name) for name in capture.full_rig.names}
+    images = {name: capture.encoded_image(index, name) for name in capture.full_rig.names}
     files = {name: capture.encoded_mask(index, name) for name in capture.full_rig.names}
     masks = {name: mask for name, mask in files.items() if mask is not None}
     return images, masks if len(masks) == len(images) else {}

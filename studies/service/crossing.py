@@ -93,7 +93,7 @@ def crossed(folder: Path, capture: Capture) -> dict[str, list[str]]:
             client.put_points(scene, capture.points)
 
             def put(index: int) -> None:
-                images = {name: capture.encoded(index, name) for name in capture.rig.names}
+                images = {name: capture.encoded_image(index, name) for name in capture.rig.names}
                 masks = {name: capture.encoded_mask(index, name) for name in capture.rig.names}
                 client.put_frame(scene, index, images, {name: mask for name, mask in masks.items() if mask})
 

@@ -61,9 +61,9 @@ class ChosenFrames:
         """Decodes a mask, [H, W]."""
         return self._reader.mask(self._frames[index], camera)
 
-    def encoded(self, index: int, camera: str) -> bytes:
+    def encoded_image(self, index: int, camera: str) -> bytes:
         """A picture as a file."""
-        return self._reader.encoded(self._frames[index], camera)
+        return self._reader.encoded_image(self._frames[index], camera)
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
         """A mask as a file; None where there is none."""

@@ -87,7 +87,7 @@ def test_degraded(sized, service):
         push(sdk, id, 0)
         push(sdk, id, 1, red=fakes.RAISES)
         opened(sized, service, id)
-        until(sized, "document.getElementById('trouble').innerText.includes('Frame 1 was set aside')")
+        until(sized, "document.getElementById('trouble').innerText.includes('Frame 1 failed')")
         shown(sized, frame="0")
         looked_at(sized, "degraded")
 

@@ -52,7 +52,7 @@ def test_a_loop_goes_back_and_forth_and_time_only_forward(capture):
     assert [sequence.place(index) for index in range(9)] == [1, 2, 3, 2, 1, 2, 3, 2, 1]
     times = [sequence.time(index) for index in range(9)]
     assert times == pytest.approx([index / 30 for index in range(9)])
-    assert sequence.files(3).images == {name: capture.encoded(2, name) for name in ("0", "1")}
+    assert sequence.files(3).images == {name: capture.encoded_image(2, name) for name in ("0", "1")}
     assert sequence.files(3).masks.keys() == {"0", "1"}
     sequence.close()
     once = Sequence(capture, start=1)

@@ -61,7 +61,7 @@ class DrawnReconstruction(fakes.FakeReconstruction):
         seconds = {"total": (0.8 + 0.1 * (frame.index % 3)) * self.iterations / fakes.ITERATIONS}
         more = {"cameras": fits, "psnr": 31.0 + np.sin(frame.index), "seconds": seconds, "alarms": alarms}
         if not self.history.indices and next(iter(frame.images.values()))[0, 0, 0] == fakes.GUESSED:
-            off = {"off": list(make_rig().names[:4]), "warnings": list(OFF)}
+            off = {"miscalibrated": list(make_rig().names[:4]), "warnings": list(OFF)}
             more["calibration"] = {"cameras": {}, **off, "refined": None}
         return super().commit(frame, dropped, {**(notes or {}), **more})
 

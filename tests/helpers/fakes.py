@@ -92,11 +92,11 @@ def refined(camera):
     """The calibration of frame 0 with one camera shifted."""
     pose = camera.world_to_camera.copy()
     pose[0, 3] += 0.25
-    figures = {"turned": 0.0, "moved": 0.25, "focal": 1.0, "before": 2.0, "after": None, "fixed": False}
+    figures = {"rotation_deg": 0.0, "translation": 0.25, "focal": 1.0, "before": 2.0, "after": None, "fixed": False}
     outcome = {"accepted": True, "text": "", "before": 2.0, "after": 0.5, "matches": 100}
     return {
         "cameras": {"c0": {"pixels": None, "matches": 3}},
-        "off": [camera.name],
+        "miscalibrated": [camera.name],
         "warnings": [f"the fake refined {camera.name}"],
         "refined": {**outcome, "cameras": {camera.name: {**figures, "pose": pose.tolist()}}},
     }
@@ -144,7 +144,7 @@ class FakeReconstruction:
                 faults.append(str(error))
         offset = np.array([STEP_M * first, 0, 0])
         points = history.gaussians(first).means - offset
-        return cls(points, history, Resumed(last, history.cut(last), faults, False))
+        return cls(points, history, Resumed(last, history.truncate(last), faults, False))
 
     def commit(self, frame, dropped, notes):
         count = len(self.points)
@@ -173,7 +173,7 @@ class FakeReconstruction:
             record["timing"]["c1"] = {"frames": 0.4, "error": 0.02, "off": True}
         if red == GUESSED and not known:
             record |= {
-                "cloud": {"way": "volume", "points": count, "covered": 0.0},
+                "cloud": {"method": "volume", "points": count, "coverage": 0.0},
                 "shortened": ["no stereo"],
                 "grey": ["c1"],
             }

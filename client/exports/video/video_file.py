@@ -64,11 +64,11 @@ def video_file(path: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
     ...     for level in range(3):
     ...         add(np.full((16, 32, 3), level, np.uint8))
     """
-    from scas4d_core.exports.whole_files import whole_file
+    from scas4d_core.exports.atomic_files import atomic_path
 
     suffix, av = check_suffix(path), pyav()
     path.parent.mkdir(parents=True, exist_ok=True)
-    with whole_file(path) as beside:
+    with atomic_path(path) as beside:
         encoder: _Encoder | None = None
         try:
             encoder = _Encoder(beside, suffix, fps)

@@ -1,6 +1,6 @@
 """Reads exports back as states, where they identify each Gaussian."""
 
 from scas4d_core.exports.reading.sources import open_export
-from scas4d_core.exports.reading.states import ReadStates
+from scas4d_core.exports.reading.states import ExportedStates
 
-__all__ = ["ReadStates", "open_export"]
+__all__ = ["ExportedStates", "open_export"]

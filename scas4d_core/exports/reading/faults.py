@@ -17,7 +17,7 @@ FAULTS = (
 
 
 @contextmanager
-def readable(name: str) -> Iterator[None]:
+def translate_read_errors(name: str) -> Iterator[None]:
     """Takes what goes wrong for a fault of the file.
 
     Args:
@@ -26,7 +26,7 @@ def readable(name: str) -> Iterator[None]:
     Raises:
         InputError: it cannot be read.
 
-    >>> with readable("a.glb"):
+    >>> with translate_read_errors("a.glb"):
     ...     {}["accessors"]
     Traceback (most recent call last):
     scas4d_core.errors.InputError: a.glb cannot be read (KeyError: 'accessors'); export it anew

@@ -92,7 +92,7 @@ class GltfFrame:
             if isinstance(error, InputError):
                 raise
             raise InputError(f"{self._name} holds no splats that can be read ({error})", REMEDY) from None
-        return cloud.turned().in_units(1 / self.metres_per_unit)
+        return cloud.half_turned().scaled(1 / self.metres_per_unit)
 
     def _values(self, number: int) -> NDArray[np.float64]:
         """[N, width] of an accessor."""

@@ -15,14 +15,14 @@ from plyfile import PlyData
 
 from scas4d_core.errors import InputError
 from scas4d_core.exports.cloud import Cloud
-from scas4d_core.exports.reading.faults import readable
+from scas4d_core.exports.reading.faults import translate_read_errors
 from scas4d_core.exports.reading.gltf import GltfFrame
-from scas4d_core.exports.reading.states import ReadStates, head_of
+from scas4d_core.exports.reading.states import ExportedStates, default_header
 from scas4d_core.exports.reading.usd import open_usd
 from scas4d_core.exports.usd import SUFFIXES as USD_SUFFIXES
 from scas4d_core.query.ply import SH_DEGREE_0, read_ply
 
-RATE = 30.0
+DEFAULT_FPS = 30.0
 """Frames per second of numbered files, which have no times."""
 NUMBERED = re.compile(r"frame_(\d+)(\.\w+)")
 LOST = {
@@ -36,7 +36,7 @@ LARGEST = 1 << 30
 """Bytes of a frame's file in a .zip: a small archive can hold more than the memory does."""
 
 
-def open_export(path: Path | str, frames_per_second: float = RATE) -> ReadStates:
+def open_export(path: Path | str, frames_per_second: float = DEFAULT_FPS) -> ExportedStates:
     """Opens an export as states; one frame is read at a time.
 
     Args:
@@ -56,11 +56,11 @@ def open_export(path: Path | str, frames_per_second: float = RATE) -> ReadStates
         raise InputError(f"{str(given)!r} cannot be read as states: {LOST[suffix]}", REMEDY)
     if not given.exists():
         raise InputError(f"there is no {str(given)!r}", REMEDY)
-    with readable(given.name):
+    with translate_read_errors(given.name):
         return _opened(given, suffix, frames_per_second)
 
 
-def _opened(given: Path, suffix: str, frames_per_second: float) -> ReadStates:
+def _opened(given: Path, suffix: str, frames_per_second: float) -> ExportedStates:
     if suffix in USD_SUFFIXES:
         return open_usd(given)
     if given.is_dir():
@@ -95,7 +95,7 @@ def _of_zip(path: Path) -> dict[str, Bytes]:
     return {name: partial(read, name) for name in sizes}
 
 
-def _numbered(source: str, files: dict[str, Bytes], rate: float) -> ReadStates:
+def _numbered(source: str, files: dict[str, Bytes], rate: float) -> ExportedStates:
     matches = {name: match for name in sorted(files) if (match := NUMBERED.fullmatch(name))}
     suffixes = sorted({match[2].lower() for match in matches.values()})
     if lost := [suffix for suffix in suffixes if suffix in LOST]:
@@ -111,7 +111,7 @@ def _numbered(source: str, files: dict[str, Bytes], rate: float) -> ReadStates:
     return _sequence(source, suffixes[0], dict(sorted(by_index.items())), rate)
 
 
-def _sequence(source: str, suffix: str, files: dict[int, tuple[str, Bytes]], rate: float) -> ReadStates:
+def _sequence(source: str, suffix: str, files: dict[int, tuple[str, Bytes]], rate: float) -> ExportedStates:
     if not 0 < rate < float("inf"):
         raise InputError(f"frames_per_second is {rate!r}", "give a positive number")
     frames, named = list(files), list(files.values())
@@ -136,7 +136,7 @@ def _sequence(source: str, suffix: str, files: dict[int, tuple[str, Bytes]], rat
 
     if deep:
         remarks.append("gloss is read as the mean over all directions")
-    return ReadStates(frames, [index / rate for index in frames], cloud, head_of(metres, rate), {}, remarks)
+    return ExportedStates(frames, [index / rate for index in frames], cloud, default_header(metres, rate), {}, remarks)
 
 
 class PlyRows:

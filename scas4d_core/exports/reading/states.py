@@ -19,7 +19,7 @@ from scas4d_core.cameras import WorldFrame
 from scas4d_core.compact import FileHeader
 from scas4d_core.errors import InputError
 from scas4d_core.exports.cloud import Cloud
-from scas4d_core.exports.reading.faults import readable
+from scas4d_core.exports.reading.faults import translate_read_errors
 from scas4d_core.gaussians import Gaussians
 
 Float = NDArray[np.float64]
@@ -30,7 +30,7 @@ STANDS = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class _Known:
+class _GaussianTable:
     """What the frames hold of each Gaussian, by row: ids, moving, opacities [N], and the first axes [N, 4]."""
 
     ids: Int
@@ -40,7 +40,7 @@ class _Known:
 
 
 @dataclass(eq=False)
-class ReadStates:
+class ExportedStates:
     """A sequence of clouds as states. One frame is in memory at a time, and what is known of each Gaussian.
 
     Attributes:
@@ -54,7 +54,7 @@ class ReadStates:
     >>> first = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1)
     >>> world = WorldFrame(np.zeros(3))
     >>> clouds = [cloud_of(state, world) for state in (first.rows([0]), first, first.rows([1]))]
-    >>> read = ReadStates([3, 4, 5], [0.0, 0.1, 0.2], clouds.__getitem__, FileHeader(world))
+    >>> read = ExportedStates([3, 4, 5], [0.0, 0.1, 0.2], clouds.__getitem__, FileHeader(world))
     >>> [(index, state.ids.tolist(), state.present.tolist()) for index, _, state in read.states()]
     [(3, [0], [True]), (4, [0, 1], [True, True]), (5, [0, 1], [False, True])]
     """
@@ -66,10 +66,10 @@ class ReadStates:
     part_of: dict[int, int] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
     damage: str | None = None
-    _known: _Known | None = None
+    _known: _GaussianTable | None = None
 
     @property
-    def known(self) -> _Known:
+    def known(self) -> _GaussianTable:
         """The frames are read once for it."""
         if self._known is None:
             self._known = self._survey()
@@ -96,7 +96,7 @@ class ReadStates:
         for place, (index, time) in enumerate(zip(self.frames, self.times, strict=True)):
             if high is not None and index > high:
                 return
-            with readable(f"frame {index}"):
+            with translate_read_errors(f"frame {index}"):
                 cloud = self.cloud(place)
             rows = np.array([row_of[id] for id in cloud.ids.tolist()], np.intp)
             of = cloud.splats
@@ -113,11 +113,11 @@ class ReadStates:
             if index >= low:
                 yield index, time, _state(known, born, retired, means, factors, rotations, colours)
 
-    def _survey(self) -> _Known:
+    def _survey(self) -> _GaussianTable:
         ids: dict[int, int] = {}
         first, turns, opacities, moving = (np.zeros((0, n)) for n in (3, 4, 1, 1))
         for place in range(len(self.frames)):
-            with readable(f"frame {self.frames[place]}"):
+            with translate_read_errors(f"frame {self.frames[place]}"):
                 cloud = self.cloud(place)
             given = cloud.ids.tolist()
             if len(set(given)) < len(given):
@@ -136,13 +136,13 @@ class ReadStates:
         extent = float(np.ptp(first, axis=0).max(initial=0)) if len(first) else 0.0
         far = float(np.abs(first).max(initial=0))  # a difference below float32's resolution is no motion
         least = max(STANDS * extent, 4 * float(np.finfo(np.float32).eps) * far)
-        return _Known(
+        return _GaussianTable(
             np.fromiter(ids, np.int64, len(ids)), moving[:, 0] > least, opacities[:, 0].astype(np.float32), turns
         )
 
 
 def _state(
-    known: _Known,
+    known: _GaussianTable,
     born: int,
     retired: NDArray[np.bool_],
     means: NDArray[np.float32],
@@ -164,10 +164,10 @@ def _state(
     )
 
 
-def head_of(metres_per_unit: float, frames_per_second: float | None) -> FileHeader:
+def default_header(metres_per_unit: float, frames_per_second: float | None) -> FileHeader:
     """The head of states in the user's world, in metres.
 
-    >>> head_of(0.01, 30.0).world.to_inside(np.array([[100.0, 0, 0]]))
+    >>> default_header(0.01, 30.0).world.to_inside(np.array([[100.0, 0, 0]]))
     array([[1., 0., 0.]])
     """
     return FileHeader(WorldFrame(np.zeros(3), metres_per_unit=metres_per_unit), frames_per_second=frames_per_second)

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.errors import InputError, message_of
+from scas4d_core.exports.atomic_files import import_optional
 from scas4d_core.exports.cloud import Cloud
-from scas4d_core.exports.reading.states import ReadStates, head_of
-from scas4d_core.exports.whole_files import package
+from scas4d_core.exports.reading.states import ExportedStates, default_header
 from scas4d_core.query.ply import SH_DEGREE_0, Splats
 
 GAUSSIANS = "/World/Gaussians"
@@ -19,14 +19,14 @@ PARTS = "/World/Parts"
 REMEDY = "give a file of scas4d export --format usd"
 
 
-def open_usd(path: Path) -> ReadStates:
+def open_usd(path: Path) -> ExportedStates:
     """Opens a file; a frame is read when it is asked for.
 
     Raises:
         InputError: usd-core is missing, it is no such file, or has no ids.
     """
-    usd, geometry, volume = (package(f"pxr.{name}", "usd") for name in ("Usd", "UsdGeom", "UsdVol"))
-    failure = package("pxr.Tf", "usd").ErrorException
+    usd, geometry, volume = (import_optional(f"pxr.{name}", "usd") for name in ("Usd", "UsdGeom", "UsdVol"))
+    failure = import_optional("pxr.Tf", "usd").ErrorException
     try:
         stage = usd.Stage.Open(str(path))
     except failure as error:
@@ -53,11 +53,11 @@ def open_usd(path: Path) -> ReadStates:
     parts = primvars.GetPrimvar("scas4d:part").Get() if primvars.HasPrimvar("scas4d:part") else None
     part_of = {} if parts is None else dict(zip(reader.ids.tolist(), np.array(parts).tolist(), strict=True))
     unit = float(geometry.GetStageMetersPerUnit(stage))
-    return ReadStates(
+    return ExportedStates(
         frames,
         [begin + code / rate for code in codes],
         lambda place: reader.cloud(codes[place]),
-        head_of(unit, rate),
+        default_header(unit, rate),
         part_of,
         ["gloss is read as the mean over all directions"] if reader.degree else [],
     )
@@ -98,4 +98,4 @@ class _Reader:
         colours = 0.5 + SH_DEGREE_0 * harmonics[:, 0]
         there = opacities > 0
         cloud = Cloud(Splats(means, scales, quaternions, opacities, colours), harmonics, self.ids)
-        return cloud.turned().rows(there)
+        return cloud.half_turned().rows(there)

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Camera
 from scas4d_core.first_frame.calibration.matches import Matches
-from scas4d_core.first_frame.points.triangulation import grouped, triangulator
+from scas4d_core.first_frame.points.triangulation import group_by_track, triangulator
 from scas4d_core.posed_pictures import Float
 
 BOUNDS = (16.0, 6.0, 2.0)
@@ -27,33 +27,35 @@ BOUNDS = (16.0, 6.0, 2.0)
 leaves out what is no match."""
 NOISE = 0.5
 """Pixels, scale of the Cauchy loss of features."""
-TRUST = 0.5
+MIN_PRIOR_SCALE = 0.5
 """Pixels, least scale of the Cauchy loss that draws a camera to its calibration: turns, shifts and the focal length are
 weighed by how far they move what it sees. After the first round it is the rig's median, where that is larger."""
 MIN_ANGLE_DEG = 1.0
 """Rays that meet under less say little about depth."""
-MOST_STEPS = 40
+MAX_STEPS = 40
 """Of Levenberg-Marquardt in a round."""
-ENOUGH_GAIN = 1e-5
+MIN_RELATIVE_GAIN = 1e-5
 """A step that lowers the loss by a smaller share is the last one."""
 
 Track = tuple[NDArray[np.intp], Float]
 """Indices of cameras [n], each once, and the pixel [n, 2] in each."""
 
 
-def tracks_of(matches: Matches) -> list[Track]:
+def build_tracks(matches: Matches) -> list[Track]:
     """Features that match from camera to camera, a track each; those with two features in one picture are left out."""
     label, offsets = matches.tracks()
     owner = np.repeat(np.arange(len(matches.pixels)), np.diff(offsets))
     pixels = np.concatenate(matches.pixels) if len(owner) else np.zeros((0, 2))
     return [
         (owner[group], pixels[group])
-        for group in grouped(label)
+        for group in group_by_track(label)
         if len(group) > 1 and len(np.unique(owner[group])) == len(group)
     ]
 
 
-def adjusted(cameras: Sequence[Camera], tracks: Sequence[Track], *, focal: bool = False, seed: int = 0) -> list[Camera]:
+def bundle_adjust(
+    cameras: Sequence[Camera], tracks: Sequence[Track], *, focal: bool = False, seed: int = 0
+) -> list[Camera]:
     """The cameras brought to agree with the tracks, in the world as calibrated; those that see none stay as they are.
 
     Args:
@@ -62,13 +64,13 @@ def adjusted(cameras: Sequence[Camera], tracks: Sequence[Track], *, focal: bool 
         focal: each camera's focal length is adjusted too; the ratio of fx and fy stays.
         seed: of RANSAC.
     """
-    current, trust = list(cameras), TRUST
+    current, trust = list(cameras), MIN_PRIOR_SCALE
     for bound in BOUNDS:
-        seen, points = _observed(current, tracks, bound, seed)
+        seen, points = _triangulate_tracks(current, tracks, bound, seed)
         if len(points):
-            bundle = _Bundle(cameras, seen, focal, trust)
-            current = bundle.solved(current, points)
-            trust = max(TRUST, bundle.usual_pull(current, points))
+            bundle = _BundleAdjustment(cameras, seen, focal, trust)
+            current = bundle.solve(current, points)
+            trust = max(MIN_PRIOR_SCALE, bundle.median_prior_distance(current, points))
     return current
 
 
@@ -81,7 +83,7 @@ class Observations:
     pixel: Float
 
 
-def _observed(
+def _triangulate_tracks(
     cameras: Sequence[Camera], tracks: Sequence[Track], bound: float, seed: int
 ) -> tuple[Observations, Float]:
     """The right features of each track that gives a point, and the points [P, 3] (LO-RANSAC, pycolmap)."""
@@ -102,7 +104,7 @@ def _observed(
     return seen, np.array(points).reshape(-1, 3)
 
 
-class _Bundle:
+class _BundleAdjustment:
     """Levenberg-Marquardt over poses and points; the points are eliminated (Schur complement)."""
 
     def __init__(self, given: Sequence[Camera], seen: Observations, focal: bool, trust: float) -> None:
@@ -110,26 +112,26 @@ class _Bundle:
         self.size = 7 if focal else 6
         self.count = len(given)
 
-    def solved(self, cameras: list[Camera], points: Float) -> list[Camera]:
+    def solve(self, cameras: list[Camera], points: Float) -> list[Camera]:
         """The cameras after the last step that lowers the loss."""
         depth = self._depths(cameras, points)
         damping, loss = 1e-3, self._loss(cameras, points, depth)
-        for _ in range(MOST_STEPS):
+        for _ in range(MAX_STEPS):
             moves, shifts = self._step(cameras, points, depth, damping)
-            trial, places = [_moved(c, move) for c, move in zip(cameras, moves, strict=True)], points + shifts
+            trial, places = [_apply_step(c, move) for c, move in zip(cameras, moves, strict=True)], points + shifts
             trial_loss = self._loss(trial, places, depth)
             if trial_loss < loss:
                 gain, cameras, points, loss = (loss - trial_loss) / loss, trial, places, trial_loss
                 damping = max(damping / 5, 1e-9)
-                if gain < ENOUGH_GAIN:
+                if gain < MIN_RELATIVE_GAIN:
                     break
             elif (damping := damping * 10) > 1e6:
                 break
         return cameras
 
-    def usual_pull(self, cameras: list[Camera], points: Float) -> float:
+    def median_prior_distance(self, cameras: list[Camera], points: Float) -> float:
         """Median distance of the cameras that see something from their calibration, pixels."""
-        pulls = np.linalg.norm(self._pulls(cameras, self._depths(cameras, points))[0], axis=1)
+        pulls = np.linalg.norm(self._prior_residuals(cameras, self._depths(cameras, points))[0], axis=1)
         return float(np.median(pulls[np.unique(self.seen.camera)]))
 
     def _depths(self, cameras: Sequence[Camera], points: Float) -> Float:
@@ -159,7 +161,7 @@ class _Bundle:
         columns = [by_place @ -_cross(place), by_place, *([offset[:, :, None]] if self.focal else [])]
         return miss, np.concatenate(columns, axis=2), by_place @ rotation
 
-    def _pulls(self, cameras: Sequence[Camera], depth: Float) -> tuple[Float, Float]:
+    def _prior_residuals(self, cameras: Sequence[Camera], depth: Float) -> tuple[Float, Float]:
         """Distances of each camera from its calibration [V, 6 or 7] in pixels, and the pixels of a unit of each."""
         rows, units = np.zeros((self.count, self.size)), np.zeros((self.count, self.size))
         for index, (before, now) in enumerate(zip(self.given, cameras, strict=True)):
@@ -173,7 +175,7 @@ class _Bundle:
 
     def _loss(self, cameras: Sequence[Camera], points: Float, depth: Float) -> float:
         miss = (self._residuals(cameras, points)[0] ** 2).sum(1) / NOISE**2
-        pull = (self._pulls(cameras, depth)[0] ** 2).sum(1) / self.trust**2
+        pull = (self._prior_residuals(cameras, depth)[0] ** 2).sum(1) / self.trust**2
         return float(np.log1p(miss).sum() + np.log1p(pull).sum())
 
     def _step(self, cameras: Sequence[Camera], points: Float, depth: Float, damping: float) -> tuple[Float, Float]:
@@ -186,7 +188,7 @@ class _Bundle:
         slope = np.zeros((self.count, size))
         np.add.at(blocks, seen.camera, np.einsum("mki,mkj->mij", heavy, by_camera))
         np.add.at(slope, seen.camera, np.einsum("mki,mk->mi", heavy, miss))
-        pull, units = self._pulls(cameras, depth)
+        pull, units = self._prior_residuals(cameras, depth)
         trust = (1 / (1 + (pull**2).sum(1) / self.trust**2) / self.trust**2)[:, None]
         diagonal = np.arange(size)
         blocks[:, diagonal, diagonal] += trust * units**2
@@ -228,7 +230,7 @@ def _cross(vectors: Float) -> Float:
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
 
 
-def _moved(camera: Camera, move: Float) -> Camera:
+def _apply_step(camera: Camera, move: Float) -> Camera:
     """The camera turned about its axes, shifted along them, and its focal length multiplied by e to the last number."""
     turn = Rotation.from_rotvec(move[:3]).as_matrix()
     pose, intrinsics = np.eye(4), camera.intrinsics.copy()

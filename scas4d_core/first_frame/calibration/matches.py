@@ -16,9 +16,9 @@ from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures.images import resize_area
 from scas4d_core.first_frame.points.triangulation import (
     descriptor_distances,
-    features,
+    extract_features,
     fundamental_matrix,
-    joined,
+    label_tracks,
     mutual_best,
 )
 from scas4d_core.posed_pictures import Float, PosedPicture
@@ -33,7 +33,7 @@ which as many match. Where the pictures are of one size they are some of those t
 twice, at up to 1.0 s of the processor for `robot`, 3.0 s for `basketball`."""
 NEIGHBOURS = 6
 """Cameras that look most like a camera and are matched with it: pictures taken farther apart hardly match."""
-EVERY = 5
+HELD_OUT_EVERY = 5
 """Every so many tracks are held out, to test with."""
 
 Pair = tuple[int, int]
@@ -54,7 +54,7 @@ class Matches:
     pixels: list[Float]
     pairs: dict[Pair, NDArray[np.intp]]
 
-    def seen_by(self, cameras: Sequence[Camera]) -> Matches:
+    def with_cameras(self, cameras: Sequence[Camera]) -> Matches:
         """The same features, of the rig in another calibration; cameras are of the size of these."""
         return replace(self, cameras=tuple(cameras))
 
@@ -68,7 +68,7 @@ class Matches:
         offsets = np.concatenate([[0], np.cumsum([len(uv) for uv in self.pixels])])
         edges = [rows + offsets[list(pair)] for pair, rows in self.pairs.items()]
         all_edges = np.concatenate(edges) if edges else np.zeros((0, 2), np.intp)
-        return joined(all_edges, int(offsets[-1])), offsets
+        return label_tracks(all_edges, int(offsets[-1])), offsets
 
     def split(self) -> tuple[Matches, Matches]:
         """Those to learn from, and those held out: no feature is in both."""
@@ -78,29 +78,29 @@ class Matches:
             [np.zeros(0, np.intp), *(track[r + offsets[list(p)]][:, 0] for p, r in self.pairs.items())]
         )
         order = np.unique(matched)
-        held = {pair: np.searchsorted(order, track[rows[:, 0] + offsets[pair[0]]]) % EVERY == 0
+        held = {pair: np.searchsorted(order, track[rows[:, 0] + offsets[pair[0]]]) % HELD_OUT_EVERY == 0
                 for pair, rows in self.pairs.items()}  # fmt: skip
         learnt = {pair: rows[~held[pair]] for pair, rows in self.pairs.items()}
         return replace(self, pairs=learnt), replace(self, pairs={p: rows[held[p]] for p, rows in self.pairs.items()})
 
 
-def matches_by_appearance(views: Sequence[PosedPicture]) -> Matches:
+def match_by_appearance(views: Sequence[PosedPicture]) -> Matches:
     """Matches SIFT features of each camera with those of its neighbours in direction and place.
 
     Args:
         views: of one moment, of two cameras or more.
     """
-    small = [_reduced(view) for view in views]
-    feature_sets = features(small, most=FEATURES, contrast=CONTRAST)
+    small = [_downscale(view) for view in views]
+    feature_sets = extract_features(small, most=FEATURES, contrast=CONTRAST)
     pairs = {
-        (a, b): _mutual(feature_sets[a][1], feature_sets[b][1])
-        for a, b in neighbouring(Rig(tuple(view.camera for view in small)))
+        (a, b): _mutual_matches(feature_sets[a][1], feature_sets[b][1])
+        for a, b in neighbour_pairs(Rig(tuple(view.camera for view in small)))
     }
     scale = np.array([view.camera.width / less.camera.width for view, less in zip(views, small, strict=True)])
     return Matches(tuple(view.camera for view in small), scale, [uv for uv, _ in feature_sets], pairs)
 
 
-def _reduced(view: PosedPicture) -> PosedPicture:
+def _downscale(view: PosedPicture) -> PosedPicture:
     longest = max(view.camera.width, view.camera.height)
     if longest <= LONGEST_SIDE:
         return view
@@ -108,7 +108,7 @@ def _reduced(view: PosedPicture) -> PosedPicture:
     return PosedPicture(camera, resize_area(view.image, (camera.width, camera.height)))
 
 
-def neighbouring(rig: Rig) -> list[Pair]:
+def neighbour_pairs(rig: Rig) -> list[Pair]:
     """Pairs of cameras worth matching: each with the ``NEIGHBOURS`` that are nearest in direction and place.
 
     >>> lens = [[100, 0, 32], [0, 100, 24], [0, 0, 1]]
@@ -116,7 +116,7 @@ def neighbouring(rig: Rig) -> list[Pair]:
     >>> for i, pose in enumerate(row):
     ...     pose[0, 3] = -i
     >>> cameras = tuple(Camera(str(i), lens, pose, 64, 48) for i, pose in enumerate(row))
-    >>> pairs = neighbouring(Rig(cameras))
+    >>> pairs = neighbour_pairs(Rig(cameras))
     >>> (0, 6) in pairs, (0, 7) in pairs
     (True, False)
     """
@@ -133,7 +133,7 @@ def neighbouring(rig: Rig) -> list[Pair]:
     return sorted(chosen)
 
 
-def _mutual(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.intp]:
+def _mutual_matches(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.intp]:
     """[M, 2] rows of two sets of unit descriptors that are each other's nearest, and much nearer than any other."""
     if min(len(first), len(second)) < 2:
         return np.zeros((0, 2), np.intp)

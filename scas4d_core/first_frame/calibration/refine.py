@@ -11,26 +11,26 @@ from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures.frame import Frame
-from scas4d_core.first_frame.calibration.bundle import NOISE, adjusted, tracks_of
-from scas4d_core.first_frame.calibration.matches import Matches, epipolar_distances, matches_by_appearance
-from scas4d_core.first_frame.calibration.record import Calibration, CameraResidual, RefinedCamera, Refinement
-from scas4d_core.first_frame.calibration.residuals import FEWEST, NEAR, OFF, residuals
+from scas4d_core.first_frame.calibration.bundle import NOISE, build_tracks, bundle_adjust
+from scas4d_core.first_frame.calibration.matches import Matches, epipolar_distances, match_by_appearance
+from scas4d_core.first_frame.calibration.report import CalibrationReport, CameraResidual, RefinedCamera, Refinement
+from scas4d_core.first_frame.calibration.residuals import MAX_RESIDUAL, MIN_INLIERS, NEAR, measure_residuals
 from scas4d_core.posed_pictures import Float, InitialPointsError, collect_views
 from scas4d_core.progress import Progress
 from scas4d_core.settings import StaticSettings
 
-LEAST_CAMERAS = 3
+MIN_CAMERAS = 3
 """Cameras at least: of two, either could be off."""
-SURE = 2.0
+STANDARD_ERRORS = 2.0
 """Standard errors by which the loss of matches held out has to fall."""
-FEWEST_HELD = 20
+MIN_HELD_OUT = 20
 """Matches held out, of fewer of which a standard error says little."""
 
 
-def first_calibration(
+def calibrate_first_frame(
     rig: Rig, frame: Frame, settings: StaticSettings, on_progress: Callable[[Progress], None], *, measured: bool
-) -> Calibration | None:
-    """``checked_calibration`` of frame 0, refined where the settings ask for it.
+) -> CalibrationReport | None:
+    """``check_calibration`` of frame 0, refined where the settings ask for it.
 
     Args:
         rig: as given, at the size of the frame's pictures. measured: also where no refining is asked for; else None.
@@ -38,12 +38,12 @@ def first_calibration(
     if not (measured or settings.refine_calibration):
         return None
     on_progress(Progress("calibration", 0, 1))
-    calibration = checked_calibration(rig, frame.images, refine=settings.refine_calibration)
+    calibration = check_calibration(rig, frame.images, refine=settings.refine_calibration)
     on_progress(Progress("calibration", 1, 1))
     return calibration
 
 
-def checked_calibration(rig: Rig, images: Mapping[str, NDArray[np.uint8]], *, refine: bool) -> Calibration | None:
+def check_calibration(rig: Rig, images: Mapping[str, NDArray[np.uint8]], *, refine: bool) -> CalibrationReport | None:
     """Measures how far the pictures are off the calibration; None where fewer than two cameras can be compared.
 
     Args:
@@ -52,28 +52,28 @@ def checked_calibration(rig: Rig, images: Mapping[str, NDArray[np.uint8]], *, re
 
     >>> from scas4d_core.captures import open_capture
     >>> capture = open_capture("samples/robot")
-    >>> found = checked_calibration(capture.rig, capture.frame(0).images, refine=False)
-    >>> sorted(found.cameras) == sorted(capture.rig.names), found.off, found.refined
+    >>> found = check_calibration(capture.rig, capture.frame(0).images, refine=False)
+    >>> sorted(found.cameras) == sorted(capture.rig.names), found.miscalibrated, found.refined
     (True, [], None)
     """
     try:
         views = collect_views(rig, images, {})
     except InitialPointsError:  # one picture, or of another size, which is refused in words elsewhere
         return None
-    matches = matches_by_appearance(views)
-    cameras, off = residuals(matches)
-    given = Calibration(cameras, off, _sentences(cameras, off, matches))
+    matches = match_by_appearance(views)
+    cameras, off = measure_residuals(matches)
+    given = CalibrationReport(cameras, off, _describe_faults(cameras, off, matches))
     if not refine:
         return given
-    refined = refined_rig(rig, matches)
+    refined = refine_rig(rig, matches)
     if not refined.accepted:
         return replace(given, refined=refined, warnings=[*given.warnings, refined.text])
-    posed = [refined.posed(camera) for camera in matches.cameras]
-    left = matches.seen_by(posed)
-    return replace(given, refined=refined, warnings=[refined.text, *_sentences(*residuals(left), left)])
+    posed = [refined.apply_to(camera) for camera in matches.cameras]
+    left = matches.with_cameras(posed)
+    return replace(given, refined=refined, warnings=[refined.text, *_describe_faults(*measure_residuals(left), left)])
 
 
-def _sentences(cameras: Mapping[str, CameraResidual], off: Sequence[str], matches: Matches) -> list[str]:
+def _describe_faults(cameras: Mapping[str, CameraResidual], off: Sequence[str], matches: Matches) -> list[str]:
     """Sentences on what is off, for people."""
     known = {name: fit.pixels for name, fit in cameras.items() if np.isfinite(fit.pixels)}
     if not known:
@@ -82,7 +82,7 @@ def _sentences(cameras: Mapping[str, CameraResidual], off: Sequence[str], matche
     remedy = "static.refine_calibration has it refined from the pictures of frame 0"
     inside = [known[camera.name] / scale for camera, scale in zip(matches.cameras, matches.scale, strict=True)
               if camera.name in known]  # fmt: skip
-    if float(np.median(inside)) > OFF:
+    if float(np.median(inside)) > MAX_RESIDUAL:
         return [
             f"the calibration seems to be off: matching features miss their epipolar lines by {usual:.1f} px, median "
             f"over {len(known)} cameras; {remedy}"
@@ -94,42 +94,42 @@ def _sentences(cameras: Mapping[str, CameraResidual], off: Sequence[str], matche
     ]
 
 
-def refined_rig(rig: Rig, matches: Matches) -> Refinement:
+def refine_rig(rig: Rig, matches: Matches) -> Refinement:
     """Poses of a rig that agree better with the pictures, if matches that were held out say so.
 
     Args:
         rig: as given, of the user's world. matches: of its cameras' pictures of one moment.
     """
     learnt, held = matches.split()
-    fits = list(residuals(matches)[0].values())
+    fits = list(measure_residuals(matches)[0].values())
     counts = [camera_fit.matches for camera_fit in fits]
     fixed = [
-        i for i, camera_fit in enumerate(fits) if camera_fit.matches < FEWEST or not np.isfinite(camera_fit.pixels)
+        i for i, camera_fit in enumerate(fits) if camera_fit.matches < MIN_INLIERS or not np.isfinite(camera_fit.pixels)
     ]
-    if len(counts) - len(fixed) < LEAST_CAMERAS:
-        return _kept(f"only {len(counts) - len(fixed)} cameras have {FEWEST} matches or more")
+    if len(counts) - len(fixed) < MIN_CAMERAS:
+        return _not_refined(f"only {len(counts) - len(fixed)} cameras have {MIN_INLIERS} matches or more")
     before = list(matches.cameras)
-    tracks = tracks_of(learnt.without(fixed))
-    best = _Test.of(held, before, adjusted(before, tracks))
-    if len(best.losses) < FEWEST_HELD:
-        return _kept(f"only {len(best.losses)} matches could be held out to test it")
-    if not best.better:
-        return _kept(
+    tracks = build_tracks(learnt.without(fixed))
+    best = _HeldOutTest.of(held, before, bundle_adjust(before, tracks))
+    if len(best.losses) < MIN_HELD_OUT:
+        return _not_refined(f"only {len(best.losses)} matches could be held out to test it")
+    if not best.is_better:
+        return _not_refined(
             f"{len(best.losses)} matches that were held out are not met better: {best.before:.2f} px before, "
             f"{best.after:.2f} px after"
         )
-    longer = _Test.of(held, best.cameras, adjusted(before, tracks, focal=True))
-    after = longer.cameras if longer.better else best.cameras
-    best = _Test.of(held, before, after)
-    return _refinement(rig, matches, best, fixed, focal=longer.better)
+    longer = _HeldOutTest.of(held, best.cameras, bundle_adjust(before, tracks, focal=True))
+    after = longer.cameras if longer.is_better else best.cameras
+    best = _HeldOutTest.of(held, before, after)
+    return _refinement(rig, matches, best, fixed, focal=longer.is_better)
 
 
-def _kept(reason: str) -> Refinement:
+def _not_refined(reason: str) -> Refinement:
     return Refinement(False, f"the calibration was not refined: {reason}")
 
 
 @dataclass(frozen=True, eq=False)
-class _Test:
+class _HeldOutTest:
     """A rig against another one on matches that neither has learnt from.
 
     Attributes:
@@ -142,11 +142,11 @@ class _Test:
     after: float
 
     @classmethod
-    def of(cls, held: Matches, given: Sequence[Camera], found: list[Camera]) -> _Test:
+    def of(cls, held: Matches, given: Sequence[Camera], found: list[Camera]) -> _HeldOutTest:
         """Matches that are far off in both are wrong, and say nothing."""
         pairs = list(held.pairs)
         before, after = (
-            np.concatenate([np.zeros(0), *(epipolar_distances(held.seen_by(rig), pair) for pair in pairs)])
+            np.concatenate([np.zeros(0), *(epipolar_distances(held.with_cameras(rig), pair) for pair in pairs)])
             for rig in (given, found)
         )
         near = np.minimum(before, after) < NEAR
@@ -155,28 +155,31 @@ class _Test:
         return cls(found, losses[0] - losses[1], *typical)
 
     @property
-    def better(self) -> bool:
+    def is_better(self) -> bool:
         """True where the loss has fallen by more than chance."""
         count = len(self.losses)
-        return count >= FEWEST_HELD and float(self.losses.mean()) > SURE * float(self.losses.std()) / count**0.5
+        return (
+            count >= MIN_HELD_OUT
+            and float(self.losses.mean()) > STANDARD_ERRORS * float(self.losses.std()) / count**0.5
+        )
 
 
-def _refinement(rig: Rig, matches: Matches, test: _Test, fixed: Sequence[int], *, focal: bool) -> Refinement:
-    before, after = residuals(matches)[0], residuals(matches.seen_by(test.cameras))[0]
+def _refinement(rig: Rig, matches: Matches, test: _HeldOutTest, fixed: Sequence[int], *, focal: bool) -> Refinement:
+    before, after = measure_residuals(matches)[0], measure_residuals(matches.with_cameras(test.cameras))[0]
     cameras = {}
     for index, (given, fitted) in enumerate(zip(matches.cameras, test.cameras, strict=True)):
         name = given.name
-        turned, moved = _moved(given, fitted)
+        turned, moved = _pose_change(given, fitted)
         factor = fitted.fx / given.fx
         cameras[name] = RefinedCamera(
             turned, moved, factor, before[name].pixels, after[name].pixels, index in fixed,
             pose=fitted.world_to_camera.tolist() if index not in fixed else rig[name].world_to_camera.tolist(),
         )  # fmt: skip
-    far = max(cameras, key=lambda name: cameras[name].turned)
+    far = max(cameras, key=lambda name: cameras[name].rotation_deg)
     text = (
         f"the calibration was refined, as asked: {len(test.losses)} matches held out miss their epipolar lines "
         f"by {test.after:.2f} px in place of {test.before:.2f}; camera {far!r} was turned most, by "
-        f"{cameras[far].turned:.2f}°: {cameras[far].after:.2f} px in place of {cameras[far].before:.2f}"
+        f"{cameras[far].rotation_deg:.2f}°: {cameras[far].after:.2f} px in place of {cameras[far].before:.2f}"
     )
     if focal:
         text += "; their focal lengths were adjusted too"
@@ -185,7 +188,7 @@ def _refinement(rig: Rig, matches: Matches, test: _Test, fixed: Sequence[int], *
     return Refinement(True, text, test.before, test.after, len(test.losses), cameras)
 
 
-def _moved(given: Camera, found: Camera) -> tuple[float, float]:
+def _pose_change(given: Camera, found: Camera) -> tuple[float, float]:
     """Degrees by which a camera was turned, and the distance by which its centre was moved."""
     turn = Rotation.from_matrix(found.rotation @ given.rotation.T).magnitude()
     return float(np.degrees(turn)), float(np.linalg.norm(found.centre - given.centre))

@@ -9,51 +9,51 @@ from typing import NamedTuple
 import numpy as np
 
 from scas4d_core.first_frame.calibration.matches import Matches, Pair, epipolar_distances
-from scas4d_core.first_frame.calibration.record import CameraResidual
+from scas4d_core.first_frame.calibration.report import CameraResidual
 from scas4d_core.posed_pictures import Float
 
 NEAR, FAR = 16.0, 80.0
 """Pixels. Nearer to their epipolar lines than the first are right matches, and some wrong ones; between the two are
 wrong ones, which look alike anywhere in the picture: so many of them are taken off for each pixel."""
-FEWEST = 30
+MIN_INLIERS = 30
 """Right matches of a camera, below which nothing is claimed."""
-PURE = 0.5
+MIN_INLIER_SHARE = 0.5
 """Share of the matches nearer than ``NEAR`` that have to be right: else their distances are those of chance."""
-OFF, TIMES = 0.9, 2.0
+MAX_RESIDUAL, MAX_TIMES_MEDIAN = 0.9, 2.0
 """Pixels at which features were found, and times the median of the rig, above which a camera is off. Right captures
 have 0.1 to 0.6, up to 1.6 times the median; a camera turned by two pixels has 0.9 to 2.2 (docs/calibration.md)."""
 
 
-class Spread(NamedTuple):
+class ResidualEstimate(NamedTuple):
     """Distances of right matches: their median, what it is at least (two standard errors), and how many they are."""
 
     median: float
-    least: float
-    right: int
+    lower_bound: float
+    inliers: int
 
 
-def spread_of(distances: Float) -> Spread:
+def estimate_residual(distances: Float) -> ResidualEstimate:
     """Median distance of right matches, the density of wrong ones taken off.
 
     Args:
         distances: [M] pixels from epipolar lines, of right and wrong matches.
 
     >>> right, wrong = np.linspace(0, 1, 101), np.linspace(0, 80, 81)
-    >>> spread_of(np.concatenate([right, wrong]))
-    Spread(median=0.49, least=0.39, right=101)
+    >>> estimate_residual(np.concatenate([right, wrong]))
+    ResidualEstimate(median=0.49, lower_bound=0.39, inliers=101)
     """
     ordered = np.sort(distances)
     near = int(np.searchsorted(ordered, NEAR))
     density = (int(np.searchsorted(ordered, FAR)) - near) / (FAR - NEAR)
     right = near - density * NEAR
-    if right < FEWEST or right < PURE * near:
-        return Spread(nan, nan, max(0, round(right)))
+    if right < MIN_INLIERS or right < MIN_INLIER_SHARE * near:
+        return ResidualEstimate(nan, nan, max(0, round(right)))
     surplus = np.arange(1, near + 1) - density * ordered[:near]
     median, least = (float(ordered[int(np.argmax(surplus >= rank))]) for rank in (right / 2, right / 2 - right**0.5))
-    return Spread(median, least, round(right))
+    return ResidualEstimate(median, least, round(right))
 
 
-def residuals(matches: Matches) -> tuple[dict[str, CameraResidual], list[str]]:
+def measure_residuals(matches: Matches) -> tuple[dict[str, CameraResidual], list[str]]:
     """The residual of each camera against those that are not off themselves, by name; and the names of those off.
 
     A camera that is off spoils the residuals of its neighbours. So the worst one is taken out, and the others are
@@ -66,8 +66,10 @@ def residuals(matches: Matches) -> tuple[dict[str, CameraResidual], list[str]]:
         known = {
             index: one for index, one in enumerate(camera_residuals) if not np.isnan(one.median) and index not in off
         }
-        worst = max(known, key=lambda index: known[index].least, default=None)
-        if worst is None or known[worst].least <= max(OFF, TIMES * float(np.median([m for m, *_ in known.values()]))):
+        worst = max(known, key=lambda index: known[index].lower_bound, default=None)
+        if worst is None or known[worst].lower_bound <= max(
+            MAX_RESIDUAL, MAX_TIMES_MEDIAN * float(np.median([m for m, *_ in known.values()]))
+        ):
             break
         off.append(worst)
         if 2 * len(off) >= len(known) + len(off):
@@ -75,13 +77,13 @@ def residuals(matches: Matches) -> tuple[dict[str, CameraResidual], list[str]]:
             camera_residuals = [_of_camera(index, measured, off) for index in range(len(matches.cameras))]
             break
     cameras = {
-        camera.name: CameraResidual(one.median * float(scale), one.right)
+        camera.name: CameraResidual(one.median * float(scale), one.inliers)
         for camera, scale, one in zip(matches.cameras, matches.scale, camera_residuals, strict=True)
     }
     return cameras, [matches.cameras[index].name for index in sorted(off)]
 
 
-def _of_camera(index: int, measured: Sequence[tuple[Pair, Float]], off: Sequence[int]) -> Spread:
-    """``spread_of`` a camera's matches with those cameras that are not off."""
+def _of_camera(index: int, measured: Sequence[tuple[Pair, Float]], off: Sequence[int]) -> ResidualEstimate:
+    """``estimate_residual`` a camera's matches with those cameras that are not off."""
     own = [distances for pair, distances in measured if index in pair and not {*pair} - {index} & {*off}]
-    return spread_of(np.concatenate([*own, np.zeros(0)]))
+    return estimate_residual(np.concatenate([*own, np.zeros(0)]))

@@ -8,25 +8,25 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from scas4d_core.captures.frame import InitialPoints
-from scas4d_core.first_frame.points.merging import SPACING, merged, thinned
+from scas4d_core.first_frame.points.merging import SPACING, average_per_cell, merge_candidates
 from scas4d_core.first_frame.points.stereo import (
-    FEWEST_NEIGHBOURS,
+    MIN_NEIGHBOURS,
     DepthMap,
+    count_violations,
     depth_maps,
     fused_points,
-    looked_through,
-    planned,
+    plan_stereo,
 )
 from scas4d_core.first_frame.points.surfaces import (
     TOLERANCE,
     Support,
     fit_surfaces,
     sample_surfaces,
-    settle,
+    snap_to_points,
     surface_depth,
 )
 from scas4d_core.first_frame.points.triangulation import FeatureTracks, Triangulation, triangulate
-from scas4d_core.first_frame.points.visual_hull import MISSES, VisualHull, carve, contradicted, pixel_at
+from scas4d_core.first_frame.points.visual_hull import MISSES, VisualHull, carve, count_contradictions, pixel_size_at
 from scas4d_core.first_frame.time_limit import TimeLimit
 from scas4d_core.posed_pictures import (
     Bool,
@@ -40,14 +40,14 @@ from scas4d_core.posed_pictures import (
 OnProgress = Callable[[str, int, int], None]
 """Called with a stage, the steps done and the steps in all."""
 
-LOOKED_THROUGH = 2
+REFUTING_VIOLATIONS = 2
 """Cameras looking through an unconfirmed point that refute it: one depth may be wrong."""
-CONTRADICTED = 1
+REFUTING_MASKS = 1
 """Masks speaking against a point that refute it: one is enough, for all masks agree on the hull behind the point."""
 
 
 @dataclass(frozen=True, eq=False)
-class Search:
+class PointSearch:
     """Settings of a search for points.
 
     Attributes:
@@ -71,7 +71,7 @@ class Search:
     limit: TimeLimit
 
 
-def agreed_points(search: Search, on_progress: OnProgress) -> InitialPoints:
+def find_agreeing_points(search: PointSearch, on_progress: OnProgress) -> InitialPoints:
     """Points on which ``search.min_views`` cameras agree.
 
     Raises:
@@ -79,7 +79,7 @@ def agreed_points(search: Search, on_progress: OnProgress) -> InitialPoints:
     """
     views, plain, min_views, seed = search.views, search.backdrop, search.min_views, search.seed
     middle = look_at_point(views)
-    pixel = pixel_at(views, middle)
+    pixel = pixel_size_at(views, middle)
 
     triangulated = triangulate(views, search.tracks, min_views=min_views, seed=seed)
     on_progress("hull", 0, 1)
@@ -101,7 +101,7 @@ def agreed_points(search: Search, on_progress: OnProgress) -> InitialPoints:
     on_progress("merging", 0, 1)
     confirmed = np.concatenate([fused_points(maps, min_views), triangulated.positions])
     if not plain and len(hull.cells):
-        confirmed = confirmed[contradicted(views, hull, confirmed, MISSES) < CONTRADICTED]
+        confirmed = confirmed[count_contradictions(views, hull, confirmed, MISSES) < REFUTING_MASKS]
 
     solid = _free_hull(hull, maps, min_views)
     walls = np.zeros((0, 3))
@@ -109,11 +109,11 @@ def agreed_points(search: Search, on_progress: OnProgress) -> InitialPoints:
         # One sample for about every four pixels of stereo's pictures is as dense as the thinning below needs.
         stride = max(2, max(view.camera.width for view in views) // 160)
         samples = sample_surfaces(views, supports, stride, search.radius)
-        samples, _ = thinned(samples, 2.0 * SPACING * pixel)
-        samples = settle(samples, supports, confirmed, 4.0 * TOLERANCE * search.radius)
-        walls = samples[looked_through(maps, samples, min_views) < LOOKED_THROUGH]
+        samples, _ = average_per_cell(samples, 2.0 * SPACING * pixel)
+        samples = snap_to_points(samples, supports, confirmed, 4.0 * TOLERANCE * search.radius)
+        walls = samples[count_violations(maps, samples, min_views) < REFUTING_VIOLATIONS]
     sources = (confirmed, solid, walls)
-    return merged(search.labelled, views, sources, pixel, plain, bool(maps), search.max_points)
+    return merge_candidates(search.labelled, views, sources, pixel, plain, bool(maps), search.max_points)
 
 
 def _in_foreground(views: Sequence[PosedPicture], triangulated: Triangulation) -> Bool:
@@ -131,7 +131,7 @@ def _in_foreground(views: Sequence[PosedPicture], triangulated: Triangulation) -
 
 
 def _stereo(
-    search: Search,
+    search: PointSearch,
     triangulated: Triangulation,
     hull: VisualHull,
     supports: Sequence[Support],
@@ -140,7 +140,7 @@ def _stereo(
 ) -> list[DepthMap]:
     """Depth maps of all pictures, halved; the search starts from hull, surfaces and triangulated points."""
     views, plain = search.views, search.backdrop
-    effort = planned(views, middle, search.iterations, search.limit)
+    effort = plan_stereo(views, middle, search.iterations, search.limit)
     if effort is None:
         return []
     small = [halved(view, effort.width) for view in views]
@@ -179,7 +179,7 @@ def _stereo(
         iterations=effort.iterations,
         seed=search.seed,
         hull=hull,
-        fewest=min(FEWEST_NEIGHBOURS, search.min_views - 1),
+        fewest=min(MIN_NEIGHBOURS, search.min_views - 1),
         progress=lambda done, total: on_progress("stereo", done, total),
     )
 
@@ -188,6 +188,6 @@ def _free_hull(hull: VisualHull, maps: Sequence[DepthMap], min_views: int) -> Fl
     """[P, 3] surface of the hull without the space that cameras look through."""
     if len(hull.cells) == 0:
         return np.zeros((0, 3))
-    solid = looked_through(maps, hull.centres, min_views, margin=0.01) < LOOKED_THROUGH
+    solid = count_violations(maps, hull.centres, min_views, margin=0.01) < REFUTING_VIOLATIONS
     rest = replace(hull, cells=hull.cells[solid])
     return rest.centres[rest.surface()]

@@ -28,7 +28,7 @@ CROWD = 4
 """Stereo points that the 27 cells about one must hold: true surfaces are seen by many pixels, strays by few."""
 
 
-def merged(
+def merge_candidates(
     labelled: Sequence[PosedPicture],
     views: Sequence[PosedPicture],
     sources: tuple[Float, Float, Float],
@@ -48,7 +48,7 @@ def merged(
     needed_by = (0, 2, 1)
     points, needed = np.zeros((0, 3)), np.zeros(0, dtype=np.intp)
     for source, (candidates, views_needed) in enumerate(zip(sources, needed_by, strict=True)):
-        new, sizes = thinned(candidates, fine)
+        new, sizes = average_per_cell(candidates, fine)
         if source == 0 and stereo and len(new):
             # Features are few and checked; the hull and the walls cover those that lie near no point of stereo.
             crowd = np.asarray(cKDTree(candidates).query_ball_point(new, 1.5 * fine, return_length=True))
@@ -85,7 +85,7 @@ def merged(
             members = np.flatnonzero(group & good)
             if len(members) and spacing > fine:
                 chosen[members] = False
-                chosen[members[spaced(points[members], spacing)]] = True
+                chosen[members[pick_one_per_cell(points[members], spacing)]] = True
         if chosen.sum() <= max_points:
             break
         scale *= 1.15
@@ -111,7 +111,7 @@ def labelled_share(views: Sequence[PosedPicture], points: Float, visible: Bool) 
     return (yes / np.maximum(said, 1)).astype(np.float32)
 
 
-def spaced(points: Float, cell: float) -> NDArray[np.intp]:
+def pick_one_per_cell(points: Float, cell: float) -> NDArray[np.intp]:
     """Index of one point for each cubic cell, the nearest to the mean of the cell's points: that spreads evenly."""
     where, count = _cells(points, cell)
     means = np.stack([np.bincount(where, points[:, axis]) for axis in range(3)], axis=-1) / count[:, None]
@@ -120,7 +120,7 @@ def spaced(points: Float, cell: float) -> NDArray[np.intp]:
     return result
 
 
-def thinned(points: Float, cell: float) -> tuple[Float, NDArray[np.intp]]:
+def average_per_cell(points: Float, cell: float) -> tuple[Float, NDArray[np.intp]]:
     """Means [Q, 3] of the points in each cubic cell of edge ``cell``, and the number of points in each [Q]."""
     if len(points) == 0:
         return points.reshape(-1, 3), np.zeros(0, dtype=np.intp)

@@ -11,7 +11,7 @@ from scipy.ndimage import binary_closing, binary_opening, gaussian_filter, minim
 
 from scas4d_core.captures.frame import InitialPoints
 from scas4d_core.first_frame.points.merging import SPACING, labelled_share
-from scas4d_core.first_frame.points.visual_hull import pixel_at
+from scas4d_core.first_frame.points.visual_hull import pixel_size_at
 from scas4d_core.posed_pictures import (
     Bool,
     Float,
@@ -26,7 +26,7 @@ Planes = NDArray[np.float32]
 
 CELLS = 48
 """Cells along the side of the square in which a plane is looked for; it is as wide as most pictures at the middle."""
-MOST_CELLS = 160
+MAX_CELLS = 160
 """Cells along it in which its points are taken at most."""
 REACH = 1.5
 """Farthest plane that is tried, half squares from the middle of the stage."""
@@ -50,9 +50,9 @@ PAIRS = 2
 BEYOND_CHANCE = 1.8
 """Agreement on a plane, as a multiple of that of mirrored pictures, which agree by chance alone: 2.2 to 4.7 where
 there is a floor or a table (six rigs), 0.9 to 1.6 where there is none (three)."""
-FEWEST_CELLS = 40
+MIN_CELLS = 40
 """Cells on which cameras agree, for a plane to be believed."""
-MOST_VIEWS = 6
+MAX_VIEWS = 6
 """Views that are compared: of more, some, evenly chosen."""
 CLOSED = 15
 """Cells across of a gap between agreeing cells that belongs to the plane all the same."""
@@ -113,9 +113,9 @@ def plane_points(labelled: Sequence[PosedPicture]) -> InitialPoints:
     >>> len(found) > 500, bool(np.abs(found.positions[:, 2]).max() < 0.05)
     (True, True)
     """
-    views = [labelled[i] for i in np.unique(np.linspace(0, len(labelled) - 1, MOST_VIEWS).astype(int))]
+    views = [labelled[i] for i in np.unique(np.linspace(0, len(labelled) - 1, MAX_VIEWS).astype(int))]
     plane = agreed_plane(views)
-    count = min(MOST_CELLS, max(CELLS, int(2 * plane.half / (SPACING * pixel_at(views, plane.middle)))))
+    count = min(MAX_CELLS, max(CELLS, int(2 * plane.half / (SPACING * pixel_size_at(views, plane.middle)))))
     points = plane.cells(count)
     closed = binary_closing(np.pad(_agreed_cells(views, plane, count), CLOSED), np.ones((CLOSED, CLOSED), bool))
     within = binary_opening(closed, np.ones((5, 5), bool))
@@ -138,7 +138,7 @@ def agreed_plane(views: Sequence[PosedPicture]) -> Plane:
     (score, plane), start = max(candidates, key=lambda one: one[0][0])
     mirrored = [replace(view, image=np.ascontiguousarray(view.image[:, ::-1])) for view in views]
     cells = _agreed_cells(views, plane, CELLS)
-    if cells.sum() < FEWEST_CELLS or score < BEYOND_CHANCE * _best(mirrored, start, refine=False)[0]:
+    if cells.sum() < MIN_CELLS or score < BEYOND_CHANCE * _best(mirrored, start, refine=False)[0]:
         raise InitialPointsError(NO_PLANE)
     return plane
 
@@ -211,7 +211,7 @@ def _axes(normal: Float) -> tuple[Float, Float]:
 
 def _smooth(views: Sequence[PosedPicture], plane: Plane, count: int) -> list[Planes]:
     """Grey pictures without what is finer than a cell."""
-    cell = 2 * plane.half / count / pixel_at(views, plane.middle)
+    cell = 2 * plane.half / count / pixel_size_at(views, plane.middle)
     return [gaussian_filter(view.image.mean(axis=2, dtype=np.float32), max(0.5, cell / 2)) for view in views]
 
 
@@ -226,7 +226,7 @@ def _agreement(
     Returns:
         [T] sums of correlations beyond ``HALF_ALIKE``; [T, C, C] pairs of cameras that agree on a cell.
     """
-    laid = [_laid(view, picture, points) for view, picture in zip(views, smooth, strict=True)]
+    laid = [_warp_to_plane(view, picture, points) for view, picture in zip(views, smooth, strict=True)]
     scores, pairs = np.zeros(len(points)), np.zeros(points.shape[:3], np.intp)
     for i, (one, mean, spread, textured) in enumerate(laid):
         for other, other_mean, other_spread, other_textured in laid[:i]:
@@ -240,7 +240,7 @@ def _agreement(
     return scores, pairs
 
 
-def _laid(view: PosedPicture, picture: Planes, points: Float) -> tuple[Planes, Planes, Planes, Bool]:
+def _warp_to_plane(view: PosedPicture, picture: Planes, points: Float) -> tuple[Planes, Planes, Planes, Bool]:
     """A picture on planes: [T, C, C] values, their means and deviations over patches, and which have texture."""
     uv, depth = view.camera.project(points.reshape(-1, 3))
     height, width = picture.shape

@@ -26,7 +26,7 @@ SAME = 0.05
 colours are quantized have up to 0.03."""
 ALIKE = 8
 """Levels of 255 by which the pixels of one colour may differ: noise, and the traces of JPEG."""
-EVERY = 4
+PIXEL_STRIDE = 4
 """Pixels, between those that are looked at."""
 
 
@@ -38,18 +38,18 @@ def backdrop(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64] | None:
     """Colour [3], in levels of 255, of a plain backdrop that a good part of the pictures shows; None where none does.
 
     Args:
-        images: [H, W, 3] each, wider and higher than ``EVERY`` pixels.
+        images: [H, W, 3] each, wider and higher than ``PIXEL_STRIDE`` pixels.
     """
     pixels = [_sampled(image) for image in images]
     everyone = np.concatenate(pixels)
     codes, counts = np.unique(everyone @ np.array([1 << 16, 1 << 8, 1]), return_counts=True)
     code = int(codes[counts.argmax()])
     painted = np.array([code >> 16, code >> 8 & 255, code & 255], np.float64)
-    if _shown([_alike(some, painted, 0) for some in pixels], SAME):
+    if _is_backdrop([_alike(some, painted, 0) for some in pixels], SAME):
         return painted
     cells = np.ravel_multi_index(tuple(everyone.T // ALIKE), (256 // ALIKE,) * 3)
     common: NDArray[np.float64] = np.median(everyone[cells == np.bincount(cells).argmax()], axis=0)
-    plain = _shown([_alike(some, common, ALIKE) for some in pixels], PLAIN)
+    plain = _is_backdrop([_alike(some, common, ALIKE) for some in pixels], PLAIN)
     return common if plain else None
 
 
@@ -60,14 +60,14 @@ def mean_colour(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64]:
 
 
 def _sampled(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return image[EVERY // 2 :: EVERY, EVERY // 2 :: EVERY].reshape(-1, 3)
+    return image[PIXEL_STRIDE // 2 :: PIXEL_STRIDE, PIXEL_STRIDE // 2 :: PIXEL_STRIDE].reshape(-1, 3)
 
 
 def _alike(pixels: NDArray[np.uint8], colour: NDArray[np.float64], levels: int) -> Bool:
     return np.asarray((np.abs(pixels - colour) <= levels).all(axis=1))
 
 
-def _shown(of_it: list[Bool], share: float) -> bool:
+def _is_backdrop(of_it: list[Bool], share: float) -> bool:
     """True where so many pixels are of a backdrop, and half as many in most cameras; ``of_it``: by camera."""
     return bool(np.concatenate(of_it).mean() >= share and np.median([some.mean() for some in of_it]) >= share / 2)
 

@@ -22,7 +22,7 @@ PLANES_FIRST, PLANES_EACH = 3, 12
 """Planes that each pixel tries at first, and in a round (``patch_match``)."""
 NEIGHBOURS = 4
 """Other cameras that each picture is compared with."""
-FEWEST_NEIGHBOURS = 2
+MIN_NEIGHBOURS = 2
 """A picture with fewer of them is compared with none: a match in a single one is often wrong."""
 ITERATIONS = 4
 """Rounds of propagation and refinement."""
@@ -57,20 +57,22 @@ class DepthMap:
 
 
 @dataclass(frozen=True)
-class Effort:
+class StereoBudget:
     """Effort of stereo: pictures no wider than ``width`` pixels, and rounds of propagation and refinement."""
 
     width: int
     iterations: int
 
 
-def planned(views: Sequence[PosedPicture], middle: Float, iterations: int, limit: TimeLimit) -> Effort | None:
+def plan_stereo(views: Sequence[PosedPicture], middle: Float, iterations: int, limit: TimeLimit) -> StereoBudget | None:
     """The effort that there is time for, by the pace on pictures of a few pixels; None: not even for the least.
 
     Args:
         views: at full size. middle: see ``depth_maps``. iterations: wanted. limit: of the time of frame 0.
     """
-    efforts = [Effort(width, rounds) for width in (WIDTH, WIDTH // 2) for rounds in (iterations, -(-iterations // 2))]
+    efforts = [
+        StereoBudget(width, rounds) for width in (WIDTH, WIDTH // 2) for rounds in (iterations, -(-iterations // 2))
+    ]
     if not limit.bounded:
         return efforts[0]
     tiny = [halved(view, PACE_WIDTH) for view in views]
@@ -86,7 +88,7 @@ def planned(views: Sequence[PosedPicture], middle: Float, iterations: int, limit
         each * (PLANES_FIRST + PLANES_EACH * effort.iterations) * sum(_pixels(view, effort.width) for view in views)
         for effort in efforts
     ]
-    index = limit.chosen(STEREO, costs)
+    index = limit.choose(STEREO, costs)
     if index == len(efforts):
         limit.shortened.append("no stereo")
         return None
@@ -134,7 +136,7 @@ def depth_maps(
     iterations: int = ITERATIONS,
     seed: int = 0,
     hull: VisualHull | None = None,
-    fewest: int = FEWEST_NEIGHBOURS,
+    fewest: int = MIN_NEIGHBOURS,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[DepthMap]:
     """PatchMatch of every view against its neighbours, then the comparison of all depths.
@@ -198,19 +200,19 @@ def _match(
         active,
         prior,
         np.array([1 / camera.fx, -camera.cx / camera.fx, 1 / camera.fy, -camera.cy / camera.fy]),
-        *_stacked([greys[j] for j in chosen]),
+        *_pad_pictures([greys[j] for j in chosen]),
         np.stack(matrices),
         np.stack(shifts),
         near=depths[0],
         far=depths[1],
         iterations=iterations,
-        best=min(FEWEST_NEIGHBOURS, len(chosen)),
+        best=min(MIN_NEIGHBOURS, len(chosen)),
         seed=seed,
     )
     return np.where(cost <= MAX_COST, depth, 0.0)
 
 
-def _stacked(pictures: Sequence[NDArray[np.float32]]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+def _pad_pictures(pictures: Sequence[NDArray[np.float32]]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """Pictures as planes [V, H, W] of the largest size, each in the upper left corner, and their sizes [V, 2]."""
     sizes = np.array([picture.shape for picture in pictures], np.int64)
     planes = np.zeros((len(pictures), *sizes.max(axis=0)), np.float32)
@@ -225,7 +227,7 @@ def _confine(view: PosedPicture, depth: Float, hull: VisualHull) -> None:
     if len(rows) == 0:
         return
     points = view.camera.unproject(np.stack([columns + 0.5, rows + 0.5], -1), depth[rows, columns])
-    off = ~hull.about(points)
+    off = ~hull.is_near(points)
     depth[rows[off], columns[off]] = 0.0
 
 
@@ -262,12 +264,12 @@ def fused_points(maps: Sequence[DepthMap], min_views: int, max_violations: float
         trusted = one.trusted(min_views - 1)
         rows, columns = np.nonzero(trusted > 0)
         points = one.view.camera.unproject(np.stack([columns + 0.5, rows + 0.5], -1), trusted[rows, columns])
-        through = looked_through(maps, points, min_views, skip=index)
+        through = count_violations(maps, points, min_views, skip=index)
         fused.append(points[through <= max_violations * (1 + one.agreeing[rows, columns])])
     return np.concatenate(fused)
 
 
-def looked_through(
+def count_violations(
     maps: Sequence[DepthMap], points: Float, min_views: int, margin: float = 0.03, skip: int = -1
 ) -> NDArray[np.intp]:
     """[P] cameras whose trusted depth lies more than ``margin`` (relative) behind each point [P, 3].

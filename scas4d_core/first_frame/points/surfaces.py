@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from scas4d_core.posed_pictures import Bool, Float, PosedPicture
 
-MOST = 3
+MAX_SURFACES = 3
 """Planes and spheres fitted to the triangulated points: walls, floor and a dome are rarely more."""
 TOLERANCE = 0.012
 """Distance of an inlier from a fitted surface, in radii of the rig."""
@@ -132,7 +132,9 @@ def fit_sphere(points: Float) -> Sphere | None:
     return Sphere(answer[:3] + middle, float(np.sqrt(square)))
 
 
-def fit_surfaces(points: Float, centres: Float, tolerance: float, *, most: int = MOST, seed: int = 0) -> list[Support]:
+def fit_surfaces(
+    points: Float, centres: Float, tolerance: float, *, most: int = MAX_SURFACES, seed: int = 0
+) -> list[Support]:
     """Planes and spheres that bound the room of the cameras, the best supported first.
 
     Args:
@@ -270,7 +272,7 @@ def sample_surfaces(views: Sequence[PosedPicture], supports: Sequence[Support], 
     return np.concatenate(samples) if samples else np.zeros((0, 3))
 
 
-def settle(points: Float, supports: Sequence[Support], seen: Float, reach: float) -> Float:
+def snap_to_points(points: Float, supports: Sequence[Support], seen: Float, reach: float) -> Float:
     """Moves samples along the normal of their surface to the measured points about them.
 
     A dome is made of panels and a floor is not quite flat: the measured offsets are averaged over the neighbours of

@@ -51,7 +51,7 @@ class Triangulation:
     error: Float
 
 
-def features(
+def extract_features(
     views: Sequence[PosedPicture],
     limit: TimeLimit | None = None,
     *,
@@ -83,13 +83,13 @@ def features(
 def _all_features(
     views: Sequence[PosedPicture], extract: Callable[[NDArray[np.float32]], Any], limit: TimeLimit
 ) -> list[tuple[Float, NDArray[np.float32]]]:
-    """``features`` by a function that takes grey pictures; the first picture measures the pace."""
+    """``extract_features`` by a function that takes grey pictures; the first picture measures the pace."""
     features_by_view: list[tuple[Float, NDArray[np.float32]]] = []
     size, began, divisor = [view.camera.width * view.camera.height for view in views], limit.clock(), 1
     for view in views:
         if len(features_by_view) == 1 and divisor == 1:
             each = (limit.clock() - began) / size[0]
-            index = limit.chosen(FEATURES, [each * sum(size[1:]), *(each * sum(size) / n**2 for n in (2, 4))])
+            index = limit.choose(FEATURES, [each * sum(size[1:]), *(each * sum(size) / n**2 for n in (2, 4))])
             if index:
                 divisor = 2 ** min(index, 2)
                 limit.shortened.append(f"features of pictures of a size of 1/{divisor}")
@@ -180,47 +180,47 @@ class FeatureTracks:
     groups: list[NDArray[np.intp]]
 
 
-def matched_tracks(views: Sequence[PosedPicture], limit: TimeLimit | None = None) -> FeatureTracks:
+def match_tracks(views: Sequence[PosedPicture], limit: TimeLimit | None = None) -> FeatureTracks:
     """Matches SIFT features over all pairs of views; masks do not matter.
 
     Args:
         limit: of the time of frame 0; where it is short, pairs that look in different directions are left out.
     """
     limit = limit or TimeLimit(None)
-    features_by_view = features(views, limit)
+    features_by_view = extract_features(views, limit)
     described = [
         (view.camera, uv, descriptors) for view, (uv, descriptors) in zip(views, features_by_view, strict=True)
     ]
     offsets = np.concatenate([[0], np.cumsum([len(uv) for _, uv, _ in described])])
     owner = np.repeat(np.arange(len(views)), np.diff(offsets))
     pixels = np.concatenate([uv for _, uv, _ in described]) if len(owner) else np.zeros((0, 2))
-    chosen = _pairs_in_time(described, limit)
+    chosen = _affordable_pairs(described, limit)
     pairs = [guided_matches(described[a], described[b]) + offsets[[a, b]] for a, b in chosen]
     edges = np.concatenate(pairs) if pairs else np.zeros((0, 2), dtype=np.intp)
-    return FeatureTracks(pixels, owner, grouped(joined(edges, len(owner))))
+    return FeatureTracks(pixels, owner, group_by_track(label_tracks(edges, len(owner))))
 
 
-def joined(edges: NDArray[np.intp], count: int) -> NDArray[np.intp]:
+def label_tracks(edges: NDArray[np.intp], count: int) -> NDArray[np.intp]:
     """[F] the track of each of ``count`` features, of which those of an edge [E, 2] are in one.
 
-    >>> joined(np.array([[0, 3], [3, 1]]), 4).tolist()
+    >>> label_tracks(np.array([[0, 3], [3, 1]]), 4).tolist()
     [0, 0, 1, 0]
     """
     graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
     return np.asarray(connected_components(graph, directed=False)[1])
 
 
-def grouped(track: NDArray[np.intp]) -> list[NDArray[np.intp]]:
+def group_by_track(track: NDArray[np.intp]) -> list[NDArray[np.intp]]:
     """Indices of the features of each track, in the order of the tracks' numbers.
 
-    >>> [group.tolist() for group in grouped(np.array([0, 0, 1, 0]))]
+    >>> [group.tolist() for group in group_by_track(np.array([0, 0, 1, 0]))]
     [[0, 1, 3], [2]]
     """
     order = np.argsort(track, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(track[order])) + 1) if len(order) else []
 
 
-def _pairs_in_time(
+def _affordable_pairs(
     found: Sequence[tuple[Camera, Float, NDArray[np.float32]]], limit: TimeLimit
 ) -> list[tuple[int, int]]:
     """Pairs of views that there is time to match: all, or those that look in like directions."""
@@ -234,7 +234,7 @@ def _pairs_in_time(
     for a, b in pairs[:FEW_PAIRS]:
         guided_matches(found[a], found[b])
     each = (limit.clock() - began) / max(float(work[:FEW_PAIRS].sum()), 1.0)
-    most = int((each * np.cumsum(work) <= limit.left(MATCHES)).sum())
+    most = int((each * np.cumsum(work) <= limit.seconds_left(MATCHES)).sum())
     if most < len(pairs):
         most = max(most, FEW_PAIRS)
         limit.shortened.append(f"features matched in {most} of {len(pairs)} pairs of pictures")
@@ -284,11 +284,11 @@ def triangulate(
 
     Args:
         views: pictures of one moment.
-        tracks: ``matched_tracks`` of them, where that is known already.
+        tracks: ``match_tracks`` of them, where that is known already.
         min_views: inlier views a point needs.
         seed: of RANSAC.
     """
-    tracks = tracks or matched_tracks(views)
+    tracks = tracks or match_tracks(views)
     pixels, owner = tracks.pixels, tracks.owner
     point_of = triangulator(
         [view.camera for view in views], angle=MIN_ANGLE_DEG, error=EPIPOLAR_ERROR, trials=500, seed=seed

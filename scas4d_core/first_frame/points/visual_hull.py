@@ -60,7 +60,7 @@ class VisualHull:
         """Volume in cubic world units."""
         return len(self.cells) * self.voxel**3
 
-    def about(self, points: Float) -> Bool:
+    def is_near(self, points: Float) -> Bool:
         """[P] true for points [P, 3] within the hull or nearer to it than two voxels (and some a little farther)."""
         low, size, strides, keys = self._surroundings
         at = np.floor((points - self.origin) / self.voxel + 0.5).astype(np.int64) // 2
@@ -100,7 +100,7 @@ class VisualHull:
         return bare
 
 
-def pixel_at(views: Sequence[PosedPicture], point: Float) -> float:
+def pixel_size_at(views: Sequence[PosedPicture], point: Float) -> float:
     """World units across one pixel at ``point`` [3], median over the cameras that have it in front (1 without any)."""
     sizes = [
         float(view.camera.project(point)[1]) / view.camera.fx for view in views if view.camera.project(point)[1] > 0
@@ -130,10 +130,10 @@ def carve(
         return VisualHull(cells[:0], origin, voxel)
     distances = [_distance(np.asarray(view.mask)) for view in masked]
     min_views = max(min_views, int(SEEN_SHARE * len(masked)))
-    target = voxel_pixels * pixel_at(views, middle)
+    target = voxel_pixels * pixel_size_at(views, middle)
     while True:
         last = voxel <= target or 8 * len(cells) > MAX_VOXELS
-        cells = cells[_kept(masked, distances, origin + cells * voxel, voxel, misses, min_views, last)]
+        cells = cells[_inside_silhouettes(masked, distances, origin + cells * voxel, voxel, misses, min_views, last)]
         if last or len(cells) == 0:
             return VisualHull(cells, origin, voxel)
         children = np.stack(np.meshgrid(*[np.arange(2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -142,7 +142,9 @@ def carve(
         voxel /= 2
 
 
-def contradicted(views: Sequence[PosedPicture], hull: VisualHull, points: Float, misses: float) -> NDArray[np.intp]:
+def count_contradictions(
+    views: Sequence[PosedPicture], hull: VisualHull, points: Float, misses: float
+) -> NDArray[np.intp]:
     """[P] number of masks that contradict each point [P, 3].
 
     A point within the silhouettes is foreground, and no mask contradicts it. Any other is background: it must not lie
@@ -177,7 +179,7 @@ def _distance(mask: Bool) -> Float:
     return result
 
 
-def _kept(
+def _inside_silhouettes(
     views: Sequence[PosedPicture],
     distances: Sequence[Float],
     centres: Float,

@@ -67,7 +67,7 @@ def test_scores_are_printed_and_not_measured_twice(capture_folder, tmp_path):
 def test_scores_are_the_same_with_the_states_in_a_scratch_file(capture_folder, tmp_path, monkeypatch):
     """A long capture does not fit into memory."""
     moved = []
-    own = ScratchFile.moved
+    own = ScratchFile.store
 
     def noted(self, frame):
         if "means" in frame:  # else it is a report
@@ -76,7 +76,7 @@ def test_scores_are_the_same_with_the_states_in_a_scratch_file(capture_folder, t
 
     rows = []
     for taken in (lambda self, frame: frame, noted):
-        monkeypatch.setattr(ScratchFile, "moved", taken)
+        monkeypatch.setattr(ScratchFile, "store", taken)
         out = tmp_path / str(len(rows))
         rows.append(evaluate(capture_folder, out, frames=4, changes=CHANGES, report=lambda line: None))
         assert sorted(path.name for path in out.iterdir()) == ["frames", "pictures", "rows", "table.md"]

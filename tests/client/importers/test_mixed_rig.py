@@ -48,7 +48,7 @@ def test_what_is_not_as_usual_is_said(folder):
 def test_files_to_be_sent_have_eight_bits(folder):
     capture = open_source(folder, encoding="png")
     for name in capture.rig.names:
-        file = capture.encoded(1, name)
+        file = capture.encoded_image(1, name)
         assert file[24] == 8
         np.testing.assert_array_equal(decode_image(file), capture.frame(1).images[name])
 
@@ -101,13 +101,15 @@ def test_pictures_at_half_of_the_calibrated_size_scale_their_cameras_and_say_so(
 
 def test_pictures_a_little_off_are_refused_until_it_is_said_why(folder, tmp_path):
     cut = resized(folder, tmp_path / "cut", lambda picture: picture.crop((0, 0, picture.width - 8, picture.height)))
-    with pytest.raises(CaptureError, match=r"c0/0.png: is 88x72 .* 'c0' was calibrated for 96x72.* --fit corner"):
+    with pytest.raises(
+        CaptureError, match=r"c0/0.png: is 88x72 .* 'c0' was calibrated for 96x72.* --size-mismatch corner"
+    ):
         open_source(cut)
     shown = {}
-    for fit in ("corner", "centre", "stretch"):
-        capture = open_source(cut, fit=fit)
+    for size_mismatch in ("corner", "centre", "stretch"):
+        capture = open_source(cut, size_mismatch=size_mismatch)
         assert sum("calibrated for" in remark for remark in capture.remarks) == COUNT
-        shown[fit] = capture.rig["c0"]
+        shown[size_mismatch] = capture.rig["c0"]
     full = camera(0)
     assert (shown["corner"].cx, shown["corner"].fx) == (full.cx, full.fx)
     assert (shown["centre"].cx, shown["centre"].fx) == (full.cx - 4, full.fx)
@@ -128,6 +130,6 @@ def test_the_layout_of_the_core_takes_the_same_remedies(folder, tmp_path):
     assert (capture.rig["c0"].width, capture.rig["c0"].fx) == (48, 55.0)
     meta = json.loads((tmp_path / "out/train_meta.json").read_text())
     (tmp_path / "out/train_meta.json").write_text(json.dumps(meta | {"w": [w // 2 - 4 for w in meta["w"]]}))
-    with pytest.raises(CaptureError, match=r"--fit corner"):
+    with pytest.raises(CaptureError, match=r"--size-mismatch corner"):
         open_source(tmp_path / "out", use_masks=False)
-    assert open_source(tmp_path / "out", use_masks=False, fit="centre").rig["c0"].width == 48
+    assert open_source(tmp_path / "out", use_masks=False, size_mismatch="centre").rig["c0"].width == 48

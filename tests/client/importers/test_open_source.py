@@ -27,7 +27,7 @@ def test_pictures_of_straight_lenses_go_as_they_are(straight):
     source = open_source(straight)
     assert source.rig.names == ("cam1", "cam2", "cam10")
     assert (source.frame_count, source.fps, source.time(1)) == (2, 25, 1 / 25)
-    assert source.encoded(1, "cam10") == (straight / "images/cam10/000001.png").read_bytes()
+    assert source.encoded_image(1, "cam10") == (straight / "images/cam10/000001.png").read_bytes()
     assert source.encoded_mask(0, "cam1") is None
     assert source.points is None
     assert open_source(straight, fps=50).time(1) == 1 / 50
@@ -54,7 +54,7 @@ def test_frames_are_in_natural_order_and_one_name_is_one_frame(straight):
             Image.open(path).save(path.with_suffix(".webp"), lossless=True)
             path.unlink()
     source = open_source(straight)
-    shades = [decode_image(source.encoded(t, "cam2"))[0, 0, 1] for t in range(source.frame_count)]
+    shades = [decode_image(source.encoded_image(t, "cam2"))[0, 0, 1] for t in range(source.frame_count)]
     assert shades == [0, 40, 120, 80]  # f1, f2, f9, f10
     assert sorted(["cam10", "cam2", "a1b10", "a1b9"], key=natural) == ["a1b9", "a1b10", "cam2", "cam10"]
 
@@ -73,7 +73,7 @@ def test_undistorted_pictures_and_masks_fit_their_cameras(tmp_path):
     for encoding, magic in (("png", b"\x89PNG"), ("jpeg", b"\xff\xd8")):
         source = open_source(tmp_path, encoding=encoding)
         for camera in source.rig.cameras:
-            file = source.encoded(0, camera.name)
+            file = source.encoded_image(0, camera.name)
             assert file.startswith(magic)
             picture = decode_image(file, size=(camera.width, camera.height))
             mask = decode_mask(source.encoded_mask(0, camera.name), size=(camera.width, camera.height))
@@ -139,7 +139,7 @@ def test_a_path_cannot_lead_out_of_the_capture(tmp_path):
 def test_the_sample_goes_through_the_same_door(capture_folder):
     source = open_source(capture_folder)
     assert (source.rig.names, source.frame_count, source.fps) == (("0", "1"), 4, 30)
-    assert source.encoded(0, "0").startswith(b"\x89PNG")
+    assert source.encoded_image(0, "0").startswith(b"\x89PNG")
     assert source.encoded_mask(0, "0") is not None
     assert open_source(capture_folder, use_masks=False).encoded_mask(0, "0") is None
     assert len(source.points) == 5
@@ -177,7 +177,10 @@ def empty(folder):
     ("damage", "said"),
     [
         (cut, r"images/cam2: has no pictures of 1 of 2 frames \(000001\), which 'cam1' has"),
-        (resize, r"cam10/000000.png: is 312x240 pixels, but camera 'cam10' was calibrated for 320x240.*--fit"),
+        (
+            resize,
+            r"cam10/000000.png: is 312x240 pixels, but camera 'cam10' was calibrated for 320x240.*--size-mismatch",
+        ),
         (empty, r"images/cam1: has no pictures; give files ending in .jpg"),
         (
             lambda f: (f / "images/cam10").rename(f / "images/ten"),
@@ -218,5 +221,5 @@ def test_bmp_files_are_encoded_for_the_way(straight):
         for path in (straight / "images" / camera).iterdir():
             Image.open(path).save(path.with_suffix(".bmp"))
             path.unlink()
-    with Image.open(io.BytesIO(open_source(straight, encoding="png").encoded(1, "cam1"))) as picture:
+    with Image.open(io.BytesIO(open_source(straight, encoding="png").encoded_image(1, "cam1"))) as picture:
         assert (picture.format, picture.getpixel((0, 0))) == ("PNG", (80, 40, 99))

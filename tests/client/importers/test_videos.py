@@ -104,8 +104,8 @@ def test_a_rig_of_videos_is_a_source(rig_of_videos):
     assert source.fps == pytest.approx(25)
     assert source.time(3) == pytest.approx(3 / 25)
     for index in (0, 1, 17, 16):
-        assert {number(decode_image(source.encoded(index, name))) for name in NAMES} == {index}
-    assert open_source(rig_of_videos).encoded(5, "cam1").startswith(b"\xff\xd8")
+        assert {number(decode_image(source.encoded_image(index, name))) for name in NAMES} == {index}
+    assert open_source(rig_of_videos).encoded_image(5, "cam1").startswith(b"\xff\xd8")
 
 
 def test_frames_of_videos_reach_the_reconstruction_scaled(rig_of_videos):

@@ -52,7 +52,7 @@ def test_what_was_imported_is_a_capture(distorted, tmp_path):
                 assert np.linalg.norm(dot_at(frame.images[camera.name], uv) - uv) < 0.1
                 assert frame.masks[camera.name][int(uv[1]), int(uv[0])] == 1
     again = open_source(tmp_path / "out")
-    assert again.encoded(1, "cam1") == source.encoded(1, "cam1")
+    assert again.encoded_image(1, "cam1") == source.encoded_image(1, "cam1")
     assert again.time(1) == pytest.approx(1 / 12)
 
 

@@ -123,15 +123,15 @@ def test_everything_is_scaled_together(folder):
 
 def test_files_can_be_pushed_without_decoding(folder):
     capture = open_capture(folder, image_scale=0.5)
-    assert capture.encoded(1, "3") == (folder / "ims/3/000001.png").read_bytes()
-    assert capture.encoded(1, "2") == (folder / "ims/2/000001.png").read_bytes()
+    assert capture.encoded_image(1, "3") == (folder / "ims/3/000001.png").read_bytes()
+    assert capture.encoded_image(1, "2") == (folder / "ims/2/000001.png").read_bytes()
     assert capture.encoded_mask(1, "3") == (folder / "seg/3/000001.png").read_bytes()
     assert open_capture(folder, use_masks=False).encoded_mask(1, "3") is None
     with pytest.raises(KeyError):
-        capture.encoded(0, "7")
+        capture.encoded_image(0, "7")
     for index in (-1, 3):
         with pytest.raises(IndexError, match=r"not one of 0…2"):
-            capture.encoded(index, "3")
+            capture.encoded_image(index, "3")
         with pytest.raises(IndexError, match=r"not one of 0…2"):
             capture.frame(index)
 
@@ -336,6 +336,6 @@ def test_a_bitmap_is_sent_as_png(folder):
     ]
     (folder / "train_meta.json").write_text(json.dumps(train))
     capture = open_capture(folder)
-    sent = capture.encoded(1, "0")
+    sent = capture.encoded_image(1, "0")
     assert sent.startswith(b"\x89PNG")
     assert np.array_equal(decode_image(sent), shade(0, 1))

@@ -17,7 +17,7 @@ from scas4d_core.compact import Bounds, CompactReader, CompactWriter, DamagedFil
 from scas4d_core.compact.columns import Columns
 from scas4d_core.compact.frame_code import errors_of
 from scas4d_core.compact.index import footer
-from scas4d_core.compact.planes import deflated
+from scas4d_core.compact.planes import compress
 from scas4d_core.compact.records import HEAD_SIZE, RecordKind, parse_head, record_bytes, scan
 from scas4d_core.compact.writer import KEY_EVERY
 from scas4d_core.gaussians import Gaussians, quaternion_products
@@ -286,7 +286,7 @@ def test_an_index_that_is_none_is_passed_over(file: Path, tmp_path: Path, index:
         records = list(scan(opened, 0, "a"))
     data = file.read_bytes()[: records[-1].offset - HEAD_SIZE]
     if index == "json":
-        index = (0).to_bytes(4, "little") + deflated(b"[" * 100_000)
+        index = (0).to_bytes(4, "little") + compress(b"[" * 100_000)
     assert isinstance(index, bytes)
     path = tmp_path / "a.s4d"
     path.write_bytes(data + record_bytes(RecordKind.INDEX, index) + footer(len(data)))
@@ -297,7 +297,7 @@ def test_an_index_that_is_none_is_passed_over(file: Path, tmp_path: Path, index:
 
 def test_a_head_that_is_no_json_leaves_no_file(tmp_path: Path) -> None:
     with pytest.raises((TypeError, ValueError)):
-        CompactWriter(tmp_path / "a.s4d", FileHeader(WorldFrame(np.zeros(3)), remark={"a": object()}))
+        CompactWriter(tmp_path / "a.s4d", FileHeader(WorldFrame(np.zeros(3)), metadata={"a": object()}))
     assert not list(tmp_path.iterdir())
 
 

@@ -11,7 +11,15 @@ from scipy.spatial.transform import Rotation
 from scas4d_core.compact.bounds import Bounds
 from scas4d_core.compact.cluster_motion import PER_CLUSTER, ClusterMotion, Clusters, polar_rotations, quaternions_of
 from scas4d_core.compact.columns import Columns
-from scas4d_core.compact.frame_code import FLAT, Change, Coded, after, decode, encode, errors_of
+from scas4d_core.compact.frame_code import (
+    MIN_VOLUME_RATIO,
+    EncodedFrame,
+    FrameDelta,
+    apply_deltas,
+    decode,
+    encode,
+    errors_of,
+)
 from scas4d_core.compact.planes import PlaneError
 from scas4d_core.gaussians import Gaussians, quaternion_products
 
@@ -58,7 +66,7 @@ def jittered(state: Gaussians, size: float, seed: int = 1) -> Gaussians:
     )
 
 
-def coded(before: Gaussians, after: Gaussians, bounds: Bounds = BOUNDS) -> Coded:
+def coded(before: Gaussians, after: Gaussians, bounds: Bounds = BOUNDS) -> EncodedFrame:
     """Encodes, and checks that a reader gets the same bits and that the errors are told as they are."""
     clusters, reference = Clusters.of(before), Columns.of(before)
     result = encode(reference, Columns.of(after), clusters, bounds)
@@ -117,8 +125,8 @@ def test_thin_gaussians_keep_their_volume_and_their_handedness() -> None:
     after = jittered(before, 0.5)
     found = coded(before, after).decoded.gaussians()
     ratios = np.linalg.det(found.factors.astype(float)) / np.linalg.det(after.factors.astype(float))
-    assert (ratios > 0.99 * FLAT).all()
-    assert (ratios < 1.01 / FLAT).all()
+    assert (ratios > 0.99 * MIN_VOLUME_RATIO).all()
+    assert (ratios < 1.01 / MIN_VOLUME_RATIO).all()
 
 
 def test_who_moves_is_the_same() -> None:
@@ -188,9 +196,9 @@ def test_states_are_the_same_told_at_once_or_one_by_one() -> None:
         true = true.replace(means=means, factors=factors, rotations=rotations, colours=colours)
         coded_state = encode(told, Columns.of(true), clusters, BOUNDS)
         assert within(dict(coded_state.errors), BOUNDS)
-        changes.append(Change.read(coded_state.body, told, clusters))
+        changes.append(FrameDelta.read(coded_state.body, told, clusters))
         told = coded_state.decoded
-    at_once = after(first, clusters, BOUNDS, changes)
+    at_once = apply_deltas(first, clusters, BOUNDS, changes)
     for name in ("means", "factors", "rotations", "colours", "foreground"):
         assert getattr(at_once, name).tobytes() == getattr(told, name).tobytes(), name
     assert within(errors_of(at_once, Columns.of(true)), BOUNDS)
@@ -211,14 +219,14 @@ def test_steps_that_cannot_be_are_refused_where_they_are(step: float) -> None:
     before = cloud()
     body = coded(before, jittered(before, 0.1)).body
     with pytest.raises(PlaneError, match="cannot be"):
-        Change.read(np.float64(step).tobytes() + body[8:], Columns.of(before), Clusters.of(before))
+        FrameDelta.read(np.float64(step).tobytes() + body[8:], Columns.of(before), Clusters.of(before))
 
 
 def test_maps_of_clusters_are_those_that_were_made() -> None:
     before = cloud(count=2000)
     clusters = Clusters.of(before)
     turn = Rotation.from_rotvec([0.3, -0.2, 0.1])
-    motion = ClusterMotion.between(clusters, Columns.of(before), Columns.of(carried(before, turn, (0.1, 0.2, 0.3))))
+    motion = ClusterMotion.fit(clusters, Columns.of(before), Columns.of(carried(before, turn, (0.1, 0.2, 0.3))))
     assert np.abs(motion.matrices + np.eye(3) - turn.as_matrix()).max() < 0.02  # ridge
     assert clusters.count == -(-np.count_nonzero(before.moving) // PER_CLUSTER)
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from scas4d_core.compact.planes import MOST, NARROW, WIDE, PlaneError, deflated, inflated, pack, unpack
+from scas4d_core.compact.planes import MOST, NARROW, WIDE, PlaneError, compress, decompress, pack, unpack
 
 
 @given(st.lists(st.integers(-MOST + 1, MOST - 1), max_size=50), st.sampled_from([1, 3, 100, 70_000, MOST]))
@@ -56,9 +56,9 @@ def test_another_number_of_values_is_refused(bits: int) -> None:
 
 
 def test_nothing_larger_than_told_is_unpacked() -> None:
-    bomb = deflated(bytes(50_000_000))
+    bomb = compress(bytes(50_000_000))
     assert len(bomb) < 10_000
     with pytest.raises(PlaneError, match="50000000 bytes where 100 belong"):
-        inflated(bomb, 100)
+        decompress(bomb, 100)
     with pytest.raises(PlaneError, match="no zstandard frame"):
-        inflated(b"nothing", 100)
+        decompress(b"nothing", 100)

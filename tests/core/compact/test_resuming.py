@@ -35,7 +35,7 @@ def test_a_file_cut_anywhere_is_gone_on_with_to_the_same_bytes(whole: Path, tmp_
         path = tmp_path / f"{cut}.s4d"
         path.write_bytes(data[:cut])
         with CompactReader(path) as reader:
-            if reader.whole:
+            if reader.is_closed:
                 continue
             known = reader.frames
         with CompactWriter.resume(path) as writer:
@@ -72,7 +72,7 @@ def test_what_has_no_state_or_is_whole_or_damaged_is_not_gone_on_with(whole: Pat
 def test_a_copy_of_some_frames_has_their_bits(first: int, last: int, whole: Path, tmp_path: Path) -> None:
     path = tmp_path / "copy.s4d"
     with CompactReader(whole) as reader, path.open("wb") as file:
-        listed = reader.copied(first, last, file)
+        listed = reader.copy_records(first, last, file)
         file.close()
         with CompactReader(path) as copy:
             wanted = [index for index in FRAMES if first <= index <= last]
@@ -88,9 +88,9 @@ def test_a_copy_of_some_frames_has_their_bits(first: int, last: int, whole: Path
 def test_a_copy_is_gone_on_with_and_a_copy_of_nothing_refused(whole: Path, tmp_path: Path) -> None:
     path = tmp_path / "copy.s4d"
     with CompactReader(whole) as reader, path.open("wb") as file:
-        reader.copied(10, 12, file)
+        reader.copy_records(10, 12, file)
         with pytest.raises(FileError, match="no frame from 3 to 4"):
-            reader.copied(3, 4, file)
+            reader.copy_records(3, 4, file)
     with CompactWriter.resume(path) as writer:
         writer.add(13, *TRUE[13])
     with CompactReader(path) as reader:
@@ -153,9 +153,9 @@ def test_a_copy_ends_before_what_is_damaged(whole: Path, tmp_path: Path) -> None
     damaged, path = tmp_path / "damaged.s4d", tmp_path / "copy.s4d"
     damaged.write_bytes(data)
     with CompactReader(damaged) as reader, path.open("wb") as file:
-        assert reader.copied(7, 20, file)[-1] == 8
+        assert reader.copy_records(7, 20, file)[-1] == 8
         file.close()
         with CompactReader(path) as copy:
             near(copy, 8)
         with path.open("wb") as file, pytest.raises(DamagedFileError):
-            reader.copied(9, 20, file)
+            reader.copy_records(9, 20, file)

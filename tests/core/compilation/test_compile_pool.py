@@ -27,22 +27,22 @@ def there(tmp_path, monkeypatch):
     """CompiledMarkers in a folder of their own, and kernels that nobody compiles."""
     mine = CompiledMarkers(tmp_path / "compiled_markers")
     found = {KernelGroup.UPDATE: [ONE, TWO, THREE], KernelGroup.STEREO: [LATER]}
-    monkeypatch.setattr(compile_pool, "here", lambda: mine)
+    monkeypatch.setattr(compile_pool, "open_markers", lambda: mine)
     monkeypatch.setattr(compile_pool, "kernels_of", lambda groups: [one for group in groups for one in found[group]])
     monkeypatch.setattr(compile_pool, "_end_with_parent", lambda: None)
-    monkeypatch.setattr(compile_pool, "_crew", [])
+    monkeypatch.setattr(compile_pool, "_pool", [])
     monkeypatch.setattr(compile_pool.os, "nice", lambda more: None)
     monkeypatch.setattr(compile_pool, "gc", SimpleNamespace(freeze=lambda: None, set_threshold=lambda *given: None))
     return mine
 
 
 class Started:
-    """Stands in for a process of a compile_pool: what `work` does, done at once."""
+    """Stands in for a process of a compile_pool: what `compile_kernels` does, done at once."""
 
     def __init__(self, command, **_):
         self.groups = [given.split(";") if given else [] for given in command[3:5]]
         assert command[5:] == sys.path  # it finds the same sources
-        self.ended = compile_pool.work(*self.groups)
+        self.ended = compile_pool.compile_kernels(*self.groups)
 
     def poll(self):
         return self.ended
@@ -85,20 +85,20 @@ def test_each_kernel_is_compiled_once(there, monkeypatch):
     monkeypatch.setattr(compile_pool, "compile_kernel", compile_kernel)
     monkeypatch.setattr(compile_pool, "processes", lambda: 3)
     with ThreadPoolExecutor() as pool:  # flock is of the open file: threads are kept apart as processes are
-        assert list(pool.map(lambda _: compile_pool.work([KernelGroup.UPDATE], []), range(3))) == [0, 0, 0]
+        assert list(pool.map(lambda _: compile_pool.compile_kernels([KernelGroup.UPDATE], []), range(3))) == [0, 0, 0]
     assert sorted(done, key=lambda kernel: kernel.name) == [ONE, THREE, TWO]
 
 
 def test_no_more_compile_than_there_are_places(there, monkeypatch):
-    monkeypatch.setattr(compiled_markers, "PLACE_S", 0.0)
+    monkeypatch.setattr(compiled_markers, "SLOT_WAIT_S", 0.0)
     monkeypatch.setattr(compile_pool, "compile_kernel", lambda kernel: pytest.fail("there is no place"))
-    assert not there.busy(1)
-    with there.place(1) as taken:
+    assert not there.is_compiling(1)
+    with there.slot(1) as taken:
         assert taken
-        assert there.busy(1)
+        assert there.is_compiling(1)
         monkeypatch.setattr(compile_pool, "processes", lambda: 1)
-        assert compile_pool.work([KernelGroup.UPDATE], []) == 0
-    assert not there.busy(1)
+        assert compile_pool.compile_kernels([KernelGroup.UPDATE], []) == 0
+    assert not there.is_compiling(1)
 
 
 def test_who_waits_takes_over_from_a_crew_that_was_killed(there, monkeypatch):
@@ -155,11 +155,11 @@ def test_a_process_asks_once_for_each_group(monkeypatch):
 
 
 def test_the_marks_are_in_the_cache_of_this_version_and_of_this_checkout(monkeypatch):
-    mine = compiled_markers.here()
+    mine = compiled_markers.open_markers()
     assert mine is not None
     assert mine.folder.parent.name.startswith("kernels-")
     monkeypatch.setattr(jit, "__file__", "/elsewhere/scas4d_core/kernels/jit.py")
-    other = compiled_markers.here()
+    other = compiled_markers.open_markers()
     assert other is not None
     other.folder.rmdir()
     assert mine.folder != other.folder
@@ -172,7 +172,7 @@ def test_without_a_cache_kernels_are_compiled_where_they_are_called(monkeypatch)
 
     monkeypatch.setattr(subprocess, "Popen", lambda *_, **__: pytest.fail("a process was started"))
     for here in (lambda: None, nowhere):
-        monkeypatch.setattr(compile_pool, "here", here)
+        monkeypatch.setattr(compile_pool, "open_markers", here)
         assert not compile_pool.wait_for_kernels([KernelGroup.UPDATE])
 
 

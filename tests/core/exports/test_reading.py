@@ -15,7 +15,7 @@ from export_cases.corner import Found
 from scas4d_core.compact import CompactReader
 from scas4d_core.errors import InputError
 from scas4d_core.exports import FORMATS, export_sequence
-from scas4d_core.exports.reading import ReadStates, open_export, sources
+from scas4d_core.exports.reading import ExportedStates, open_export, sources
 from scas4d_core.gaussians import Gaussians, quaternions_to_matrices
 
 LATER = Gaussians.of_points([[0.5, -1.2, 2.2]], 0.05, [0.2, 0.7, 0.1])
@@ -43,7 +43,7 @@ def written(path: Path, format: str, states: list[Gaussians]) -> Path:
     return path
 
 
-def found(state: Gaussians, read: ReadStates) -> Found:
+def found(state: Gaussians, read: ExportedStates) -> Found:
     """In the user's world."""
     unit = read.head.world.metres_per_unit
     factors = state.factors.astype(np.float64) / unit
@@ -52,7 +52,7 @@ def found(state: Gaussians, read: ReadStates) -> Found:
     )
 
 
-def assert_states(read: ReadStates, states: list[Gaussians], metres: bool = False) -> None:
+def assert_states(read: ExportedStates, states: list[Gaussians], metres: bool = False) -> None:
     assert list(read.frames) == [FIRST + k for k in range(len(states))]
     for (index, _, back), truth, frame in zip(read.states(), states, range(len(states)), strict=True):
         assert index == FIRST + frame
@@ -140,7 +140,7 @@ def test_a_part_of_the_frames_has_the_rows_of_all(tmp_path):
     np.testing.assert_allclose(state.means[1], moving.state(0).means[1] + found_shift(read), atol=1e-5)
 
 
-def found_shift(read: ReadStates) -> np.ndarray:
+def found_shift(read: ExportedStates) -> np.ndarray:
     """The inside world of a file is the user's in metres."""
     return corner.WORLD.origin * corner.WORLD.metres_per_unit
 

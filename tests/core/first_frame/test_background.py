@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from scas4d_core.cameras import Camera, WorldFrame
-from scas4d_core.first_frame.start import as_begun, with_background
+from scas4d_core.first_frame.fit_first_frame import with_background, with_recorded_background
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.committed import CommittedScene
 from scas4d_core.reconstruction import Reconstruction
@@ -80,7 +80,7 @@ def test_it_is_committed_and_goes_on(tmp_path: Path, background: list[float] | s
     outside = Camera("away", [[100, 0, 4], [0, 100, 4], [0, 0, 1]], FAR_AWAY, 8, 8)
     read = CommittedScene(History.open(tmp_path / "states"), scene.world)
     np.testing.assert_allclose(read.render(outside).colour, np.broadcast_to(expected, (8, 8, 3)), atol=1e-6)
-    assert as_begun(settings, read.history).scene.background == expected
+    assert with_recorded_background(settings, read.history).scene.background == expected
     again = Reconstruction.resume(rig, settings, History.open(tmp_path / "states"))
     assert again.settings.scene.background == expected
     assert Reconstruction.fork(rig, settings, again.history, 0).settings.scene.background == expected
@@ -93,7 +93,7 @@ def test_a_history_that_says_nothing_has_black() -> None:
     history.append(0, 0.0, Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0]))
     away = Camera("away", [[100, 0, 8], [0, 100, 8], [0, 0, 1]], FAR_AWAY, 16, 16)
     assert not CommittedScene(history, WorldFrame(np.zeros(3))).render(away).colour.any()
-    assert as_begun(Settings(), history).scene.background_rgb == (0.0, 0.0, 0.0)
+    assert with_recorded_background(Settings(), history).scene.background_rgb == (0.0, 0.0, 0.0)
 
 
 def test_a_thing_that_fills_the_pictures_has_the_colour_painted_behind_it() -> None:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from scas4d_core.first_frame.points.silhouettes import plain_background, silhouette
-from scas4d_core.first_frame.points.surfaces import PatchPlane, Sphere, fit_surfaces, sample_surfaces, settle
-from scas4d_core.first_frame.points.visual_hull import carve, contradicted
+from scas4d_core.first_frame.points.surfaces import PatchPlane, Sphere, fit_surfaces, sample_surfaces, snap_to_points
+from scas4d_core.first_frame.points.visual_hull import carve, count_contradictions
 from scas4d_core.posed_pictures import PosedPicture
 
 RADIUS = 0.45
@@ -20,8 +20,8 @@ def test_hull_of_a_ball_has_its_volume_and_holds_it(scene):
     assert true < hull.volume < 1.25 * true
     inside = np.random.default_rng(0).normal(size=(500, 3))
     inside *= RADIUS * 0.97 / np.linalg.norm(inside, axis=1, keepdims=True)
-    assert hull.about(inside).all()
-    assert not hull.about(inside * 1.6).any()
+    assert hull.is_near(inside).all()
+    assert not hull.is_near(inside * 1.6).any()
     radius = np.linalg.norm(hull.centres[hull.surface()], axis=1)
     assert abs(np.median(radius) - RADIUS) < 1.5 * hull.voxel
 
@@ -60,7 +60,7 @@ def test_background_before_the_foreground_is_contradicted(scene):
     views = scene.ball_views()
     hull = carve(views, voxel_pixels=2)
     points = np.array([[0.0, 0.0, 0.0], [RADIUS + 0.07, 0.0, 0.0], [0.0, 0.0, 5.0]])
-    against = contradicted(views, hull, points, 0.0)
+    against = count_contradictions(views, hull, points, 0.0)
     assert against[0] == 0
     assert against[1] >= 2
     assert against[2] == 0
@@ -142,5 +142,5 @@ def test_samples_are_the_first_surface_and_settle_on_what_was_measured(scene):
     on_floor = np.abs(samples[:, 1] - 0.8) < 0.02
     assert np.linalg.norm(samples[~on_floor], axis=1) == pytest.approx(np.full((~on_floor).sum(), 3.0), abs=0.05)
     raised = samples[on_floor] - (0, 0.05, 0)
-    settled = settle(samples[on_floor], found, raised, 0.2)
+    settled = snap_to_points(samples[on_floor], found, raised, 0.2)
     assert np.median(settled[:, 1]) == pytest.approx(0.75, abs=0.01)

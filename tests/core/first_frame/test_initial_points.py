@@ -8,9 +8,9 @@ from scipy.spatial import cKDTree
 
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures import InitialPoints
-from scas4d_core.first_frame.initial_points import ENOUGH, covered, initial_points, joined
-from scas4d_core.first_frame.points.stereo import DepthMap, fused_points, looked_through
-from scas4d_core.first_frame.points.triangulation import features, fundamental_matrix, triangulate
+from scas4d_core.first_frame.initial_points import ENOUGH_COVERAGE, image_coverage, initial_points, merge_points
+from scas4d_core.first_frame.points.stereo import DepthMap, count_violations, fused_points
+from scas4d_core.first_frame.points.triangulation import extract_features, fundamental_matrix, triangulate
 from scas4d_core.first_frame.time_limit import TimeLimit
 from scas4d_core.posed_pictures import (
     InitialPointsError,
@@ -124,14 +124,14 @@ def test_the_shorter_the_time_the_less_finely_points_are_looked_for(scene, box, 
     found = initial_points(rig, images, {}, limit=(limit := TimeLimit(100.0, Ticking(tick))))
     assert len(limit.shortened) == len(said)
     assert all(text.startswith(start) for text, start in zip(limit.shortened, said, strict=True))
-    assert found.covered > 0.5 * cloud.covered
+    assert found.coverage > 0.5 * cloud.coverage
     assert np.median(scene.distance_to_box(found.positions)) < 2 * PIXEL
 
 
 def test_features_of_smaller_pictures_lie_where_those_of_whole_ones_do(box):
     rig, images, _ = box
     views = collect_views(rig, images, {})[:2]
-    extracted = [features(views, limit) for limit in (None, TimeLimit(10.0, Ticking(0.7)))]
+    extracted = [extract_features(views, limit) for limit in (None, TimeLimit(10.0, Ticking(0.7)))]
     whole, small = ((found[0][0], found[1][0]) for found in extracted)
     for many, few in zip(whole, small, strict=True):
         assert 5 < len(few) < len(many)
@@ -188,7 +188,7 @@ def test_two_cameras_do_not_outvote_min_views():
 def test_what_cameras_look_through_is_found():
     maps = _flat_maps([3.0, 3.0, 3.0])
     points = np.array([[0.2, 0.0, 2.0], [0.2, 0.0, 3.0], [0.2, 0.0, 3.5], [90.0, 0.0, 2.0]])
-    assert looked_through(maps, points, 3).tolist() == [3, 0, 0, 0]
+    assert count_violations(maps, points, 3).tolist() == [3, 0, 0, 0]
 
 
 def test_halved_pictures_keep_their_geometry(scene):
@@ -247,7 +247,7 @@ def test_silhouettes_are_found_before_a_backdrop_that_does_not_reach_all_borders
     images = {camera.name: scene.picture(camera)[0] for camera in rig.cameras}
     images["c0"][:6] = (200, 190, 180)  # a ceiling in one picture, so that the borders differ
     found = initial_points(rig, images, {}, stereo=False)
-    assert "backdrop" in found.way
+    assert "backdrop" in found.method
     assert len(found) > 100
     assert (scene.distance_to_box(found.positions) < 3 * PIXEL).mean() > 0.6
 
@@ -257,8 +257,8 @@ def test_frame_0_has_points_where_no_camera_confirms_any(scene):
     rng = np.random.default_rng(0)
     images = {camera.name: rng.integers(0, 255, (128, 128, 3), dtype=np.uint8) for camera in rig.cameras}
     found = initial_points(rig, images, {}, stereo=False)
-    assert found.way.endswith("volume + surroundings")
-    assert found.covered < ENOUGH
+    assert found.method.endswith("volume + surroundings")
+    assert found.coverage < ENOUGH_COVERAGE
     assert found.stage is not None
     on_stage = found.positions[found.stage.holds(found.positions)]
     inside = np.stack([pixels_inside(camera, on_stage)[3] for camera in rig.cameras])
@@ -286,8 +286,8 @@ def test_points_that_one_way_labels_and_another_does_not_have_no_labels():
     grey, label = np.full((1, 3), 0.5, np.float32), np.ones(1, np.float32)
     labelled, plain = InitialPoints(near, grey, label), InitialPoints(far, grey)
     for first, second, known in ((labelled, plain, False), (plain, labelled, False), (labelled, labelled, True)):
-        found = joined(joined(None, first, "backdrop", [view], 0.1), second, "volume", [view], 0.1)
-        assert found.way == "backdrop + volume"
+        found = merge_points(merge_points(None, first, "backdrop", [view], 0.1), second, "volume", [view], 0.1)
+        assert found.method == "backdrop + volume"
         assert (found.foreground is not None) == known
         assert len(found.positions) == (1 if known else 2)  # the same place twice is one point
 
@@ -297,7 +297,7 @@ def test_cells_that_hold_points_are_covered():
     view = PosedPicture(Camera("front", lens, np.eye(4), 64, 64), np.zeros((64, 64, 3), np.uint8))
     line = np.stack([np.linspace(-0.49, 0.49, 64), np.zeros(64), np.ones(64)], axis=1)
     cloud = InitialPoints(line, np.zeros((64, 3), np.float32))
-    assert covered([view], cloud) == pytest.approx(1 / 32)
+    assert image_coverage([view], cloud) == pytest.approx(1 / 32)
     masked = PosedPicture(view.camera, view.image, np.zeros((64, 64), bool))
     masked.mask[32:34] = True
-    assert covered([masked], cloud) == pytest.approx(1.0)
+    assert image_coverage([masked], cloud) == pytest.approx(1.0)

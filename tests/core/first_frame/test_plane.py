@@ -127,7 +127,7 @@ def test_surroundings_leave_out_what_masks_hold(views):
 
 
 def test_few_cameras_far_apart_get_plane_and_surroundings(cloud):
-    assert cloud.way.endswith("plane + surroundings")
+    assert cloud.method.endswith("plane + surroundings")
     assert cloud.stage is not None
     on_stage = cloud.stage.holds(cloud.positions)
     assert on_stage.sum() > 300

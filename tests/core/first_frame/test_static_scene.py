@@ -11,8 +11,8 @@ from box_scene import held_out_camera, make_box, make_rig, photograph, take_fram
 from scas4d_core.captures.frame import Frame
 from scas4d_core.engines.fit import OPACITY
 from scas4d_core.first_frame import static_scene
+from scas4d_core.first_frame.fit_first_frame import fit_static_scene
 from scas4d_core.first_frame.fit_schedule import FitProgress
-from scas4d_core.first_frame.start import fit_static_scene
 from scas4d_core.first_frame.static_scene import (
     STOP_ROUNDS,
     StaticResult,

@@ -10,8 +10,8 @@ import pytest
 from box_scene import make_box, make_rig, take_frame
 
 from scas4d_core.captures.frame import InitialPoints
-from scas4d_core.first_frame import fit_schedule, start, static_scene
-from scas4d_core.first_frame.fit_schedule import FEWEST, FitSchedule
+from scas4d_core.first_frame import fit_first_frame, fit_schedule, static_scene
+from scas4d_core.first_frame.fit_schedule import MIN_ITERATIONS, FitSchedule
 from scas4d_core.first_frame.static_scene import StaticTrainer
 from scas4d_core.first_frame.time_limit import STEREO, TimeLimit
 from scas4d_core.fit.initial_gaussians import initial_parameters
@@ -40,9 +40,9 @@ def run(iterations: int, seconds: float | None, cost: Callable[[float], float], 
     schedule = FitSchedule(iterations, TimeLimit(seconds, clock=clock), counts)
     steps = []
     while schedule.at < iterations:
-        steps.append(schedule.next())
+        steps.append(schedule.begin_iteration())
         clock.now += cost(steps[-1].begun)
-        schedule.took(round(counts(steps[-1].begun)))
+        schedule.end_iteration(round(counts(steps[-1].begun)))
     return schedule, steps, clock.now
 
 
@@ -64,7 +64,7 @@ def test_too_little_time_shortens_all_phases_and_is_kept(seconds: float) -> None
     assert 0.9 * seconds < spent <= 1.01 * seconds
     assert steps[-1].ended == 3000
     assert all(one.ended == two.begun for one, two in pairwise(steps))
-    assert FEWEST <= len(steps) < 3000
+    assert MIN_ITERATIONS <= len(steps) < 3000
     assert schedule.planned[-1][1] == pytest.approx(len(steps), rel=0.03)
     assert max(step.ended - step.begun for step in steps[300:]) < 2.2 * np.mean(
         [step.ended - step.begun for step in steps[300:]]
@@ -79,7 +79,7 @@ def test_a_machine_that_gets_slower_is_noticed() -> None:
 
 def test_a_few_iterations_are_made_whatever_the_time() -> None:
     _, steps, _ = run(3000, 1e-3, lambda at: 0.05, lambda at: 1000.0)
-    assert FEWEST <= len(steps) <= FEWEST + fit_schedule.FIRST_TIMED + fit_schedule.PLAN_EVERY
+    assert MIN_ITERATIONS <= len(steps) <= MIN_ITERATIONS + fit_schedule.FIRST_TIMED + fit_schedule.PLAN_EVERY
     _, few, _ = run(300, 1e-3, lambda at: 0.05, lambda at: 1000.0)
     assert len(few) == 300
 
@@ -87,11 +87,11 @@ def test_a_few_iterations_are_made_whatever_the_time() -> None:
 def test_time_for_another_fit_is_kept() -> None:
     clock = Clock()
     schedule = FitSchedule(1000, TimeLimit(100.0, clock=clock), lambda at: 1000.0)
-    schedule.again, schedule.end = True, 500.0
+    schedule.fits_again, schedule.end = True, 500.0
     while schedule.at < 500:
-        schedule.next()
+        schedule.begin_iteration()
         clock.now += 0.1
-        schedule.took(1000)
+        schedule.end_iteration(1000)
     assert clock.now == pytest.approx(33, rel=0.15)  # 500 of this fit and 1000 of the next
     assert schedule.shortened
 
@@ -115,7 +115,7 @@ def trainer(monkeypatch: pytest.MonkeyPatch) -> Callable[[TimeLimit], StaticTrai
     """Makes a trainer of the box scene; densified early, and with a floor of few iterations."""
     monkeypatch.setattr(static_scene, "DENSIFY_FROM", 50)
     monkeypatch.setattr(static_scene, "DENSIFY_EVERY", 50)
-    monkeypatch.setattr(fit_schedule, "FEWEST", 40)
+    monkeypatch.setattr(fit_schedule, "MIN_ITERATIONS", 40)
 
     def make(limit: TimeLimit) -> StaticTrainer:
         factory = ViewFactory(RIG)
@@ -161,10 +161,10 @@ def test_a_shortened_fit_goes_through_all_phases(trainer: Callable[[TimeLimit], 
 
 
 def test_a_report_says_what_was_shortened(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fit_schedule, "FEWEST", 30)
+    monkeypatch.setattr(fit_schedule, "MIN_ITERATIONS", 30)
     frame, told = take_frame(0, 0.0, BOX, RIG), []
     for seconds, shorter in ((None, False), (1e6, False), (30.0, True)):
-        monkeypatch.setattr(start, "TimeLimit", lambda seconds: TimeLimit(seconds, Clock(0.1)))
+        monkeypatch.setattr(fit_first_frame, "TimeLimit", lambda seconds: TimeLimit(seconds, Clock(0.1)))
         settings = Settings(static=StaticSettings(iterations=150, max_gaussians=600, seconds=seconds))
         points = InitialPoints(BOX.means.astype(np.float64), BOX.colours, None)
         scene = Reconstruction.start(RIG, frame, settings, points=points, progress=told.append)
@@ -184,13 +184,13 @@ def test_a_few_iterations_fewer_are_figures_and_no_warning(
     monkeypatch: pytest.MonkeyPatch, made: int, said: bool
 ) -> None:
     """A limit that hardly binds: the report has the figure, and nobody is told to mend anything."""
-    began = fit_schedule.FitSchedule.next
+    began = fit_schedule.FitSchedule.begin_iteration
 
     def hurried(self: FitSchedule) -> fit_schedule.FitStep:
         self.stride = 200 / made if self.done < made - 1 else 200.0
         return began(self)
 
-    monkeypatch.setattr(fit_schedule.FitSchedule, "next", hurried)
+    monkeypatch.setattr(fit_schedule.FitSchedule, "begin_iteration", hurried)
     settings = Settings(static=StaticSettings(iterations=200, max_gaussians=300, seconds=1e6))
     points = InitialPoints(BOX.means.astype(np.float64), BOX.colours, None)
     scene = Reconstruction.start(RIG, take_frame(0, 0.0, BOX, RIG), settings, points=points)
@@ -208,7 +208,7 @@ def test_a_few_iterations_fewer_are_figures_and_no_warning(
 def test_of_several_ways_the_best_that_ends_in_time_is_chosen() -> None:
     clock = Clock()
     limit = TimeLimit(100.0, clock=clock)
-    assert limit.chosen(STEREO, [50, 30, 5]) == 1
+    assert limit.choose(STEREO, [50, 30, 5]) == 1
     clock.now = 34
-    assert limit.chosen(STEREO, [50, 30, 5]) == 3
-    assert TimeLimit(None).chosen(STEREO, [1e9]) == 0
+    assert limit.choose(STEREO, [50, 30, 5]) == 3
+    assert TimeLimit(None).choose(STEREO, [1e9]) == 0

@@ -5,8 +5,8 @@ from sklearn.metrics import adjusted_rand_score
 
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query import parts as module
-from scas4d_core.query.parts import STANDING, match_labels, part_features, parts
-from scas4d_core.storage.births import grown_roots
+from scas4d_core.query.parts import NO_PART, match_labels, part_features, parts
+from scas4d_core.storage.births import extend_roots
 from scas4d_core.storage.history import History
 
 
@@ -57,7 +57,7 @@ def test_the_same_lambdas_serve_every_scale(unit):
 def test_standing_gaussians_belong_to_no_part():
     history, which = bodies(standing=500)
     labels = parts(history, 3)
-    assert np.all(labels[len(which) :] == STANDING)
+    assert np.all(labels[len(which) :] == NO_PART)
     assert np.array_equal(labels[: len(which)], which)
 
 
@@ -65,7 +65,7 @@ def test_standing_gaussians_belong_to_no_part():
 def quick(monkeypatch):
     """Fewer starts of K-means, and fewer counts tried."""
     monkeypatch.setattr(module, "RESTARTS", 3)
-    monkeypatch.setattr(module, "MOST_PARTS", 6)
+    monkeypatch.setattr(module, "MAX_PARTS", 6)
 
 
 @pytest.mark.usefixtures("quick")
@@ -80,7 +80,7 @@ def test_count_is_found_and_a_sample_labels_everyone(monkeypatch):
 
 def test_long_histories_are_thinned_evenly(monkeypatch):
     history, which = bodies(frames=40)
-    monkeypatch.setattr(module, "MOST_FRAMES", 5)
+    monkeypatch.setattr(module, "MAX_FRAMES", 5)
     asked: list[list[int]] = []
     stacked = history.stacked
     history.stacked = lambda name, indices=None, rows=None: (asked.append(list(indices)), stacked(name, indices, rows))[
@@ -188,7 +188,7 @@ def test_gaussians_born_later_belong_to_the_part_of_their_founders():
             there = state.rows(born)
             ids = np.full(len(born), -1) if t == birth else history.ids[count:]
             state = state.joined(there).replace(ids=np.concatenate([state.ids, ids]))
-            roots = grown_roots(history.roots(), state, parents) if t == birth else None
+            roots = extend_roots(history.roots(), state, parents) if t == birth else None
         given = {} if t != birth else {"parents": parents, "roots": roots}
         history.append(t, t / 30, state.retire([0, 1]) if t == whole.indices[-1] else state, **given)
     positions, rotations = module.motion(history, np.arange(count, count + len(born)), 12)
@@ -198,7 +198,7 @@ def test_gaussians_born_later_belong_to_the_part_of_their_founders():
     labels = parts(history, 3)
     assert np.array_equal(labels[2:count], which[2:])
     assert np.array_equal(labels[count:], which[born])
-    assert (labels[:2] == STANDING).all()
+    assert (labels[:2] == NO_PART).all()
 
 
 def test_gaussians_born_without_a_founder_stay_where_they_were_born():

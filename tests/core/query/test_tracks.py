@@ -6,8 +6,8 @@ from scas4d_core.cameras import Camera, WorldFrame
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.tracks import (
     carriers,
+    find_visibility,
     geometric_median,
-    seen,
     tracks_of_ids,
     tracks_of_pixels,
     tracks_of_points,
@@ -144,11 +144,11 @@ def wall(camera: Camera, index: int) -> tuple[np.ndarray, np.ndarray]:
 def test_seen_asks_picture_depth_and_tolerance():
     columns = CAMERA.unproject([[8.5, 8.5], [8.5, 8.5], [40.5, 8.5], [70.0, 8.5], [8.5, 8.5]], [9.0, 10.4, 12, 9, 10.6])
     positions = np.stack([columns, columns])
-    visible = seen(positions, [0, 1], CAMERA, wall, tolerance=0.5)
+    visible = find_visibility(positions, [0, 1], CAMERA, wall, tolerance=0.5)
     assert visible.tolist() == [[True, True, True, False, False], [True, True, False, False, False]]
-    behind = seen(-positions, [0, 1], CAMERA, wall, 0.5)
+    behind = find_visibility(-positions, [0, 1], CAMERA, wall, 0.5)
     assert not behind.any()
-    assert not seen(np.full((1, 2, 3), np.nan), [0], CAMERA, wall, 0.5).any()
+    assert not find_visibility(np.full((1, 2, 3), np.nan), [0], CAMERA, wall, 0.5).any()
 
 
 def test_seen_forgives_a_pixel_at_an_edge():
@@ -158,7 +158,7 @@ def test_seen_forgives_a_pixel_at_an_edge():
         return depth, np.ones((48, 64))
 
     at_edge, off_edge = CAMERA.unproject([[31.5, 8.5], [30.5, 8.5]], [20.0, 20.0])
-    assert seen(np.stack([at_edge, off_edge])[None], [0], CAMERA, step, 0.5).tolist() == [[True, False]]
+    assert find_visibility(np.stack([at_edge, off_edge])[None], [0], CAMERA, step, 0.5).tolist() == [[True, False]]
 
 
 def sheet(z: float, half: float, opacity: float, id: int) -> Gaussians:

@@ -15,8 +15,7 @@ from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.frame_report import FrameReport
 from scas4d_core.metrics import psnr
 from scas4d_core.reconstruction import Reconstruction
-from scas4d_core.robust.checks import ALIKE, EXPOSURE, light_continues, noted
-from scas4d_core.robust.checks import with_light as with_light
+from scas4d_core.robust.checks import ALIKE, EXPOSURE, light_continues, noted, with_light
 from scas4d_core.robust.outliers import Past
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
@@ -74,7 +73,7 @@ def run(lights: list[float], masks: bool) -> tuple[list[float], list[FrameReport
     scene, found, reports = started(lights[0], masks), [], []
     for index in range(1, len(lights)):
         reports.append(scene.step(sent(index, lights[index], masks)))
-        truth = with_light(dict(FOOTAGE.truth(index)), lights[index])
+        truth = brighten(dict(FOOTAGE.truth(index)), lights[index])
         shown = {camera.name: scene.render(camera, index).colour for camera in FOOTAGE.held_out}
         found.append(float(np.mean([psnr(shown[name], truth[name]) for name in shown])))
     return found, reports, scene

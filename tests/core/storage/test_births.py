@@ -12,7 +12,7 @@ from histories import filled, same, state
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.storage.births import Life, grown_roots
+from scas4d_core.storage.births import Life, extend_roots
 from scas4d_core.storage.faults import DamagedFrameError, HistoryError
 from scas4d_core.storage.history import History
 from scas4d_core.storage.npz import read_npz
@@ -79,7 +79,7 @@ def test_lives(where: str, tmp_path: Path) -> None:
         history.append(BORN_AT, 0.1, grown(1, history.newest, 3), parents=np.array([1, -1, 6]))
         reader.refresh((BORN_AT,))
         assert reader.count == 10
-        history.cut(0)
+        history.truncate(0)
         reader.refresh()
         assert reader.count == 7
         fill(History(tmp_path / "more"))
@@ -94,7 +94,7 @@ def test_lives(where: str, tmp_path: Path) -> None:
     found = {
         "disk": lambda: history,
         "loaded": lambda: History.load(tmp_path / "states"),
-        "copied": lambda: history.copied(INDICES),
+        "copied": lambda: history.copy_frames(INDICES),
         "saved": lambda: History.load(tmp_path / "copy"),
     }[where]()
     check(found)
@@ -112,7 +112,7 @@ def test_without_births_nothing_more_is_written(tmp_path: Path) -> None:
 
 
 def test_a_copy_of_some_frames_knows_all_births() -> None:
-    copy = fill(History()).copied([0, LAST])
+    copy = fill(History()).copy_frames([0, LAST])
     assert copy.indices == [0, LAST]
     assert copy.lives([108]) == [LIVES[108]]
     copy.append(LAST + 1, 1.0, grown(7, copy.newest, 1))
@@ -159,14 +159,14 @@ def test_the_born_go_back_as_their_founders_came() -> None:
         rotations=np.tile(quaternion, (7, 1)),
     )
     born = now.rows([2, 3])
-    roots = grown_roots(first, now.joined(born).retire([1]), np.array([4, -1]))
+    roots = extend_roots(first, now.joined(born).retire([1]), np.array([4, -1]))
     np.testing.assert_allclose(roots.means[7], first.means[2], atol=1e-5)
     np.testing.assert_allclose(roots.factors[7], first.factors[2], atol=1e-5)
     np.testing.assert_allclose(roots.rotations[7], [1, 0, 0, 0], atol=1e-6)
     np.testing.assert_array_equal(roots.means[8], now.means[3])
     assert np.flatnonzero(roots.retired).tolist() == [1]
     # Founders that were born themselves lead on to frame 0.
-    again = grown_roots(roots, now.joined(born).joined(born).retire([1]), np.array([7, 7]))
+    again = extend_roots(roots, now.joined(born).joined(born).retire([1]), np.array([7, 7]))
     np.testing.assert_allclose(again.means[9], first.means[2], atol=1e-5)
     np.testing.assert_allclose(again.means[10], first.means[3], atol=1e-5)
 
@@ -177,10 +177,10 @@ def test_roots_are_kept(tmp_path: Path) -> None:
     assert same(history.roots(), history.first)
     parents = np.array([1, -1, 6])
     now = grown(1, history.newest, 3)
-    roots = grown_roots(history.roots(), now, parents)
+    roots = extend_roots(history.roots(), now, parents)
     history.append(1, 0.1, now, parents=parents, roots=roots)
     history.append(2, 0.2, grown(2, history.newest).retire([0]))
-    for one in (history, History.load(tmp_path), history.copied([0, 1])):
+    for one in (history, History.load(tmp_path), history.copy_frames([0, 1])):
         for name in ("means", "factors", "rotations", "foreground", "opacities"):
             np.testing.assert_array_equal(getattr(one.roots(1), name), getattr(roots, name))
         assert one.roots(1).ids.tolist() == IDS[:10]
@@ -193,16 +193,16 @@ def test_a_birth_taken_back_has_its_ids_again_and_no_other_gets_them(tmp_path: P
     for history in (History(), History(tmp_path)):
         fill(history)
         whole = [history.gaussians(index) for index in INDICES]
-        assert history.cut(0) == INDICES[1:]
+        assert history.truncate(0) == INDICES[1:]
         assert (history.count, history.highest_id) == (7, 111)
         history.append(BORN_AT, 0.1, grown(9, history.newest, 1))
         assert history.ids[-1] == 112
-        assert history.cut(0) == [BORN_AT]
+        assert history.truncate(0) == [BORN_AT]
         if history.directory is not None:
             history = History.open(tmp_path)
         history.append(1, 0.05, grown(10, history.newest, 1))
         assert history.ids[-1] == 113
-        history.cut(0)
+        history.truncate(0)
         again = grown(1, history.newest, 3)
         history.append(BORN_AT, 0.1, again, parents=np.array([1, -1, 6]))
         assert history.ids[-3:].tolist() == [114, 115, 116]  # another birth was in its place since
@@ -258,7 +258,7 @@ def test_a_frame_is_written_anew_with_its_log(tmp_path: Path) -> None:
     (tmp_path / f"frame_{BORN_AT:06d}.npz").write_bytes(b"")
     history = History.open(tmp_path)
     base = history.gaussians(0)
-    made = history.completed(BORN_AT, base)
+    made = history.complete_state(BORN_AT, base)
     assert len(made) == 10
     np.testing.assert_array_equal(made.means[7:], arrays["means"][7:])
     history.replace(BORN_AT, 0.1, arrays, {})

@@ -17,7 +17,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.recompute import recompute
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
-from scas4d_core.storage.frame_arrays import packed, unpacked
+from scas4d_core.storage.frame_arrays import pack_effects, unpack_effects
 from scas4d_core.storage.history import History
 from scas4d_core.storage.npz import read_npz, write_npz
 
@@ -81,11 +81,11 @@ def test_a_file_that_is_written_again_has_them(tmp_path: Path) -> None:
     file = tmp_path / "frame_000003.npz"
     whole = file.read_bytes()
     file.write_bytes(b"")
-    assert scene.history.write_again(3)
+    assert scene.history.rewrite(3)
     assert file.read_bytes() == whole
     reopened = History.open(tmp_path)
     reopened.gaussians(3), reopened.report(3)  # in memory, and not written by this process
-    assert reopened.write_again(3)
+    assert reopened.rewrite(3)
     assert file.read_bytes() == whole
     (tmp_path / "frame_000002.npz").write_bytes(b"")
     history = History.open(tmp_path)
@@ -95,7 +95,7 @@ def test_a_file_that_is_written_again_has_them(tmp_path: Path) -> None:
 
 def test_cameras_with_alike_names_keep_their_own_arrays(tmp_path: Path) -> None:
     given = {"shadows": {"cam": np.arange(2), "cam.npy": np.arange(5)}}
-    for key, array in unpacked(packed(given))["shadows"].items():
+    for key, array in unpack_effects(pack_effects(given))["shadows"].items():
         np.testing.assert_array_equal(array, given["shadows"][key])
     write_npz(tmp_path / "a.npz", given["shadows"])
     for key, array in read_npz(tmp_path / "a.npz").items():

@@ -107,7 +107,7 @@ def test_older_states_are_read_from_chunks_by_all(tmp_path: Path, true: History)
     files = [name for name in names(history) if chunk_of(name) is not None]
     assert len(files) == 3
     assert sum(name.startswith("frame_") for name in names(history)) == 1 + EXACT
-    assert not history.take_faults()
+    assert not history.pop_faults()
     assert np.isnan(history.stacked("means", [5, 20], np.array([310]))[0]).all()
     assert history.lives([history.ids[4]])[0].retired == (RETIRED_AT,)
 
@@ -196,7 +196,7 @@ def test_a_damaged_chunk_hides_only_what_needs_it(tmp_path: Path, true: History)
     assert max(hidden) <= 9
     assert len(hidden) <= 8
     assert all("frame 6" in reader.damaged[index] for index in hidden)
-    assert set(reader.take_faults()) == {f"frame_{index:06d}.npz" for index in hidden}
+    assert set(reader.pop_faults()) == {f"frame_{index:06d}.npz" for index in hidden}
     assert reader.files.fault(6)
     assert reader.files.fault(4) is None
     # Made again, a frame has a file of its own, and that is read.
@@ -306,7 +306,7 @@ def test_a_disk_that_cannot_read_is_damage_and_no_crash(
         patched.setattr(CompactReader, "__init__", broken)
         found = History.open(tmp_path / "states")
         assert found.indices == [0, *true.indices[-EXACT:]]
-        assert len(found.unlisted) == 3
+        assert len(found.damaged_chunks) == 3
         assert compacted(found) == []
 
 
@@ -322,7 +322,7 @@ def test_what_was_committed_is_taken_back_out_of_a_chunk(tmp_path: Path, true: H
     history = filled(tmp_path / "states")
     compacted(history)
     again = History.open(tmp_path / "states")
-    again.cut(after=16)
+    again.truncate(after=16)
     assert again.indices == [index for index in true.indices if index <= 16]
     last = History.open(tmp_path / "states")
     assert last.indices == again.indices
@@ -353,7 +353,7 @@ def test_other_bounds_begin_another_chunk(tmp_path: Path) -> None:
     assert chunk is not None
     assert chunk.first == 5
     assert history.files.chunks.reader(5).head.bounds.position == 0.01
-    assert history.files.chunks.reader(4).whole
+    assert history.files.chunks.reader(4).is_closed
 
 
 def test_a_frame_that_cannot_be_told_stays_exact(tmp_path: Path, true: History) -> None:

@@ -116,8 +116,8 @@ def test_what_every_frame_needs_is_read_from_its_copy_and_mended(tmp_path, lost,
     assert reader.indices == [0, 2, 4, 6]
     assert same(reader.gaussians(0), state(0))
     assert reader.report(0) == {}
-    assert lost in reader.take_faults()
-    assert reader.take_faults() == {}
+    assert lost in reader.pop_faults()
+    assert reader.pop_faults() == {}
     writer = History.open(tmp_path)
     assert list(writer.repair_fixed()) == [lost]
     assert (tmp_path / lost).read_bytes() == whole
@@ -164,17 +164,17 @@ def test_a_damaged_state_is_left_out_until_another_file_is_there(tmp_path):
     assert 4 in reader.indices  # its time can be read
     with pytest.raises(DamagedFrameError, match=r"^frame_000004\.npz is damaged"):
         reader.gaussians(4)
-    assert list(reader.take_faults()) == ["frame_000004.npz"]
+    assert list(reader.pop_faults()) == ["frame_000004.npz"]
     assert reader.refresh() == ([], [])
     assert reader.indices == [0, 2, 6, 8, 10]
     with pytest.raises(DamagedFrameError, match="frame 4 cannot be read"):
         reader.stacked("means", [0, 4])
-    assert writer.write_again(4) is True
+    assert writer.rewrite(4) is True
     assert (tmp_path / "frame_000004.npz").read_bytes() == content
     assert reader.refresh((4,)) == ([4], [])
     assert reader.indices == [0, 2, 4, 6, 8, 10]
     assert same(reader.gaussians(4), state(2))
-    assert not writer.write_again(2)  # too old to be in memory
+    assert not writer.rewrite(2)  # too old to be in memory
     damage(tmp_path / "frame_000002.npz", "flipped")
     arrays = state(7).arrays()
     writer.replace(2, 1 / 30, arrays, {"recomputed": True})
@@ -191,7 +191,7 @@ def test_a_state_that_somebody_deleted_is_told(tmp_path):
     (tmp_path / "frame_000004.npz").unlink()
     with pytest.raises(HistoryError, match="frame 4 is not in the history"):
         reader.gaussians(4)
-    assert reader.take_faults() == {"frame_000004.npz": "frame_000004.npz is gone"}
+    assert reader.pop_faults() == {"frame_000004.npz": "frame_000004.npz is gone"}
 
 
 def test_no_message_has_a_path(tmp_path):

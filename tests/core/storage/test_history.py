@@ -133,7 +133,7 @@ def test_a_reader_sees_what_the_writer_did_and_opens_only_what_is_new(tmp_path, 
     assert same(reader.gaussians(0), state(0))
     # Taken back and made anew, a frame is a new one: nothing of the old stays in memory.
     reader.gaussians(9)
-    assert writer.cut(8) == [9]
+    assert writer.truncate(8) == [9]
     writer.append(9, 1.6, state(10))
     assert reader.refresh() == ([9], [])
     assert reader.time(9) == 1.6
@@ -146,14 +146,14 @@ def test_a_reader_that_is_told_what_changed_looks_at_nothing_else(tmp_path, monk
     alone = History.load(tmp_path, only=(2, 5))
     assert alone.indices == [2]
     assert same(alone.gaussians(2), state(1))
-    monkeypatch.setattr(FrameFiles, "listed", None)  # the directory is not looked through
+    monkeypatch.setattr(FrameFiles, "list_stamps", None)  # the directory is not looked through
     writer.append(8, 1.0, state(8))
     assert writer.retain(last=2) == [2, 4]
     assert reader.refresh((8, 2)) == ([8], [2])
     assert reader.indices == [0, 4, 6, 8]
     assert reader.refresh((4, 8, 99)) == ([], [4])
     assert reader.indices == writer.indices
-    writer.cut(6)
+    writer.truncate(6)
     writer.append(7, 0.9, state(7))
     assert reader.refresh((7, 8)) == ([7], [8])
     assert reader.indices == [0, 6, 7]
@@ -225,7 +225,7 @@ def test_a_damaged_frame_is_left_out_and_can_be_made_again(tmp_path):
     history.append(6, 0.5, state(3))
     assert same(History.load(tmp_path).gaussians(6), state(3))
     assert list(History.load(tmp_path).damaged) == [2]
-    assert history.cut(0) == [2, 4, 6]
+    assert history.truncate(0) == [2, 4, 6]
     assert History.load(tmp_path).indices == [0]
 
 

@@ -23,10 +23,10 @@ FRAME_BYTES = 4 * (3 + 9 + 4 + 3 + 1)
 
 def test_states_are_the_same_bits_and_the_history_goes_on(tmp_path: Path) -> None:
     history = filled(History())
-    history.put_aside(tmp_path)
+    history.move_to_scratch(tmp_path)
     assert list(tmp_path.iterdir()) == []  # it has no name: nothing is left, however the process ends
     history.append(40, 2.0, state(40))
-    history.put_aside(tmp_path)
+    history.move_to_scratch(tmp_path)
     for t in (0, 3, 8, 3, 7):
         assert same(history.gaussians(2 * t), state(t))
     assert same(history.newest, state(40))
@@ -35,7 +35,7 @@ def test_states_are_the_same_bits_and_the_history_goes_on(tmp_path: Path) -> Non
         assert np.array_equal(stack, np.stack([state(t).arrays()[name] for t in (2, 0, 8, 40)]))
     history.save(tmp_path / "copy")
     assert same(History.load(tmp_path / "copy").gaussians(6), state(3))
-    assert history.cut(12) == [14, 16, 40]
+    assert history.truncate(12) == [14, 16, 40]
     assert same(history.newest, state(6))
 
 
@@ -53,7 +53,7 @@ def test_a_frame_costs_no_memory_any_more(tmp_path: Path) -> None:
             for index in range(frames):
                 history.append(index, index / 30, one)
                 if aside:
-                    history.put_aside(tmp_path)
+                    history.move_to_scratch(tmp_path)
             peaks.append((tracemalloc.get_traced_memory()[0] - before) / (count * FRAME_BYTES))
             del history
             gc.collect()
@@ -74,7 +74,7 @@ def test_without_room_states_stay_in_memory_and_room_is_asked_for_once(
 
     monkeypatch.setattr(scratch_frames, "TemporaryFile", full)
     for _ in range(3):
-        history.put_aside(tmp_path)
+        history.move_to_scratch(tmp_path)
     assert same(history.gaussians(6), state(3))
     assert asked == [1]
 
@@ -85,7 +85,7 @@ def test_empty_arrays_and_many_readers(tmp_path: Path) -> None:
         {"a": rng.normal(size=(50, 3)), "none": np.zeros((0, 4), np.float32), "one": np.array(k)} for k in range(40)
     ]
     scratch = scratch_frames.ScratchFile(tmp_path)
-    aside = [scratch.moved(frame) for frame in frames]
+    aside = [scratch.store(frame) for frame in frames]
     with ThreadPoolExecutor(8) as pool:
         found = list(pool.map(lambda k: dict(aside[k % 40]), range(400)))
     for k, one in enumerate(found):
@@ -95,7 +95,7 @@ def test_empty_arrays_and_many_readers(tmp_path: Path) -> None:
 
 def test_a_history_on_disk_has_no_use_for_it(tmp_path: Path) -> None:
     history = filled(History(tmp_path / "states"))
-    history.put_aside(tmp_path)
+    history.move_to_scratch(tmp_path)
     assert same(history.gaussians(6), state(3))
     assert [path.name for path in tmp_path.iterdir()] == ["states"]
 
@@ -116,7 +116,7 @@ def test_the_older_states_of_a_long_history_are_aside_by_themselves() -> None:
     assert sizes[frames - 1] - sizes[scratch_frames.IN_MEMORY] < 2
     assert [history.report(index)["index"] for index in (0, 1, 20, frames - 1)] == [0, 1, 20, frames - 1]
     assert same(history.gaussians(5), one)
-    assert history.cut(5) == list(range(6, frames))
+    assert history.truncate(5) == list(range(6, frames))
     history.append(6, 6.0, one, {"index": 7})
     assert history.report(6)["index"] == 7
 
@@ -155,7 +155,7 @@ def test_places_of_states_that_are_deleted_are_used_again(tmp_path: Path) -> Non
 
 def test_a_file_that_was_cut_is_an_error() -> None:
     scratch = scratch_frames.ScratchFile(None)
-    aside = scratch.moved({"a": np.arange(4000.0)})
+    aside = scratch.store({"a": np.arange(4000.0)})
     os.ftruncate(scratch._file.fileno(), 8000)
     with pytest.raises(OSError, match="ends at byte 8000"):
         aside["a"]

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Camera, Rig
-from scas4d_core.first_frame.calibration.matches import Matches, neighbouring
+from scas4d_core.first_frame.calibration.matches import Matches, neighbour_pairs
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 
@@ -50,7 +50,7 @@ def matches_of(cameras, points=250, noise=0.25, wrong=0.05, seed=0):
         pixels.append(uv)
         seen.append(rng.random(points) < 2 / 3)
     pairs = {}
-    for a, b in neighbouring(Rig(tuple(cameras))):
+    for a, b in neighbour_pairs(Rig(tuple(cameras))):
         rows = np.flatnonzero(seen[a] & seen[b])
         other = np.where(rng.random(len(rows)) < wrong, rng.permutation(rows), rows)
         pairs[a, b] = np.stack([rows, other], axis=1)

@@ -57,7 +57,7 @@ def test_both_are_written_from_memory(history, tmp_path):
 
 
 def test_of_a_birth_that_was_taken_back_nothing_is_missed(history, tmp_path):
-    history.cut(0)
+    history.truncate(0)
     (tmp_path / born_file(1)).write_bytes(b"")
     (mended,) = mend(history, None, RepairFiles((born_file(1),)))
     assert mended.outcome is RepairOutcome.GONE

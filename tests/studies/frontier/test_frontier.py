@@ -333,7 +333,7 @@ def test_flicker_is_told_of_pixels_that_show_something_and_stand(monkeypatch):
     found = measures.measure_flicker(scene, capture, range(4))
     assert found["still_pixels"] == 50 * 20
     assert found["flicker"] == pytest.approx((255 * shown[:, 30, 5, 0]).std())
-    monkeypatch.setattr(measures, "FEWEST_STILL", 1001)
+    monkeypatch.setattr(measures, "MIN_STILL", 1001)
     assert measures.measure_flicker(scene, capture, range(4))["flicker"] is None
 
 

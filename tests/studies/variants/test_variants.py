@@ -41,7 +41,7 @@ def test_a_variant_shows_its_frames_with_their_truth(name, frames):
         assert np.array_equal(now.images["0"], truth.images["0"])
         assert np.array_equal(now.masks["0"], truth.masks["0"])
         assert np.array_equal(variant.test_frame(index).images["4"], CAPTURE.test_frame(there).images["4"])
-        assert variant.encoded(index, "4") == CAPTURE.encoded(there, "4")
+        assert variant.encoded_image(index, "4") == CAPTURE.encoded_image(there, "4")
         assert np.array_equal(variant.ground_truth.points[index], CAPTURE.ground_truth.points[there])
         assert np.array_equal(variant.ground_truth.visible[index], CAPTURE.ground_truth.visible[there])
         camera = CAPTURE.ground_truth.label_cameras[0]

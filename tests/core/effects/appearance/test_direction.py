@@ -26,11 +26,11 @@ from scas4d_core.engines.cpu.gloss import (
 )
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.views import CameraArrays
-from scas4d_core.first_frame.glossy import fit_by_direction
+from scas4d_core.first_frame.gloss_strengths import estimate_strengths
+from scas4d_core.first_frame.glossy import fit_with_gloss_trial
 from scas4d_core.first_frame.normals import surface_normals
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.first_frame.static_scene import first_trainer
-from scas4d_core.first_frame.strengths import strengths_seen
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels.appearance.direction import CELLS, MIDDLE, NEARNESS, SIDE
 from scas4d_core.preparation import SMALLEST_CLUSTER
@@ -50,7 +50,7 @@ def fitted(state: Gaussians, mode: str, iterations: int = 1200) -> StaticResult:
     factory, rng = ViewFactory(rig()), np.random.default_rng(0)
     views = factory.views(frame(state), {})
     points = state.means + rng.normal(0, 0.003, state.means.shape)
-    return fit_by_direction(
+    return fit_with_gloss_trial(
         lambda: first_trainer(factory, views, points, state.colours, None, SceneSettings(), static),
         mode,  # type: ignore[arg-type]
     )
@@ -128,13 +128,13 @@ def test_strengths_tell_what_is_glossy_from_what_is_dull() -> None:
     half = truth.replace(gloss=np.where(dull[:, None], 0, truth.gloss).astype(np.float32))
     views = ViewFactory(rig()).views(frame(half), {})
     normals = (truth.means / RADIUS).astype(np.float32)
-    found = strengths_seen(normals, truth.environment, truth, views, CpuRenderer((0, 0, 0)))[:, 0]
+    found = estimate_strengths(normals, truth.environment, truth, views, CpuRenderer((0, 0, 0)))[:, 0]
     far = np.abs(truth.means[:, 0]) > 0.05  # neighbours share a strength
     assert np.median(found[dull & far]) < 0.15
     assert 0.3 < np.median(found[~dull & far]) < 0.7
     assert np.isfinite(found).all()
     # Three cameras see few places in the light of a lamp and out of it: the rest has the strength of what is about it.
-    found = strengths_seen(normals, truth.environment, truth, views[:3], CpuRenderer((0, 0, 0)))[:, 0]
+    found = estimate_strengths(normals, truth.environment, truth, views[:3], CpuRenderer((0, 0, 0)))[:, 0]
     assert np.median(found[dull & far]) < 0.05
     assert 0.3 < np.median(found[~dull & far]) < 0.7
 

@@ -7,14 +7,14 @@ import pytest
 from made_rigs import matches as made_matches
 
 from scas4d_core.first_frame.calibration import bundle
-from scas4d_core.first_frame.calibration.bundle import adjusted, tracks_of
+from scas4d_core.first_frame.calibration.bundle import build_tracks, bundle_adjust
 
 RING = made_matches.ring()
 
 
 @pytest.fixture(scope="module")
 def tracks():
-    return tracks_of(made_matches.matches_of(RING))
+    return build_tracks(made_matches.matches_of(RING))
 
 
 def test_tracks_have_each_camera_once(tracks):
@@ -23,14 +23,14 @@ def test_tracks_have_each_camera_once(tracks):
 
 
 def test_a_right_rig_stays(tracks):
-    assert made_matches.off_by(RING, adjusted(RING, tracks)).max() < 0.25  # the noise of a feature
+    assert made_matches.off_by(RING, bundle_adjust(RING, tracks)).max() < 0.25  # the noise of a feature
 
 
 @pytest.mark.parametrize("pixels", [1, 4, 10])
 def test_a_turned_camera_turns_back_and_takes_no_other_along(tracks, pixels):
     given = [made_matches.turned(camera, pixels, (0.6, 0.8, 0)) if camera.name == "c3" else camera for camera in RING]
     assert made_matches.off_by(RING, given).max() > 0.9 * pixels
-    assert made_matches.off_by(RING, adjusted(given, tracks)).max() < 0.25
+    assert made_matches.off_by(RING, bundle_adjust(given, tracks)).max() < 0.25
 
 
 def test_a_rig_that_is_off_all_over_is_mended_but_for_its_world(tracks):
@@ -38,26 +38,26 @@ def test_a_rig_that_is_off_all_over_is_mended_but_for_its_world(tracks):
     rng = np.random.default_rng(5)
     turns = rng.normal(size=(len(RING), 3)) * (1, 1, 0)
     given = [made_matches.turned(c, 1, c.rotation @ turn) for c, turn in zip(RING, turns - turns.mean(0), strict=True)]
-    before, after = made_matches.off_by(RING, given), made_matches.off_by(RING, adjusted(given, tracks))
+    before, after = made_matches.off_by(RING, given), made_matches.off_by(RING, bundle_adjust(given, tracks))
     assert np.median(after) < 0.5 * np.median(before)
 
 
 def test_a_focal_length_is_found_where_it_is_asked_for(tracks):
     given = [made_matches.longer(camera, 1.03) if camera.name == "c3" else camera for camera in RING]
-    found = adjusted(given, tracks, focal=True)
+    found = bundle_adjust(given, tracks, focal=True)
     assert found[3].fx == pytest.approx(RING[3].fx, rel=3e-3)
     assert found[3].fy / found[3].fx == pytest.approx(1.1)
-    assert adjusted(given, tracks)[3].fx == given[3].fx
+    assert bundle_adjust(given, tracks)[3].fx == given[3].fx
 
 
 def test_a_camera_without_tracks_stays_as_it_is(tracks):
     given = [made_matches.turned(camera, 4) if camera.name == "c3" else camera for camera in RING]
     without = [(who[who != 3], uv[who != 3]) for who, uv in tracks if (who != 3).sum() > 1]
-    np.testing.assert_allclose(adjusted(given, without)[3].world_to_camera, given[3].world_to_camera, atol=1e-12)
+    np.testing.assert_allclose(bundle_adjust(given, without)[3].world_to_camera, given[3].world_to_camera, atol=1e-12)
 
 
 def test_the_same_matches_give_the_same_rig(tracks):
-    first, second = adjusted(RING, tracks), adjusted(RING, tracks)
+    first, second = bundle_adjust(RING, tracks), bundle_adjust(RING, tracks)
     assert all(np.array_equal(a.world_to_camera, b.world_to_camera) for a, b in zip(first, second, strict=True))
 
 
@@ -65,7 +65,7 @@ def test_units_and_the_origin_of_the_world_do_not_matter(tracks):
     """In millimetres, far from the origin, the same cameras turn by the same angles."""
     given = [made_matches.turned(camera, 3) if camera.name == "c3" else camera for camera in RING]
     elsewhere = [elsewhere_of(camera) for camera in given]
-    here, there = adjusted(given, tracks), adjusted(elsewhere, tracks)
+    here, there = bundle_adjust(given, tracks), bundle_adjust(elsewhere, tracks)
     for a, b in zip(here, there, strict=True):
         np.testing.assert_allclose(a.rotation, b.rotation, atol=2e-5)
         np.testing.assert_allclose(b.centre / 1000 - (5, -7, 2), a.centre, atol=2e-4)
@@ -83,13 +83,14 @@ def test_derivatives_are_those_of_the_residuals():
     points = rng.uniform(-0.5, 0.5, (4, 3))
     who, what = np.array([0, 1, 1, 2]), np.array([0, 1, 2, 3])
     seen = bundle.Observations(who, what, rng.uniform(0, 200, (4, 2)))
-    problem = bundle._Bundle(RING, seen, True, bundle.TRUST)
+    problem = bundle._BundleAdjustment(RING, seen, True, bundle.MIN_PRIOR_SCALE)
     _, by_camera, by_point = problem._residuals(RING, points)
     step = 1e-6
     for column in range(7):
         move = np.eye(7)[column] * step
         up, down = (
-            problem._residuals([bundle._moved(camera, sign * move) for camera in RING], points)[0] for sign in (1, -1)
+            problem._residuals([bundle._apply_step(camera, sign * move) for camera in RING], points)[0]
+            for sign in (1, -1)
         )
         np.testing.assert_allclose(by_camera[:, :, column], (up - down) / (2 * step), rtol=1e-5, atol=1e-4)
     for column in range(3):
@@ -100,11 +101,13 @@ def test_derivatives_are_those_of_the_residuals():
 
 def test_the_pull_grows_as_the_camera_moves_what_it_sees():
     """A turn by 3 px and a shift by as much pull by 3 px."""
-    problem = bundle._Bundle(
+    problem = bundle._BundleAdjustment(
         RING, bundle.Observations(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2))), False, 0.5
     )
     depth = np.full(len(RING), 3.0)
     given = [made_matches.turned(RING[0], 3), *RING[1:]]
-    np.testing.assert_allclose(np.linalg.norm(problem._pulls(given, depth)[0], axis=1), [3] + [0] * 8, atol=1e-6)
-    shifted = [bundle._moved(RING[0], np.array([0, 0, 0, 0.03, 0, 0])), *RING[1:]]
-    np.testing.assert_allclose(np.linalg.norm(problem._pulls(shifted, depth)[0], axis=1)[0], 3.0, rtol=1e-6)
+    np.testing.assert_allclose(
+        np.linalg.norm(problem._prior_residuals(given, depth)[0], axis=1), [3] + [0] * 8, atol=1e-6
+    )
+    shifted = [bundle._apply_step(RING[0], np.array([0, 0, 0, 0.03, 0, 0])), *RING[1:]]
+    np.testing.assert_allclose(np.linalg.norm(problem._prior_residuals(shifted, depth)[0], axis=1)[0], 3.0, rtol=1e-6)

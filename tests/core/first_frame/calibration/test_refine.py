@@ -11,9 +11,9 @@ from made_rigs import matches as made_matches
 from scas4d_core.cameras import Rig
 from scas4d_core.captures import open_capture
 from scas4d_core.first_frame.calibration import refine
-from scas4d_core.first_frame.calibration.matches import matches_by_appearance
-from scas4d_core.first_frame.calibration.record import in_use
-from scas4d_core.first_frame.calibration.refine import checked_calibration, refined_rig
+from scas4d_core.first_frame.calibration.matches import match_by_appearance
+from scas4d_core.first_frame.calibration.refine import check_calibration, refine_rig
+from scas4d_core.first_frame.calibration.report import effective_rig
 from scas4d_core.frame_report import FrameReport
 from scas4d_core.posed_pictures import collect_views
 from scas4d_core.reconstruction import Reconstruction
@@ -44,23 +44,23 @@ def disturbed(sample):
 
 @pytest.fixture(scope="module")
 def refined(disturbed, images):
-    return checked_calibration(disturbed, images, refine=True)
+    return check_calibration(disturbed, images, refine=True)
 
 
 def test_a_right_calibration_is_told_and_left_as_it_is(sample, images):
-    found = checked_calibration(sample.rig, images, refine=True)
-    assert found.off == []
+    found = check_calibration(sample.rig, images, refine=True)
+    assert found.miscalibrated == []
     assert max(camera.pixels for camera in found.cameras.values() if np.isfinite(camera.pixels)) < 0.6
     assert not found.refined.accepted
     assert found.refined.cameras == {}
     rig = sample.rig
-    assert in_use(rig, {"calibration": asdict(found)}) is rig
+    assert effective_rig(rig, {"calibration": asdict(found)}) is rig
 
 
 def test_a_turned_camera_is_named_and_nothing_is_refined_unasked(disturbed, images):
-    found = checked_calibration(disturbed, images, refine=False)
+    found = check_calibration(disturbed, images, refine=False)
     third = disturbed.names[2]
-    assert found.off == [third]
+    assert found.miscalibrated == [third]
     assert found.cameras[third].pixels > 1
     assert found.refined is None
     (said,) = found.warnings
@@ -70,7 +70,7 @@ def test_a_turned_camera_is_named_and_nothing_is_refined_unasked(disturbed, imag
 
 def test_a_turned_camera_turns_back_and_the_others_stay(sample, disturbed, refined):
     assert refined.refined.accepted
-    rig = in_use(disturbed, FrameReport(0, 0.0, 0, {}, [], 0.0, 0, 0, calibration=refined).record())
+    rig = effective_rig(disturbed, FrameReport(0, 0.0, 0, {}, [], 0.0, 0, 0, calibration=refined).record())
     centre = sample.points.positions.mean(0)
     off = [
         np.linalg.norm(true.project(centre)[0] - found.project(centre)[0])
@@ -78,7 +78,7 @@ def test_a_turned_camera_turns_back_and_the_others_stay(sample, disturbed, refin
     ]
     assert max(off) < 0.5
     third = refined.refined.cameras[disturbed.names[2]]
-    assert third.turned > 0.1  # of 0.4°: what is small in the picture meets a shift as well as a turn
+    assert third.rotation_deg > 0.1  # of 0.4°: what is small in the picture meets a shift as well as a turn
     assert third.after < 0.5 < third.before
     assert refined.refined.after < refined.refined.before
     assert "refined, as asked" in refined.warnings[0]
@@ -88,7 +88,7 @@ def test_a_turned_camera_turns_back_and_the_others_stay(sample, disturbed, refin
 def test_cameras_with_few_matches_stay_as_they_are(sample, disturbed, images):
     """One that sees nothing but grey has none."""
     blind = {**images, disturbed.names[5]: np.full_like(images[disturbed.names[5]], 128)}
-    found = checked_calibration(disturbed, blind, refine=True).refined
+    found = check_calibration(disturbed, blind, refine=True).refined
     assert found.accepted
     assert found.cameras[disturbed.names[5]].fixed
     assert found.cameras[disturbed.names[5]].pose == disturbed.cameras[5].world_to_camera.tolist()
@@ -97,37 +97,37 @@ def test_cameras_with_few_matches_stay_as_they_are(sample, disturbed, images):
 
 def test_what_matches_held_out_do_not_bear_out_is_refused(disturbed, images, monkeypatch):
     """An adjustment that makes it worse is not taken."""
-    matches = matches_by_appearance(collect_views(disturbed, images, {}))
+    matches = match_by_appearance(collect_views(disturbed, images, {}))
     worse = lambda cameras, tracks, **_: [made_matches.turned(camera, 2) for camera in cameras]  # noqa: E731
-    monkeypatch.setattr(refine, "adjusted", worse)
-    found = refined_rig(disturbed, matches)
+    monkeypatch.setattr(refine, "bundle_adjust", worse)
+    found = refine_rig(disturbed, matches)
     assert not found.accepted
     assert "held out are not met better" in found.text
 
 
 def test_two_cameras_are_not_refined(sample, images):
     rig = Rig(sample.rig.cameras[:2])
-    found = checked_calibration(rig, images, refine=True)
+    found = check_calibration(rig, images, refine=True)
     assert not found.refined.accepted
     assert "cameras have" in found.refined.text
 
 
 def test_of_one_picture_nothing_is_told(sample, images):
     name = sample.rig.names[0]
-    assert checked_calibration(sample.rig, {name: images[name]}, refine=True) is None
+    assert check_calibration(sample.rig, {name: images[name]}, refine=True) is None
 
 
 def test_pictures_of_nothing_give_nothing(sample, images):
-    found = checked_calibration(sample.rig, {n: np.zeros_like(i) for n, i in images.items()}, refine=True)
+    found = check_calibration(sample.rig, {n: np.zeros_like(i) for n, i in images.items()}, refine=True)
     assert found.warnings == [found.refined.text]
     assert all(np.isnan(camera.pixels) and camera.matches == 0 for camera in found.cameras.values())
 
 
 def test_large_pictures_are_measured_smaller_and_told_in_their_pixels(sample, disturbed, images, refined):
     large = {name: image.repeat(4, 0).repeat(4, 1) for name, image in images.items()}
-    found = checked_calibration(disturbed.scaled(4), large, refine=False)
+    found = check_calibration(disturbed.scaled(4), large, refine=False)
     third = disturbed.names[2]
-    assert found.off == [third]
+    assert found.miscalibrated == [third]
     assert found.cameras[third].pixels == pytest.approx(4 * refined.refined.cameras[third].before, rel=0.5)
 
 
@@ -163,9 +163,9 @@ def test_without_asking_the_rig_and_the_states_are_as_they_were(sample, disturbe
     """Measuring changes no bit."""
     settings = Settings.model_validate(FEW)
     measured = Reconstruction.start(disturbed, sample.frame(0), settings, points=sample.points)
-    assert measured.report.calibration.off == [disturbed.names[2]]
+    assert measured.report.calibration.miscalibrated == [disturbed.names[2]]
     assert measured.calibrated is disturbed
-    monkeypatch.setattr("scas4d_core.reconstruction.first_calibration", lambda *_, **__: None)
+    monkeypatch.setattr("scas4d_core.reconstruction.calibrate_first_frame", lambda *_, **__: None)
     not_measured = Reconstruction.start(disturbed, sample.frame(0), settings, points=sample.points)
     assert not_measured.report.calibration is None
     assert np.array_equal(measured.history.gaussians(0).means, not_measured.history.gaussians(0).means)

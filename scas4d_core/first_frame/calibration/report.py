@@ -30,13 +30,13 @@ class RefinedCamera:
     """A camera after refinement.
 
     Attributes:
-        turned: degrees. moved: of its centre, in the user's unit. focal: times its focal length as given.
+        rotation_deg: degrees. translation: of its centre, in the user's unit. focal: times its focal length as given.
         before, after: its residual, pixels; NaN with too few matches. fixed: left as given for want of matches.
         pose: [4][4] world to camera, the user's world.
     """
 
-    turned: float
-    moved: float
+    rotation_deg: float
+    translation: float
     focal: float
     before: float
     after: float
@@ -62,29 +62,29 @@ class Refinement:
     matches: int = 0
     cameras: dict[str, RefinedCamera] = field(default_factory=dict)
 
-    def posed(self, camera: Camera) -> Camera:
+    def apply_to(self, camera: Camera) -> Camera:
         """The camera, of any size, as it was refined."""
         refined_camera = self.cameras.get(camera.name)
-        return camera if refined_camera is None else _posed(camera, refined_camera.pose, refined_camera.focal)
+        return camera if refined_camera is None else _with_pose(camera, refined_camera.pose, refined_camera.focal)
 
 
 @dataclass(frozen=True)
-class Calibration:
+class CalibrationReport:
     """The calibration against the pictures of frame 0.
 
     Attributes:
-        cameras: residual of each as it was given, by name. off: names of those that are clearly off.
+        cameras: residual of each as it was given, by name. miscalibrated: names of those that are clearly off.
         warnings: what a person should know, a sentence each; of the refined rig where there is one.
         refined: where that was asked for.
     """
 
     cameras: dict[str, CameraResidual]
-    off: list[str]
+    miscalibrated: list[str]
     warnings: list[str]
     refined: Refinement | None = None
 
 
-def in_use(rig: Rig, record: Mapping[str, Any]) -> Rig:
+def effective_rig(rig: Rig, record: Mapping[str, Any]) -> Rig:
     """The rig that a scene was begun with: with refined cameras where frame 0 has accepted them.
 
     Args:
@@ -94,10 +94,10 @@ def in_use(rig: Rig, record: Mapping[str, Any]) -> Rig:
     >>> pose = np.eye(4)
     >>> pose[0, 3] = 0.5
     >>> record = {"calibration": {"refined": {"accepted": True, "cameras": {"front": {"pose": pose, "focal": 1.01}}}}}
-    >>> refined = in_use(Rig((camera,)), record)["front"]
+    >>> refined = effective_rig(Rig((camera,)), record)["front"]
     >>> refined.centre, refined.fx
     (array([-0.5,  0. ,  0. ]), 101.0)
-    >>> in_use(Rig((camera,)), {})["front"] is camera
+    >>> effective_rig(Rig((camera,)), {})["front"] is camera
     True
     """
     refined = (record.get("calibration") or {}).get("refined") or {}
@@ -106,7 +106,7 @@ def in_use(rig: Rig, record: Mapping[str, Any]) -> Rig:
     cameras = refined["cameras"]
     return Rig(
         tuple(
-            _posed(camera, cameras[camera.name]["pose"], cameras[camera.name]["focal"])
+            _with_pose(camera, cameras[camera.name]["pose"], cameras[camera.name]["focal"])
             if camera.name in cameras
             else camera
             for camera in rig.cameras
@@ -114,7 +114,7 @@ def in_use(rig: Rig, record: Mapping[str, Any]) -> Rig:
     )
 
 
-def _posed(camera: Camera, pose: Any, focal: float) -> Camera:
+def _with_pose(camera: Camera, pose: Any, focal: float) -> Camera:
     intrinsics = camera.intrinsics.copy()
     intrinsics[0, 0] *= focal
     intrinsics[1, 1] *= focal

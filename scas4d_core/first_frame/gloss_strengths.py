@@ -41,7 +41,7 @@ FAINTEST, STRONGEST = 0.004, 1.0
 TINY = 1e-12
 
 
-def strengths_seen(
+def estimate_strengths(
     normals: Array, environment: Array, state: Gaussians, views: Sequence[TrainingView], renderer: Renderer
 ) -> Array:
     """[N, 1] strengths of unit normals [N, 3] in an environment.

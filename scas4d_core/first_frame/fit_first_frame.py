@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.engines.views import TrainingView
-from scas4d_core.first_frame.fit_schedule import FEWER, FitProgress
-from scas4d_core.first_frame.glossy import fit_by_direction
+from scas4d_core.first_frame.fit_schedule import REPORTED_SHORTFALL, FitProgress
+from scas4d_core.first_frame.glossy import fit_with_gloss_trial
 from scas4d_core.first_frame.initial_points import initial_points
-from scas4d_core.first_frame.points.silhouettes import EVERY, backdrop, mean_colour
+from scas4d_core.first_frame.points.silhouettes import PIXEL_STRIDE, backdrop, mean_colour
 from scas4d_core.first_frame.points.stereo import load_stereo
 from scas4d_core.first_frame.static_result import FirstCloud, StaticResult
 from scas4d_core.first_frame.static_scene import first_trainer
@@ -47,11 +47,11 @@ def with_background(settings: Settings, images: Mapping[str, NDArray[np.uint8]])
     if settings.scene.background != "auto":
         return settings
     pictures = [image for image in images.values() if image.ndim == 3 and image.shape[2] == 3]
-    pictures = [image for image in pictures if min(image.shape[:2]) > EVERY]
+    pictures = [image for image in pictures if min(image.shape[:2]) > PIXEL_STRIDE]
     if not pictures:  # they are refused later, in words
         return settings
     backdrop_colour = backdrop(pictures)
-    return _over(settings, _colour(mean_colour(pictures) if backdrop_colour is None else backdrop_colour))
+    return _set_background(settings, _colour(mean_colour(pictures) if backdrop_colour is None else backdrop_colour))
 
 
 def _colour(levels: NDArray[Any]) -> list[float]:
@@ -59,17 +59,17 @@ def _colour(levels: NDArray[Any]) -> list[float]:
     return colour
 
 
-def _over(settings: Settings, background: Sequence[float]) -> Settings:
+def _set_background(settings: Settings, background: Sequence[float]) -> Settings:
     scene = settings.scene.model_copy(update={"background": tuple(background)})
     return settings.model_copy(update={"scene": scene})
 
 
-def as_begun(settings: Settings, history: History) -> Settings:
+def with_recorded_background(settings: Settings, history: History) -> Settings:
     """The settings with the background with which a scene began; as they are where its first frame cannot be read."""
     if settings.scene.background != "auto":
         return settings
     with suppress(HistoryError):
-        return _over(settings, history.background)
+        return _set_background(settings, history.background)
     return settings
 
 
@@ -145,7 +145,7 @@ def fit_static_scene(
     return trainer.result(trainer.train(progress))
 
 
-def fit_first(
+def fit_first_frame(
     frame: Frame,
     points: InitialPoints | None,
     factory: ViewFactory,
@@ -167,36 +167,36 @@ def fit_first(
     if points is None:
         first_points = initial_points(
             factory.rig, frame.images, frame.masks,
-            lambda stage, done, total: on_progress(Progress(stage, done, total, _at_most(limit))), limit=limit,
+            lambda stage, done, total: on_progress(Progress(stage, done, total, _remaining_time(limit))), limit=limit,
         )  # fmt: skip
         cloud, made, stage = (
             _columns(first_points),
-            FirstCloud(first_points.way, len(first_points), first_points.covered),
+            FirstCloud(first_points.method, len(first_points), first_points.coverage),
             first_points.stage,
         )
     else:
         inside = replace(points, positions=world.to_inside(points.positions))
         cloud, made, stage = _columns(inside), FirstCloud("given", len(points)), None
     views = factory.views(frame, {})
-    result = fit_by_direction(
+    result = fit_with_gloss_trial(
         lambda: first_trainer(factory, views, *cloud, settings.scene, static, limit, stage, settings.device),
         settings.effects.get("direction", "auto") if settings.device == "cpu" else "off",
         lambda now: on_progress(Progress("fitting frame 0", now.done, now.planned, _figures(now, limit))),
     )
-    if result.hurried and len(result.losses) <= (1 - FEWER) * static.iterations:
+    if result.ran_short_of_time and len(result.losses) <= (1 - REPORTED_SHORTFALL) * static.iterations:
         limit.shortened.append(f"{len(result.losses)} of {static.iterations} iterations, each phase as much shorter")
     return replace(result, cloud=made, shortened=[*limit.shortened, *result.shortened])
 
 
-def _at_most(limit: TimeLimit) -> dict[str, float]:
+def _remaining_time(limit: TimeLimit) -> dict[str, float]:
     """The seconds after which frame 0 should be through, where that is known."""
-    return {"seconds_at_most": max(0.0, limit.left())} if limit.bounded else {}
+    return {"seconds_at_most": max(0.0, limit.seconds_left())} if limit.bounded else {}
 
 
 def _figures(now: FitProgress, limit: TimeLimit) -> dict[str, float]:
     """The figures of a progress of the fit."""
     left = {} if now.seconds is None else {"seconds_left": now.seconds}
-    return {"loss": now.loss, **left, **_at_most(limit)}
+    return {"loss": now.loss, **left, **_remaining_time(limit)}
 
 
 def _columns(cloud: InitialPoints) -> tuple[NDArray[np.float64], NDArray[np.float32], NDArray[np.float32] | None]:

@@ -13,7 +13,7 @@ from scas4d_core.errors import InputError, message_of
 
 
 @contextmanager
-def whole_file(path: Path | str) -> Iterator[Path]:
+def atomic_path(path: Path | str) -> Iterator[Path]:
     """Gives a temporary name beside ``path``; in the end that file is renamed to ``path``, or removed on an error.
 
     The temporary name keeps the suffix, by which some libraries choose the format.
@@ -23,7 +23,7 @@ def whole_file(path: Path | str) -> Iterator[Path]:
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
-    ...     with whole_file(f"{folder}/a.txt") as beside:
+    ...     with atomic_path(f"{folder}/a.txt") as beside:
     ...         written = beside.write_text("whole")
     ...     [file.name for file in Path(folder).iterdir()]
     ['a.txt']
@@ -31,7 +31,7 @@ def whole_file(path: Path | str) -> Iterator[Path]:
     target = Path(path)
     beside = _beside(target)
     try:
-        with writing(target):
+        with translate_write_errors(target):
             yield beside
             beside.replace(target)
     finally:
@@ -50,7 +50,7 @@ def check_writable(path: Path | str) -> None:
     scas4d_core.errors.InputError: out 'no_such_folder/a.glb' cannot be written (...); give a path in a ...
     """
     target = Path(path)
-    with writing(target):
+    with translate_write_errors(target):
         beside = _beside(target)
         beside.touch()
         beside.unlink()
@@ -61,7 +61,7 @@ def _beside(target: Path) -> Path:
 
 
 @contextmanager
-def writing(path: Path | str) -> Iterator[None]:
+def translate_write_errors(path: Path | str) -> Iterator[None]:
     """Turns an ``OSError`` into an ``InputError`` that names the output."""
     try:
         yield
@@ -72,7 +72,7 @@ def writing(path: Path | str) -> Iterator[None]:
         ) from error
 
 
-def package(name: str, export: str) -> Any:
+def import_optional(name: str, export: str) -> Any:
     """Imports a package of the extra ``exports``.
 
     Args:
@@ -81,7 +81,7 @@ def package(name: str, export: str) -> Any:
     Raises:
         InputError: it is not installed; the remedy is the command that installs it.
 
-    >>> package("no_such_package", "usd")
+    >>> import_optional("no_such_package", "usd")
     Traceback (most recent call last):
     scas4d_core.errors.InputError: format 'usd' needs the package no_such_package, which is not installed; in ...
     """
