@@ -26,6 +26,8 @@ HUGE = wp.constant(wp.float32(3.0e38))
 RECORD = 4
 """Rows of a splat in ``records`` [4 N]. Ten numbers are sums over pixels: dL/dpower times 1, x, y, xx, xy and yy of
 the offset (x, y) from the mean, and dL/dfeatures; the rest pads them to 64 bytes."""
+FEATURES = 6
+"""The first of the ten numbers that is of features."""
 RECORD_ROWS = wp.constant(RECORD)
 
 

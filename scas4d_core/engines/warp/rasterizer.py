@@ -28,6 +28,7 @@ class Rasterizer:
         device: of Warp, as "cpu" or "cuda:0". count: Gaussians. limits: constants of the rasterizer.
 
     Attributes:
+        count: see above.
         planes: [5, rows, columns] of the last picture: four features, background included, and transmittance left.
         g_planes: [4, rows, columns] gradient that ``carry_back`` reads.
         splats, records: [2 N] and [4 N] of vec4, see ``projection``.
@@ -38,7 +39,7 @@ class Rasterizer:
     """
 
     def __init__(self, device: str, count: int, limits: Limits = DEFAULT) -> None:
-        self._device, self._count, self._limits = device, count, limits
+        self._device, self.count, self._limits = device, count, limits
         self._lanes = lanes_of(device)
         self._warps = max(1, WARPS_EACH * wp.get_device(device).sm_count)
         self._columns = self._rows = 0
@@ -52,7 +53,7 @@ class Rasterizer:
         """Makes room for pictures of a size, and for ``capacity`` entries."""
         device = self._device
         self._columns, self._rows = columns, rows
-        self._raster = raster_of(self._limits, self._count, columns, rows, self.capacity)
+        self._raster = raster_of(self._limits, self.count, columns, rows, self.capacity)
         self._tiles = self._raster.tiles_x * self._raster.tiles_y
         segments = self.capacity // SEGMENT + self._tiles
         self.planes = wp.zeros((CHANNELS + 1, rows, columns), dtype=wp.float32, device=device)
@@ -66,6 +67,10 @@ class Rasterizer:
         self._segment_features = wp.zeros(segments * PIXELS, dtype=wp.vec4, device=device)
         self._keys = wp.zeros(self.capacity, dtype=wp.uint64, device=device)
         self.items = wp.zeros(self.capacity, dtype=wp.int32, device=device)
+
+    def holds(self, columns: int, rows: int) -> bool:
+        """Whether pictures of a size have room."""
+        return columns <= self._columns and rows <= self._rows
 
     def grow(self) -> bool:
         """Makes room for twice as many entries where there was too little; waits for the device.
@@ -92,7 +97,7 @@ class Rasterizer:
             record, log: [1] and [records, 8]: this row of the log is set to 0, its last but one number to the entries
                 of the lists.
         """
-        device, count, view_of = self._device, self._count, [cameras, view]
+        device, count, view_of = self._device, self.count, [cameras, view]
         given = [means, factors, opacities, features]
         out = [self.splats, self._boxes, self.records, self._tile_counts]
         wp.launch(projection.project, count, [self._raster, *view_of, *given, *out], device=device)
@@ -135,4 +140,8 @@ class Rasterizer:
         """Adds the gradients of the Gaussians, from ``records``, to [N] of vec3, mat33 and vec4."""
         given = [self._raster, cameras, view, means, factors, self.splats, self.records]
         inputs = [*given, g_means, g_factors, g_features]
-        wp.launch(projection.project_backward, self._count, inputs, device=self._device)
+        wp.launch(projection.project_backward, self.count, inputs, device=self._device)
+
+    def mark(self, cameras: wp.array, side: int, marks: wp.array) -> None:
+        """Marks the blocks, of so many pixels a side, that what was projected meets; see ``tiles.mark_blocks``."""
+        wp.launch(tiles.mark_blocks, self.count, [side, cameras, self.splats, self._boxes, marks], device=self._device)

@@ -10,8 +10,8 @@ from __future__ import annotations
 import warp as wp
 
 from scas4d_core.engines.warp.lanes import bits_of, load
-from scas4d_core.engines.warp.layout import SEGMENT, Camera, Raster
-from scas4d_core.engines.warp.projection import tile_form
+from scas4d_core.engines.warp.layout import SEGMENT, TILE, Camera, Raster
+from scas4d_core.engines.warp.projection import least_form, tile_form
 
 wp.set_module_options({"enable_backward": False})
 
@@ -20,6 +20,7 @@ SCAN_BLOCK = 1024
 SORT_BLOCK = 512
 """Threads of a block that sorts a list."""
 PER_SEGMENT = wp.constant(SEGMENT)
+SIDE = wp.constant(TILE)
 
 
 @wp.func_native("""
@@ -216,3 +217,34 @@ def sort_lists(
         segment_tiles[segment] = tile
     if count > 0:
         sort_list(thread, first, count, keys, items)
+
+
+@wp.kernel
+def mark_blocks(
+    side: wp.int32,
+    cameras: wp.array[Camera],
+    splats: wp.array[wp.vec4],
+    boxes: wp.array[wp.vec4i],
+    marks: wp.array2d[wp.int32],
+) -> None:
+    """Marks the blocks of pixels that the supports of Gaussians meet; a thread for each Gaussian.
+
+    Args:
+        side: pixels of a block's side, of which a tile's is a multiple. cameras: [1]. splats, boxes: from projection.
+        marks: [rows, columns] of blocks, set to 1 or left.
+    """
+    i = wp.tid()
+    first = load(splats, 2 * i)
+    second = load(splats, 2 * i + 1)
+    if second[2] > 0.0:
+        camera = cameras[0]
+        box = boxes[i]
+        blocks = SIDE // side
+        for y in range(box[1] * blocks, wp.min(box[3] * blocks, (camera.height + side - 1) // side)):
+            top = wp.float32(y * side) + 0.5 - first[1]
+            bottom = top + wp.float32(wp.min(side, camera.height - y * side) - 1)
+            for x in range(box[0] * blocks, wp.min(box[2] * blocks, (camera.width + side - 1) // side)):
+                left = wp.float32(x * side) + 0.5 - first[0]
+                right = left + wp.float32(wp.min(side, camera.width - x * side) - 1)
+                if least_form(first[2], first[3], second[0], left, right, top, bottom) <= second[2]:
+                    marks[y, x] = 1
