@@ -38,7 +38,7 @@ ONE = wp.constant(wp.uint32(1))
 
 @wp.struct
 class Spot:
-    """A lane's pixel: its place, whether it is in the picture, and the centres of its warp's pixels."""
+    """A lane's pixel: its place and centre, whether it is in the picture, and its warp's upper left pixel's centre."""
 
     x: wp.int32
     y: wp.int32
@@ -46,9 +46,7 @@ class Spot:
     centre_x: wp.float32
     centre_y: wp.float32
     left: wp.float32
-    right: wp.float32
     top: wp.float32
-    bottom: wp.float32
 
 
 @wp.func
@@ -65,14 +63,10 @@ def spot_of(raster: Raster, camera: Camera, tile: wp.int32, k: wp.int32) -> Spot
     spot.centre_x = wp.float32(spot.x) + 0.5
     spot.centre_y = wp.float32(spot.y) + 0.5
     spot.left = spot.centre_x
-    spot.right = spot.centre_x
     spot.top = spot.centre_y
-    spot.bottom = spot.centre_y
     if lane_count() > 1:
         spot.left = wp.float32(x0) + 0.5
-        spot.right = spot.left + 7.0
         spot.top = wp.float32(y0) + 0.5
-        spot.bottom = spot.top + 3.0
     return spot
 
 
@@ -81,10 +75,11 @@ def meets(spot: Spot, first: wp.vec4, second: wp.vec4) -> wp.int32:
     """1 where a support meets the warp's pixels."""
     met = wp.int32(0)
     if second[2] > 0.0:
-        form = least_form(
-            first[2], first[3], second[0], spot.left - first[0], spot.right - first[0], spot.top - first[1],
-            spot.bottom - first[1],
-        )  # fmt: skip
+        across = wp.where(lane_count() > 1, 7.0, 0.0)
+        down = wp.where(lane_count() > 1, 3.0, 0.0)
+        left = spot.left - first[0]
+        top = spot.top - first[1]
+        form = least_form(first[2], first[3], second[0], left, left + across, top, top + down)
         if form <= second[2]:
             met = wp.int32(1)
     return met
@@ -197,7 +192,6 @@ def blend_segments(
         segment_light, segment_features: out [segments · 256] the light that a segment lets pass at each pixel of its
             tile, below the stop where the pixel is finished even by this segment alone, and the features drawn.
     """
-    camera = cameras[view[0]]
     parts = AREA // lane_count()
     total = segment_starts[raster.tiles_x * raster.tiles_y] * parts
     unit = wp.int32(wp.tid() // lane_count())
@@ -206,7 +200,7 @@ def blend_segments(
         k = (unit - segment * parts) * lane_count() + lane()
         tile = segment_tiles[segment]
         begin = starts[tile] + (segment - segment_starts[tile]) * LENGTH
-        spot = spot_of(raster, camera, tile, k)
+        spot = spot_of(raster, cameras[view[0]], tile, k)
         light = draw_entries(
             raster, splats, features, items, begin, wp.min(begin + LENGTH, starts[tile + 1]), spot, spot.inside, 1.0, 0
         )
@@ -284,21 +278,26 @@ def join_segments(
         planes[4, spot.y, spot.x] = light.passed
 
 
-# A transposing butterfly: 16 shuffles for ten sums, each of which ends in a lane that adds it.
+# A transposing butterfly: 16 shuffles for ten sums, each of which ends in a lane that adds it. The compiler knows each
+# index, so that the numbers stay in registers.
 @wp.func_native("""
 float* record = reinterpret_cast<float*>(records.data + row);
 #if defined(__CUDA_ARCH__)
 float v[16] = {a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f};
 const int own = threadIdx.x & 31;
-#pragma unroll
-for (int half = 8; half > 0; half >>= 1) {
+const auto halve = [&](const int half) {
     const bool upper = own & (2 * half);
 #pragma unroll
-    for (int k = 0; k < half; ++k) {
-        const float given = upper ? v[k] : v[k + half], kept = upper ? v[k + half] : v[k];
-        v[k] = kept + __shfl_xor_sync(0xffffffffu, given, 2 * half);
-    }
-}
+    for (int k = 0; k < 8; ++k)
+        if (k < half) {
+            const float given = upper ? v[k] : v[k + half], kept = upper ? v[k + half] : v[k];
+            v[k] = kept + __shfl_xor_sync(0xffffffffu, given, 2 * half);
+        }
+};
+halve(8);
+halve(4);
+halve(2);
+halve(1);
 v[0] += __shfl_xor_sync(0xffffffffu, v[0], 1);
 const int which = own >> 1;
 if (!(own & 1) && which < 10) atomicAdd(record + which, v[0]);
@@ -341,7 +340,6 @@ def blend_backward(
         g_planes: [4, rows, columns] dL/dplanes of the features.
         records: [4 N], added to; see ``projection``.
     """
-    camera = cameras[view[0]]
     parts = AREA // lane_count()
     total = segment_starts[raster.tiles_x * raster.tiles_y] * parts
     unit = wp.int32(wp.tid() // lane_count())
@@ -352,7 +350,7 @@ def blend_backward(
         number = segment - segment_starts[tile]
         base = starts[tile] + number * LENGTH
         end = wp.min(base + LENGTH, starts[tile + 1])
-        spot = spot_of(raster, camera, tile, k)
+        spot = spot_of(raster, cameras[view[0]], tile, k)
         open = wp.int32(0)
         passed = wp.float32(1.0)
         behind = wp.float32(0.0)  # what the entries behind the present one contribute, background included

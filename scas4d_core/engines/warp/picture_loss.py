@@ -18,7 +18,8 @@ from scas4d_core.engines.views import TrainingView
 from scas4d_core.engines.warp.layout import Camera, camera_of
 from scas4d_core.guards import SSIM_C1, SSIM_C2
 
-wp.set_module_options({"enable_backward": False})
+# Loops over the window stay loops, of a length that the compiler does not know: written out, they take all registers.
+wp.set_module_options({"enable_backward": False, "max_unroll": 4})
 
 Array = NDArray[np.float32]
 
@@ -34,14 +35,13 @@ IMAGE_LOSS, MASK_LOSS, SQUARES, SHIFT, PAIRS = 0, 1, 2, 3, 6
 
 _taps = np.exp(-((np.arange(2 * REACH + 1) - REACH) ** 2) / (2 * 1.5**2))
 _taps /= _taps.sum()
-# Tap k of the window for offset k − 3 from the first row of four: zeros on either side.
-_padded = [0.0] * (ROWS - 1) + _taps.tolist() + [0.0] * (ROWS - 1)
-TAPS = wp.constant(wp.types.vector(length=2 * REACH + 1, dtype=wp.float32)(*_taps.tolist()))
-PADDED = wp.constant(wp.types.vector(length=len(_padded), dtype=wp.float32)(*_padded))
-WINDOW = wp.constant(2 * REACH + 1)
-WINDOWS = wp.constant(2 * REACH + ROWS)
+PADDED_TAPS = np.float32([0.0] * (ROWS - 1) + _taps.tolist() + [0.0] * (ROWS - 1))
+"""[17] weights of the window, with zeros on either side for those of four rows that a window does not reach."""
+
+
 HALF = wp.constant(REACH)
 BAND = wp.constant(ROWS)
+PAD = wp.constant(ROWS - 1)
 C1 = wp.constant(wp.float32(SSIM_C1))
 C2 = wp.constant(wp.float32(SSIM_C2))
 L1_PART = wp.constant(wp.float32(0.8))
@@ -138,6 +138,8 @@ def place_of(
 @wp.kernel
 def target_moments(
     cameras: wp.array[Camera],
+    window: wp.int32,
+    taps: wp.array[wp.float32],
     targets: wp.array4d[wp.float32],
     means: wp.array4d[wp.float32],
     squares: wp.array4d[wp.float32],
@@ -152,19 +154,20 @@ def target_moments(
     if x < camera.width and y < camera.height:
         mean = wp.float32(0.0)
         square = wp.float32(0.0)
-        for down in range(WINDOW):
+        for down in range(window):
             row = y + down - HALF
             if row >= 0 and row < camera.height:
                 sum_mean = wp.float32(0.0)
                 sum_square = wp.float32(0.0)
-                for across in range(WINDOW):
+                for across in range(window):
                     column = x + across - HALF
                     if column >= 0 and column < camera.width:
                         value = targets[view, channel, row, column]
-                        sum_mean += TAPS[across] * value
-                        sum_square += TAPS[across] * value * value
-                mean += TAPS[down] * sum_mean
-                square += TAPS[down] * sum_square
+                        sum_mean += taps[across + PAD] * value
+                        sum_square += taps[across + PAD] * value * value
+                tap = taps[down + PAD]
+                mean += tap * sum_mean
+                square += tap * sum_square
         means[view, channel, y, x] = mean
         squares[view, channel, y, x] = square
 
@@ -175,6 +178,8 @@ def picture_loss(
     channels: wp.array[wp.int32],
     view: wp.array[wp.int32],
     record: wp.array[wp.int32],
+    window: wp.int32,
+    taps: wp.array[wp.float32],
     exposures: wp.array2d[wp.vec2],
     weights: wp.vec4,
     planes: wp.array3d[wp.float32],
@@ -190,7 +195,8 @@ def picture_loss(
 
     Args:
         channels: [views] of each target. view, record: [1] index of the view, and row of the log.
-        exposures: [views, 4] gain and offset. weights: of the mean over a plane, by channel.
+        window: 11. taps: see ``PADDED_TAPS``. exposures: [views, 4] gain and offset.
+        weights: of the mean over a plane, by channel.
         planes: [4 or more, rows, columns] the rendering.
         targets, means, squares: [views, 4, rows, columns] see ``target_moments``.
         by_window: out [4, rows, columns] derivatives of SSIM by the window's mean, mean square and mean product.
@@ -205,24 +211,24 @@ def picture_loss(
         mean = wp.vec4(0.0, 0.0, 0.0, 0.0)
         square = wp.vec4(0.0, 0.0, 0.0, 0.0)
         product = wp.vec4(0.0, 0.0, 0.0, 0.0)
-        for down in range(WINDOWS):
+        for down in range(window + PAD):
             row = at.y + down - HALF
             if row >= 0 and row < at.height:
                 sum_mean = wp.float32(0.0)
                 sum_square = wp.float32(0.0)
                 sum_product = wp.float32(0.0)
-                for across in range(WINDOW):
+                for across in range(window):
                     column = x + across - HALF
                     if column >= 0 and column < at.width:
                         value = at.gain * planes[channel, row, column] + at.offset
-                        weighted = TAPS[across] * value
+                        weighted = taps[across + PAD] * value
                         sum_mean += weighted
                         sum_square += weighted * value
                         sum_product += weighted * targets[at.view, channel, row, column]
-                taps = wp.vec4(PADDED[down + 3], PADDED[down + 2], PADDED[down + 1], PADDED[down])
-                mean += taps * sum_mean
-                square += taps * sum_square
-                product += taps * sum_product
+                rows = wp.vec4(taps[down + 3], taps[down + 2], taps[down + 1], taps[down])
+                mean += rows * sum_mean
+                square += rows * sum_square
+                product += rows * sum_product
         for k in range(BAND):
             y = at.y + k
             if y < at.height:
@@ -259,6 +265,8 @@ def picture_gradient(
     cameras: wp.array[Camera],
     channels: wp.array[wp.int32],
     view: wp.array[wp.int32],
+    window: wp.int32,
+    taps: wp.array[wp.float32],
     exposures: wp.array2d[wp.vec2],
     weights: wp.vec4,
     planes: wp.array3d[wp.float32],
@@ -279,18 +287,18 @@ def picture_gradient(
         by_square = wp.vec4(0.0, 0.0, 0.0, 0.0)
         by_product = wp.vec4(0.0, 0.0, 0.0, 0.0)
         if at.compared == 1:
-            for down in range(WINDOWS):
+            for down in range(window + PAD):
                 row = at.y + down - HALF
                 if row >= 0 and row < at.height:
                     sums = wp.vec3(0.0, 0.0, 0.0)
-                    for across in range(WINDOW):
+                    for across in range(window):
                         column = x + across - HALF
                         if column >= 0 and column < at.width:
-                            sums += TAPS[across] * by_window[channel, row, column]
-                    taps = wp.vec4(PADDED[down + 3], PADDED[down + 2], PADDED[down + 1], PADDED[down])
-                    by_mean += taps * sums[0]
-                    by_square += taps * sums[1]
-                    by_product += taps * sums[2]
+                            sums += taps[across + PAD] * by_window[channel, row, column]
+                    rows = wp.vec4(taps[down + 3], taps[down + 2], taps[down + 1], taps[down])
+                    by_mean += rows * sums[0]
+                    by_square += rows * sums[1]
+                    by_product += rows * sums[2]
         for k in range(BAND):
             y = at.y + k
             if y < at.height:
@@ -320,6 +328,7 @@ class PictureLoss:
         self._weights = [image_weight / 3] * 3 + [mask_weight]
         self._taken: list[Array | None] = []
         self._sent: wp.Event | None = None
+        self._window = 2 * REACH + 1, wp.array(PADDED_TAPS, dtype=wp.float32, device=device)
         self.columns = self.rows = 0
 
     def load(self, views: Sequence[TrainingView]) -> bool:
@@ -352,23 +361,24 @@ class PictureLoss:
         for index in fresh:
             wp.copy(self.targets, self._targets, size * index, size * index, size)
         if fresh:
-            shape, moments = self.targets.shape, [self.target_means, self.target_squares]
-            wp.launch(target_moments, shape, [self.cameras, self.targets, *moments], device=self._device)
+            moments = [self.targets, self.target_means, self.target_squares]
+            wp.launch(target_moments, self.targets.shape, [self.cameras, *self._window, *moments], device=self._device)
         if wp.get_device(self._device).is_cuda:
-            self._sent = wp.record_event(self._sent)
+            self._sent = wp.get_stream(self._device).record_event(self._sent)
         return replaced
 
     def measure(self, view: wp.array, record: wp.array, planes: wp.array, log: wp.array) -> None:
         """Adds the loss of a view's rendering to a row of the log; see ``picture_loss``."""
-        given = [self.cameras, self.channels, view, record, self.exposures, wp.vec4(*self._weights), planes]
-        kept = [self.targets, self.target_means, self.target_squares, self._by_window, log]
+        given = [self.cameras, self.channels, view, record, *self._window, self.exposures, wp.vec4(*self._weights)]
+        kept = [planes, self.targets, self.target_means, self.target_squares, self._by_window, log]
         wp.launch(picture_loss, self._threads, given + kept, device=self._device)
 
     def carry_back(self, view: wp.array, planes: wp.array, weight: float, g_planes: wp.array) -> None:
         """Fills the gradient of what was measured last, times a weight; see ``picture_gradient``."""
         weights = wp.vec4(*(weight * each for each in self._weights))
-        given = [self.cameras, self.channels, view, self.exposures, weights, planes, self.targets]
-        wp.launch(picture_gradient, self._threads, [*given, self._by_window, g_planes], device=self._device)
+        given = [self.cameras, self.channels, view, *self._window, self.exposures, weights]
+        kept = [planes, self.targets, self._by_window, g_planes]
+        wp.launch(picture_gradient, self._threads, given + kept, device=self._device)
 
     def _allocate(self, views: int, columns: int, rows: int) -> None:
         """Makes the buffers of so many views, whose pictures are to be sent."""

@@ -30,13 +30,6 @@ class WarpRenderer:
     Args:
         background: RGB in 0…1. limits: constants of the rasterizer.
         device: of Warp, as "cpu" or "cuda:0". image_weight: of the image loss in ``compare``.
-
-    >>> from scas4d_core.cameras import Camera
-    >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
-    >>> camera = Camera("front", [[100, 0, 8], [0, 100, 8], [0, 0, 1]], np.eye(4), 16, 16)
-    >>> picture = WarpRenderer((0, 0, 0), device="cpu").render(state, CameraArrays.of(camera))
-    >>> picture.features[:, 8, 8].round(2)
-    array([0.89, 0.  , 0.  , 0.  ], dtype=float32)
     """
 
     def __init__(

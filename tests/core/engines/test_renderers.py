@@ -53,6 +53,17 @@ def test_depth_features_and_another_background(tested: Renderer) -> None:
     assert true.features[LABEL].max() > 1.5  # metres
 
 
+def test_eight_features_of_gaussians_that_are_not_all_sound(tested: Renderer) -> None:
+    state, rng = gaussians(), np.random.default_rng(0)
+    means, given = state.means.copy(), rng.uniform(size=(len(state), 8)).astype(np.float32)
+    means[11], given[20, 6], given[30, 1] = np.nan, np.inf, 1e12
+    state = state.replace(means=means)
+    mine, true = (renderer.render(state, CAMERA, given) for renderer in (tested, TRUE))
+    assert mine.features.shape == (8, 40, 48)
+    assert apart(mine.features, true.features) < CLOSE
+    assert apart(mine.rest, true.rest) < CLOSE
+
+
 def test_comparisons(tested: Renderer) -> None:
     scene = case(gaussians())
     for view in scene.views[:3]:
