@@ -24,7 +24,8 @@ from scas4d_core.engines.warp.lanes import (
     store,
 )
 from scas4d_core.engines.warp.layout import PIXELS, SEGMENT, TILE, Camera, Raster
-from scas4d_core.engines.warp.projection import RECORD, least_form
+from scas4d_core.engines.warp.projection import RECORD
+from scas4d_core.engines.warp.supports import least_form
 
 wp.set_module_options({"enable_backward": False})
 
@@ -246,9 +247,18 @@ def join_segments(
     at = segment_starts[tile] * AREA + k
     count = wp.int32(0)
     segment = wp.int32(0)
+    # The next segment's numbers are loaded before they are needed.
+    next_passed = wp.float32(1.0)
+    next_drawn = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    if segments > 0:
+        next_passed = segment_light[at]
+        next_drawn = load(segment_features, at)
     while segment < segments and ballot(light.open) != NONE:
-        passed = segment_light[at]
-        drawn = load(segment_features, at)
+        passed = next_passed
+        drawn = next_drawn
+        if segment + 1 < segments:
+            next_passed = segment_light[at + AREA]
+            next_drawn = load(segment_features, at + AREA)
         anew = wp.int32(0)
         if light.open == 1:
             segment_light[at] = light.passed

@@ -82,6 +82,16 @@ def broadcast(value: wp.int32, source: wp.int32) -> wp.int32:
 
 @wp.func_native("""
 #if defined(__CUDA_ARCH__)
+__syncwarp();
+#endif
+""")
+def sync_lanes() -> None:
+    """Waits for the lanes of the warp; what they have written can be read by each other."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
 for (int k = 16; k > 0; k >>= 1) value += __shfl_xor_sync(0xffffffffu, value, k);
 #endif
 return value;

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from scas4d_core.engines.renderer import CHANNELS
 from scas4d_core.engines.views import TrainingView
-from scas4d_core.engines.warp.layout import Camera, camera_of
+from scas4d_core.engines.warp.layout import TILE, Camera, camera_of
+from scas4d_core.engines.warp.rasterizer import Rasterizer
 from scas4d_core.guards import SSIM_C1, SSIM_C2
 
 # Loops over the window stay loops, of a length that the compiler does not know: written out, they take all registers.
@@ -41,6 +42,7 @@ PADDED_TAPS = np.float32([0.0] * (ROWS - 1) + _taps.tolist() + [0.0] * (ROWS - 1
 
 HALF = wp.constant(REACH)
 BAND = wp.constant(ROWS)
+SIDE = wp.constant(TILE)
 PAD = wp.constant(ROWS - 1)
 C1 = wp.constant(wp.float32(SSIM_C1))
 C2 = wp.constant(wp.float32(SSIM_C2))
@@ -173,6 +175,41 @@ def target_moments(
 
 
 @wp.kernel
+def find_blank(cameras: wp.array[Camera], targets: wp.array4d[wp.float32], blank: wp.array3d[wp.int32]) -> None:
+    """Marks the tiles in which each target is 0; a thread for each tile.
+
+    Args:
+        targets: [views, 4, rows, columns]. blank: out [views, tile rows, tile columns] 1 or 0.
+    """
+    view, tile_y, tile_x = wp.tid()
+    camera = cameras[view]
+    found = wp.int32(1)
+    for channel in range(4):
+        for y in range(tile_y * SIDE, wp.min(tile_y * SIDE + SIDE, camera.height)):
+            for x in range(tile_x * SIDE, wp.min(tile_x * SIDE + SIDE, camera.width)):
+                if targets[view, channel, y, x] != 0.0:
+                    found = wp.int32(0)
+    blank[view, tile_y, tile_x] = found
+
+
+@wp.func
+def nothing_near(
+    here: Place, tiles_x: wp.int32, starts: wp.array[wp.int32], background: wp.array[wp.vec4],
+    blank: wp.array3d[wp.int32],
+) -> wp.bool:  # fmt: skip
+    """True where the windows of a thread's pixels are 0 in the picture and in the target."""
+    nothing = here.offset == 0.0 and background[0][here.channel] == 0.0
+    if nothing:
+        x1 = wp.min(here.x + HALF, here.width - 1) // SIDE
+        y1 = wp.min(here.y + BAND - 1 + HALF, here.height - 1) // SIDE
+        for y in range(wp.max(here.y - HALF, 0) // SIDE, y1 + 1):
+            for x in range(wp.max(here.x - HALF, 0) // SIDE, x1 + 1):
+                tile = y * tiles_x + x
+                nothing = nothing and starts[tile + 1] == starts[tile] and blank[here.view, y, x] == 1
+    return nothing
+
+
+@wp.kernel
 def picture_loss(
     cameras: wp.array[Camera],
     channels: wp.array[wp.int32],
@@ -186,10 +223,16 @@ def picture_loss(
     targets: wp.array4d[wp.float32],
     means: wp.array4d[wp.float32],
     squares: wp.array4d[wp.float32],
+    tiles_x: wp.int32,
+    starts: wp.array[wp.int32],
+    background: wp.array[wp.vec4],
+    blank: wp.array3d[wp.int32],
     by_window: wp.array3d[wp.vec3],
     log: wp.array2d[wp.float32],
 ) -> None:
     """Adds up the loss of a view, and keeps its derivatives by the quantities of SSIM's window.
+
+    Windows of which picture and target are 0 have no loss. Their derivatives are multiplied by 0 where they are read.
 
     The launch is [4, bands of ``ROWS`` rows, columns]; each block is within one channel.
 
@@ -199,6 +242,7 @@ def picture_loss(
         weights: of the mean over a plane, by channel.
         planes: [4 or more, rows, columns] the rendering.
         targets, means, squares: [views, 4, rows, columns] see ``target_moments``.
+        tiles_x, starts, background: of the picture's tile lists, and behind everything. blank: see ``find_blank``.
         by_window: out [4, rows, columns] derivatives of SSIM by the window's mean, mean square and mean product.
         log: [records, ``COLUMNS``], added to.
     """
@@ -207,7 +251,12 @@ def picture_loss(
     loss = wp.float32(0.0)
     squared = wp.float32(0.0)
     shift = wp.float32(0.0)
-    if at.compared == 1:
+    nothing = nothing_near(at, tiles_x, starts, background, blank)
+    if at.compared == 1 and nothing:
+        for k in range(BAND):
+            if at.y + k < at.height:
+                by_window[channel, at.y + k, x] = wp.vec3(0.0, 0.0, 0.0)
+    elif at.compared == 1:
         mean = wp.vec4(0.0, 0.0, 0.0, 0.0)
         square = wp.vec4(0.0, 0.0, 0.0, 0.0)
         product = wp.vec4(0.0, 0.0, 0.0, 0.0)
@@ -271,10 +320,14 @@ def picture_gradient(
     weights: wp.vec4,
     planes: wp.array3d[wp.float32],
     targets: wp.array4d[wp.float32],
+    tiles_x: wp.int32,
+    starts: wp.array[wp.int32],
     by_window: wp.array3d[wp.vec3],
     g_planes: wp.array3d[wp.float32],
 ) -> None:
     """Fills the gradient of the loss of a view by its planes; the launch is that of ``picture_loss``.
+
+    Tiles whose lists are empty are left as they are: nothing there has a gradient.
 
     Args:
         weights: of the mean over a plane, by channel. by_window: from ``picture_loss``.
@@ -282,7 +335,11 @@ def picture_gradient(
     """
     channel, band, x = wp.tid()
     at = place_of(cameras, channels, view, exposures, weights, channel, band, x)
+    some = wp.int32(0)
     if at.shown == 1:
+        tile = (at.y // SIDE) * tiles_x + x // SIDE
+        some = starts[tile + 1] - starts[tile]
+    if some > 0:
         by_mean = wp.vec4(0.0, 0.0, 0.0, 0.0)
         by_square = wp.vec4(0.0, 0.0, 0.0, 0.0)
         by_product = wp.vec4(0.0, 0.0, 0.0, 0.0)
@@ -363,21 +420,29 @@ class PictureLoss:
         if fresh:
             moments = [self.targets, self.target_means, self.target_squares]
             wp.launch(target_moments, self.targets.shape, [self.cameras, *self._window, *moments], device=self._device)
+            wp.launch(find_blank, self._blank.shape, [self.cameras, self.targets, self._blank], device=self._device)
         if wp.get_device(self._device).is_cuda:
             self._sent = wp.get_stream(self._device).record_event(self._sent)
         return replaced
 
-    def measure(self, view: wp.array, record: wp.array, planes: wp.array, log: wp.array) -> None:
-        """Adds the loss of a view's rendering to a row of the log; see ``picture_loss``."""
-        given = [self.cameras, self.channels, view, record, *self._window, self.exposures, wp.vec4(*self._weights)]
-        kept = [planes, self.targets, self.target_means, self.target_squares, self._by_window, log]
-        wp.launch(picture_loss, self._threads, given + kept, device=self._device)
+    def measure(
+        self, view: wp.array, record: wp.array, drawn: Rasterizer, background: wp.array, log: wp.array
+    ) -> None:  # fmt: skip
+        """Adds the loss of a view's rendering to a row of the log; see ``picture_loss``.
 
-    def carry_back(self, view: wp.array, planes: wp.array, weight: float, g_planes: wp.array) -> None:
-        """Fills the gradient of what was measured last, times a weight; see ``picture_gradient``."""
+        Args:
+            drawn: rasterizer that drew it. background: [1] of vec4, behind everything.
+        """
+        given = [self.cameras, self.channels, view, record, *self._window, self.exposures, wp.vec4(*self._weights)]
+        targets = [drawn.planes, self.targets, self.target_means, self.target_squares]
+        kept = [drawn.tiles_x, drawn.starts, background, self._blank, self._by_window, log]
+        wp.launch(picture_loss, self._threads, given + targets + kept, device=self._device)
+
+    def carry_back(self, view: wp.array, drawn: Rasterizer, weight: float) -> None:
+        """Fills ``drawn.g_planes`` with the gradient of what was measured last, times a weight."""
         weights = wp.vec4(*(weight * each for each in self._weights))
         given = [self.cameras, self.channels, view, *self._window, self.exposures, weights]
-        kept = [planes, self.targets, self._by_window, g_planes]
+        kept = [drawn.planes, self.targets, drawn.tiles_x, drawn.starts, self._by_window, drawn.g_planes]
         wp.launch(picture_gradient, self._threads, given + kept, device=self._device)
 
     def _allocate(self, views: int, columns: int, rows: int) -> None:
@@ -393,6 +458,7 @@ class PictureLoss:
         self.exposures = wp.zeros((views, CHANNELS), dtype=wp.vec2, device=device)
         self.targets = wp.zeros(shape, dtype=wp.float32, device=device)
         self.target_means, self.target_squares = (wp.zeros_like(self.targets) for _ in range(2))
+        self._blank = wp.zeros((views, -(-rows // TILE), -(-columns // TILE)), dtype=wp.int32, device=device)
         self._by_window = wp.zeros(shape[1:], dtype=wp.vec3, device=device)
         self._channels = wp.zeros(views, dtype=wp.int32, device="cpu", pinned=pinned)
         self._exposures = wp.zeros((views, CHANNELS), dtype=wp.vec2, device="cpu", pinned=pinned)

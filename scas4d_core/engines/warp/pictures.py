@@ -89,7 +89,7 @@ class PicturePass:
         cameras, log = self._loss.cameras, self.log
         self._rasterizer.project(cameras, view, means, factors, opacities, features, record, log)
         self._rasterizer.draw(cameras, view, features, self._background)
-        self._loss.measure(view, record, self.planes, log)
+        self._loss.measure(view, record, self._rasterizer, self._background, log)
 
     def launch(
         self, view: wp.array, record: wp.array, means: wp.array, factors: wp.array, opacities: wp.array,
@@ -98,7 +98,7 @@ class PicturePass:
         """As ``measure``; also adds the gradients, times a weight, to ``grad_means`` and the others."""
         self.measure(view, record, means, factors, opacities, features)
         rasterizer, cameras = self._rasterizer, self._loss.cameras
-        self._loss.carry_back(view, self.planes, weight, rasterizer.g_planes)
+        self._loss.carry_back(view, rasterizer, weight)
         rasterizer.carry_back(cameras, view, features)
         gradients = self.grad_means, self.grad_factors, self.grad_features
         rasterizer.carry_to_world(cameras, view, means, factors, *gradients)

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from scas4d_core.engines.warp.lanes import SLACK, fast_divide, load, store
+from scas4d_core.engines.warp.lanes import SLACK, load, store, sync_lanes
 from scas4d_core.engines.warp.layout import TILE, Camera, Raster
+from scas4d_core.engines.warp.supports import enter_lists
 from scas4d_core.guards import FEATURE_CEILING, FOOTPRINT_CEILING, GRADIENT_NOT_FINITE, NOT_FINITE
 
 wp.set_module_options({"enable_backward": False})
@@ -19,48 +20,12 @@ FARTHEST = wp.constant(wp.float32(NOT_FINITE))
 BRIGHTEST = wp.constant(wp.float32(FEATURE_CEILING))
 WIDEST = wp.constant(wp.float32(FOOTPRINT_CEILING))
 STEEPEST = wp.constant(wp.float32(GRADIENT_NOT_FINITE))
-HUGE = wp.constant(wp.float32(3.0e38))
-
-# A splat is two rows of ``splats`` [2 N]: (mean x, mean y, conic a, conic b) and (conic c, ln opacity, reach, depth).
-# Reach is the support's squared Mahalanobis radius, a little widened; 0 where the Gaussian is not drawn.
 RECORD = 4
 """Rows of a splat in ``records`` [4 N]. Ten numbers are sums over pixels: dL/dpower times 1, x, y, xx, xy and yy of
 the offset (x, y) from the mean, and dL/dfeatures; the rest pads them to 64 bytes."""
 FEATURES = 6
 """The first of the ten numbers that is of features."""
 RECORD_ROWS = wp.constant(RECORD)
-
-
-@wp.func
-def least_form(
-    a: wp.float32, b: wp.float32, c: wp.float32, left: wp.float32, right: wp.float32, top: wp.float32,
-    bottom: wp.float32,
-) -> wp.float32:  # fmt: skip
-    """The least a x² + 2 b x y + c y² over a rectangle of offsets from the mean."""
-    least = wp.float32(0.0)
-    beside = left > 0.0 or right < 0.0
-    above = top > 0.0 or bottom < 0.0
-    if beside or above:
-        least = HUGE
-        if beside:
-            x = wp.where(left > 0.0, left, right)
-            y = wp.clamp(fast_divide(-b * x, c), top, bottom)
-            least = a * x * x + 2.0 * b * x * y + c * y * y
-        if above:
-            y2 = wp.where(top > 0.0, top, bottom)
-            x2 = wp.clamp(fast_divide(-b * y2, a), left, right)
-            least = wp.min(least, a * x2 * x2 + 2.0 * b * x2 * y2 + c * y2 * y2)
-    return least
-
-
-@wp.func
-def tile_form(camera: Camera, first: wp.vec4, second: wp.vec4, tile_x: wp.int32, tile_y: wp.int32) -> wp.float32:
-    """The least of a splat's form over the centres of a tile's pixels."""
-    left = wp.float32(tile_x * SIDE) + 0.5 - first[0]
-    top = wp.float32(tile_y * SIDE) + 0.5 - first[1]
-    across = wp.float32(wp.min(SIDE, camera.width - tile_x * SIDE) - 1)
-    down = wp.float32(wp.min(SIDE, camera.height - tile_y * SIDE) - 1)
-    return least_form(first[2], first[3], second[0], left, left + across, top, top + down)
 
 
 @wp.func
@@ -93,39 +58,22 @@ def sound(mean: wp.vec3, factor: wp.mat33, opacity: wp.float32, feature: wp.vec4
     )
 
 
-@wp.kernel
-def project(
-    raster: Raster,
-    cameras: wp.array[Camera],
-    view: wp.array[wp.int32],
-    means: wp.array[wp.vec3],
-    factors: wp.array[wp.mat33],
-    opacities: wp.array[wp.float32],
-    features: wp.array[wp.vec4],
-    splats: wp.array[wp.vec4],
-    boxes: wp.array[wp.vec4i],
-    records: wp.array[wp.vec4],
-    tile_counts: wp.array[wp.int32],
-) -> None:
-    """Projects N Gaussians, a thread each, and counts the entries of each tile's list.
-
-    Args:
-        raster: constants. cameras: of all views. view: [1] index of the camera.
-        means, factors, opacities, features: [N]; Σ = F Fᵀ.
-        splats: out [2 N], see above. boxes: out [N] tiles x0, y0, x1, y1 (exclusive) around the support; where culled,
-            anything. records: out [4 N], set to 0.
-        tile_counts: [tiles], added to.
-    """
-    i = wp.tid()
+@wp.func
+def project_one(
+    raster: Raster, camera: Camera, i: wp.int32, means: wp.array[wp.vec3], factors: wp.array[wp.mat33],
+    opacities: wp.array[wp.float32], features: wp.array[wp.vec4], splats: wp.array[wp.vec4],
+    boxes: wp.array[wp.vec4i], records: wp.array[wp.vec4],
+) -> wp.int32:  # fmt: skip
+    """Projects a Gaussian; returns 1 if its box meets the picture, else 0. See ``project``."""
     zero = wp.vec4(0.0, 0.0, 0.0, 0.0)
     for k in range(3):
         store(records, RECORD_ROWS * i + k, zero)
-    camera = cameras[view[0]]
     mean = means[i]
     factor = factors[i]
     opacity = opacities[i]
     place = camera.rotation * mean + camera.translation
     second = zero
+    drawn = wp.int32(0)
     # Comparisons with NaN are false.
     if place[2] >= raster.near and opacity >= raster.alpha_floor and sound(mean, factor, opacity, features[i]):
         inverse = 1.0 / place[2]
@@ -150,20 +98,50 @@ def project(
             width = wp.float32(camera.width)
             height = wp.float32(camera.height)
             if x + half_x > 0.0 and x - half_x < width and y + half_y > 0.0 and y - half_y < height:
-                first = wp.vec4(x, y, yy / determinant, -xy / determinant)
-                shape = wp.vec4(xx / determinant, log_opacity, reach * (1.0 + SLACK) + SLACK, place[2])
+                drawn = wp.int32(1)
+                second = wp.vec4(xx / determinant, log_opacity, reach * (1.0 + SLACK) + SLACK, place[2])
                 x0 = wp.int32(wp.max(x - half_x, 0.0)) // SIDE
                 y0 = wp.int32(wp.max(y - half_y, 0.0)) // SIDE
-                x1 = (wp.int32(wp.min(x + half_x, width - 1.0))) // SIDE + 1
-                y1 = (wp.int32(wp.min(y + half_y, height - 1.0))) // SIDE + 1
-                for tile_y in range(y0, y1):
-                    for tile_x in range(x0, x1):
-                        if tile_form(camera, first, shape, tile_x, tile_y) <= shape[2]:
-                            wp.atomic_add(tile_counts, tile_y * raster.tiles_x + tile_x, 1)
-                            second = shape
+                x1 = wp.int32(wp.min(x + half_x, width - 1.0)) // SIDE + 1
+                y1 = wp.int32(wp.min(y + half_y, height - 1.0)) // SIDE + 1
                 boxes[i] = wp.vec4i(x0, y0, x1, y1)
-                store(splats, 2 * i, first)
+                store(splats, 2 * i, wp.vec4(x, y, yy / determinant, -xy / determinant))
     store(splats, 2 * i + 1, second)
+    return drawn
+
+
+@wp.kernel
+def project(
+    raster: Raster,
+    cameras: wp.array[Camera],
+    view: wp.array[wp.int32],
+    means: wp.array[wp.vec3],
+    factors: wp.array[wp.mat33],
+    opacities: wp.array[wp.float32],
+    features: wp.array[wp.vec4],
+    splats: wp.array[wp.vec4],
+    boxes: wp.array[wp.vec4i],
+    records: wp.array[wp.vec4],
+    tile_counts: wp.array[wp.int32],
+    starts: wp.array[wp.int32],
+    keys: wp.array[wp.uint64],
+) -> None:
+    """Projects N Gaussians, a thread each, and counts the entries of each tile's list; whole warps.
+
+    Args:
+        raster: constants. cameras: of all views. view: [1] index of the camera.
+        means, factors, opacities, features: [N]; Σ = F Fᵀ.
+        splats: out [2 N], see ``supports``. boxes: out [N] tiles x0, y0, x1, y1 (exclusive) around the support; where
+            culled, anything. records: out [4 N], set to 0.
+        tile_counts: [tiles], added to. starts, keys: of the lists, left alone.
+    """
+    i = wp.tid()
+    camera = cameras[view[0]]
+    drawn = wp.int32(0)
+    if i < raster.count:
+        drawn = project_one(raster, camera, i, means, factors, opacities, features, splats, boxes, records)
+    sync_lanes()
+    enter_lists(raster, camera, i, drawn, splats, boxes, starts, tile_counts, keys, 0)
 
 
 @wp.kernel

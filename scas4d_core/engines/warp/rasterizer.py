@@ -11,7 +11,7 @@ from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.engines.renderer import CHANNELS
 from scas4d_core.engines.warp import blend, projection, tiles
 from scas4d_core.engines.warp.lanes import lanes_of
-from scas4d_core.engines.warp.layout import PIXELS, SEGMENT, raster_of
+from scas4d_core.engines.warp.layout import PIXELS, SEGMENT, TILE, raster_of
 
 LEAST_CAPACITY = 1 << 16
 """Entries of all tile lists for which there is room at first, at least."""
@@ -32,7 +32,7 @@ class Rasterizer:
         planes: [5, rows, columns] of the last picture: four features, background included, and transmittance left.
         g_planes: [4, rows, columns] gradient that ``carry_back`` reads.
         splats, records: [2 N] and [4 N] of vec4, see ``projection``.
-        starts, items: [tiles + 1] and [capacity] the tile lists of the last picture.
+        starts, items: [tiles + 1] and [capacity] the tile lists of the last picture. tiles_x: tiles of a row.
         overflow: [1] set to 1 on the device when the lists of a picture had more entries than there is room for; that
             picture is drawn empty.
         capacity: entries for which there is room.
@@ -54,7 +54,8 @@ class Rasterizer:
         device = self._device
         self._columns, self._rows = columns, rows
         self._raster = raster_of(self._limits, self.count, columns, rows, self.capacity)
-        self._tiles = self._raster.tiles_x * self._raster.tiles_y
+        self.tiles_x = -(-columns // TILE)
+        self._tiles = self.tiles_x * -(-rows // TILE)
         segments = self.capacity // SEGMENT + self._tiles
         self.planes = wp.zeros((CHANNELS + 1, rows, columns), dtype=wp.float32, device=device)
         self.g_planes = wp.zeros((CHANNELS, rows, columns), dtype=wp.float32, device=device)
@@ -97,9 +98,10 @@ class Rasterizer:
             record, log: [1] and [records, 8]: this row of the log is set to 0, its last but one number to the entries
                 of the lists.
         """
-        device, count, view_of = self._device, self.count, [cameras, view]
+        device, view_of = self._device, [cameras, view]
+        count = -(-self.count // self._lanes) * self._lanes
         given = [means, factors, opacities, features]
-        out = [self.splats, self._boxes, self.records, self._tile_counts]
+        out = [self.splats, self._boxes, self.records, self._tile_counts, self.starts, self._keys]
         wp.launch(projection.project, count, [self._raster, *view_of, *given, *out], device=device)
         threads = tiles.SCAN_BLOCK if self._lanes > 1 else 1
         lists = [self.starts, self._segment_starts, self.overflow, record, log]

@@ -44,6 +44,7 @@ class WarpRenderer:
         self._loss = PictureLoss(device, image_weight, 0.0)
         self._rasterizer = Rasterizer(device, 0, limits)
         self._first = wp.zeros(1, dtype=wp.int32, device=device)
+        self._behind = wp.zeros(1, dtype=wp.vec4, device=device)
         self._log = wp.zeros((1, COLUMNS), dtype=wp.float32, device=device)
 
     def render(
@@ -77,7 +78,7 @@ class WarpRenderer:
         cameras = self._projected(state, view.camera, shown)
         self._draw(cameras, shown, self._background)
         self._loss.load([view])
-        self._loss.measure(self._first, self._first, self._rasterizer.planes, self._log)
+        self._loss.measure(self._first, self._first, self._rasterizer, self._behind, self._log)
         log = self._log.numpy()[0].astype(float)
         red, green, blue = log[SHIFT : SHIFT + 3].tolist()
         pixels = 3 * view.camera.width * view.camera.height
@@ -141,6 +142,6 @@ class WarpRenderer:
     def _draw(self, cameras: wp.array, features: Array, background: Array) -> wp.array:
         """Draw four features [N, 4] of what was projected; returns them on the device."""
         on_device = wp.array(np.ascontiguousarray(features, np.float32), dtype=wp.vec4, device=self._device)
-        behind = wp.array([background.tolist()], dtype=wp.vec4, device=self._device)
-        self._rasterizer.draw(cameras, self._first, on_device, behind)
+        self._behind.assign(background[None])
+        self._rasterizer.draw(cameras, self._first, on_device, self._behind)
         return on_device

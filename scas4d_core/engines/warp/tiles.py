@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from scas4d_core.engines.warp.lanes import bits_of, load
+from scas4d_core.engines.warp.lanes import load
 from scas4d_core.engines.warp.layout import SEGMENT, TILE, Camera, Raster
-from scas4d_core.engines.warp.projection import least_form, tile_form
+from scas4d_core.engines.warp.supports import enter_lists, least_form
 
 wp.set_module_options({"enable_backward": False})
 
@@ -120,7 +120,7 @@ def fill_lists(
     tile_counts: wp.array[wp.int32],
     keys: wp.array[wp.uint64],
 ) -> None:
-    """Writes the lists, each in any order; a thread for each Gaussian.
+    """Writes the lists, each in any order; a thread for each Gaussian, whole warps.
 
     Args:
         splats, boxes: from projection. starts: from ``place_lists``.
@@ -128,17 +128,10 @@ def fill_lists(
         keys: out [capacity] depth and row of each entry: they sort nearest first, ties by row.
     """
     i = wp.tid()
-    second = load(splats, 2 * i + 1)
-    if second[2] > 0.0 and starts[raster.tiles_x * raster.tiles_y] > 0:
-        camera = cameras[view[0]]
-        first = load(splats, 2 * i)
-        box = boxes[i]
-        key = (wp.uint64(bits_of(second[3])) << wp.uint64(32)) | wp.uint64(i)
-        for tile_y in range(box[1], box[3]):
-            for tile_x in range(box[0], box[2]):
-                if tile_form(camera, first, second, tile_x, tile_y) <= second[2]:
-                    tile = tile_y * raster.tiles_x + tile_x
-                    keys[starts[tile] + wp.atomic_add(tile_counts, tile, 1)] = key
+    drawn = wp.int32(0)
+    if i < raster.count and starts[raster.tiles_x * raster.tiles_y] > 0:
+        drawn = wp.where(load(splats, 2 * i + 1)[2] > 0.0, 1, 0)
+    enter_lists(raster, cameras[view[0]], i, drawn, splats, boxes, starts, tile_counts, keys, 1)
 
 
 # Bitonic, with every comparison in the same direction: what would lie beyond the end never moves.

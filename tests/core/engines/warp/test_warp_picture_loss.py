@@ -15,7 +15,9 @@ from warp_cases import DEVICE, camera, index, view_of
 from scas4d_core.engines.torch import losses
 from scas4d_core.engines.torch.parameters import leaf
 from scas4d_core.engines.views import TrainingView
+from scas4d_core.engines.warp.layout import TILE
 from scas4d_core.engines.warp.picture_loss import COLUMNS, IMAGE_LOSS, MASK_LOSS, SHIFT, SQUARES, PictureLoss
+from scas4d_core.engines.warp.rasterizer import Rasterizer
 
 CLOSE = 1e-4
 SIZES = [(48, 32), (37, 29), (16, 16), (5, 3), (13, 70)]
@@ -32,21 +34,35 @@ def shot(width: int, height: int, seed: int = 0, mask: bool = True) -> tuple[Tra
     return view, picture
 
 
+def covered(picture: np.ndarray) -> np.ndarray:
+    """[H, W] the pixels of tiles that are not black, where something was drawn."""
+    shown = picture.any(axis=0)
+    result = np.zeros_like(shown)
+    for y in range(0, len(shown), TILE):
+        for x in range(0, shown.shape[1], TILE):
+            result[y : y + TILE, x : x + TILE] = shown[y : y + TILE, x : x + TILE].any()
+    return result
+
+
 def measured(views: list[TrainingView], which: int, picture: np.ndarray, weight: float):  # type: ignore[no-untyped-def]
-    """The row of the log, and the gradient."""
+    """The row of the log, and the gradient where something was drawn."""
     loss = PictureLoss(DEVICE, IMAGE, MASK)
     loss.load(views)
-    planes = np.full((5, loss.rows, loss.columns), np.nan, np.float32)
+    drawn = Rasterizer(DEVICE, 1)
+    drawn.resize(loss.columns + 40, loss.rows)
     height, width = picture.shape[1:]
+    planes = np.full(drawn.planes.shape, np.nan, np.float32)
     planes[:4, :height, :width] = picture
-    given = wp.array(planes, dtype=wp.float32, device=DEVICE)
+    drawn.planes.assign(planes)
+    tiles = np.zeros(planes.shape[1:], bool)
+    tiles[:height, :width] = covered(picture)
+    drawn.starts.assign(np.cumsum([0, *tiles[::TILE, ::TILE].ravel()], dtype=np.int32))
     log = wp.zeros((3, COLUMNS), dtype=wp.float32, device=DEVICE)
-    gradient = wp.zeros(planes[:4].shape, dtype=wp.float32, device=DEVICE)
-    loss.measure(index(which), index(1), given, log)
-    loss.carry_back(index(which), given, weight, gradient)
+    loss.measure(index(which), index(1), drawn, wp.zeros(1, dtype=wp.vec4, device=DEVICE), log)
+    loss.carry_back(index(which), drawn, weight)
     rows = log.numpy()
     assert not rows[[0, 2]].any()
-    return rows[1], gradient.numpy()[:, :height, :width]
+    return rows[1], drawn.g_planes.numpy()[:, :height, :width]
 
 
 def expected(view: TrainingView, picture: np.ndarray, weight: float):  # type: ignore[no-untyped-def]
@@ -63,7 +79,7 @@ def expected(view: TrainingView, picture: np.ndarray, weight: float):  # type: i
     row = np.zeros(COLUMNS)
     row[[IMAGE_LOSS, MASK_LOSS, SQUARES]] = image.item(), mask.item(), (difference**2).sum()
     row[SHIFT : SHIFT + 3] = difference.mean(dim=(0, 1))
-    return row, planes.grad.numpy()
+    return row, planes.grad.numpy() * covered(picture)
 
 
 @pytest.mark.parametrize("mask", [True, False])
