@@ -1,7 +1,8 @@
-"""Pictures for the tests of the Warp kernels, which run on Warp's CPU device, and the reference's view of them."""
+"""Pictures for the tests of the Warp kernels, and the reference's view of them."""
 
 from __future__ import annotations
 
+import os
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,8 @@ from scas4d_core.engines.views import CameraArrays, TrainingView
 
 wp = pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install warp-lang")
 
-DEVICE = "cpu"
+DEVICE = os.environ.get("SCAS4D_WARP_DEVICE", "cpu")
+"""Of Warp; "cuda:0" runs the same tests on a GPU."""
 LIMITS = Limits(near=0.2)
 BACKGROUND = (0.1, 0.2, 0.3)
 
@@ -69,11 +71,14 @@ def view_of(picture: np.ndarray, shot: CameraArrays, seed: int = 0, mask: bool =
 
 
 def drawn(
-    tensors: list[torch.Tensor], shot: CameraArrays, limits: Limits = LIMITS
+    tensors: list[torch.Tensor],
+    shot: CameraArrays,
+    limits: Limits = LIMITS,
+    background: tuple[float, float, float] = BACKGROUND,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Features [H, W, 4] and transmittance [H, W] of the reference, in front of ``BACKGROUND``."""
-    background = torch.tensor([*BACKGROUND, 0], dtype=torch.float64)
-    picture = render(*tensors, CameraParams.of_arrays(shot), background, limits)
+    """Features [H, W, 4] and transmittance [H, W] of the reference."""
+    behind = torch.tensor([*background, 0], dtype=torch.float64)
+    picture = render(*tensors, CameraParams.of_arrays(shot), behind, limits)
     return picture.features, 1 - picture.alpha
 
 

@@ -24,9 +24,11 @@ def tested(request) -> Renderer:  # type: ignore[no-untyped-def]
     if request.param == "cpu":
         return CpuRenderer(BACKGROUND, limits=LIMITS)
     pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install warp-lang")
+    from warp_cases import DEVICE
+
     from scas4d_core.engines.warp.renderer import WarpRenderer
 
-    return WarpRenderer(BACKGROUND, LIMITS, device="cpu")
+    return WarpRenderer(BACKGROUND, LIMITS, DEVICE)
 
 
 @pytest.mark.parametrize("glossy", [False, True])

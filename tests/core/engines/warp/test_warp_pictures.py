@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ import torch
 pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install warp-lang")
 
 from engine_cases import apart
-from warp_cases import BACKGROUND, DEVICE, LIMITS, camera, cloud, drawn, index, view_of
+from warp_cases import BACKGROUND, DEVICE, LIMITS, Cloud, camera, cloud, drawn, index, view_of
 
 from scas4d_core.engines.plan import UpdatePlan
 from scas4d_core.engines.torch import losses
@@ -35,14 +37,14 @@ def views() -> list[TrainingView]:
     return made
 
 
-def reference(view: TrainingView):  # type: ignore[no-untyped-def]
+def reference(view: TrainingView, given: Cloud = GIVEN, plan: UpdatePlan = PLAN):  # type: ignore[no-untyped-def]
     """Weighted losses, squared error, and gradients of means, factors and features."""
-    tensors, count = GIVEN.tensors(), len(view.target)
-    features, _ = drawn(tensors, view.camera)
+    tensors, count = given.tensors(), len(view.target)
+    features, _ = drawn(tensors, view.camera, background=plan.background)
     exposure, target = leaf(view.exposure), leaf(view.target).permute(1, 2, 0)
     shown = features[..., :count] * exposure[:, 0] + exposure[:, 1]
-    image = PLAN.image * losses.image_loss(shown[..., :3], target[..., :3])
-    mask = PLAN.mask * losses.image_loss(shown[..., 3:], target[..., 3:]) if count > 3 else torch.zeros(())
+    image = plan.image * losses.image_loss(shown[..., :3], target[..., :3])
+    mask = plan.mask * losses.image_loss(shown[..., 3:], target[..., 3:]) if count > 3 else torch.zeros(())
     (image + mask).backward()
     squares = ((shown - target)[..., :3] ** 2).sum()
     row = [image.item(), mask.item(), squares.item()]
@@ -94,7 +96,7 @@ def test_a_measurement_has_the_losses_and_no_gradients() -> None:
     before = [array.copy() for array in gradients(made)]
     made.measure(index(1), index(1), *GIVEN.on_device())
     log = made.log.numpy()
-    assert np.array_equal(log[0], log[1])
+    assert log[0] == pytest.approx(log[1], rel=1e-6)
     assert all(map(np.array_equal, gradients(made), before))
 
 
@@ -105,6 +107,25 @@ def test_exposures_may_change_between_launches() -> None:
     made.exposures.assign(made.exposures.numpy() * np.float32([0.5, 1]))
     made.launch(index(0), index(0), *GIVEN.on_device(), 1.0)
     assert made.log.numpy()[0, SQUARES] > 2 * bright
+
+
+def test_what_is_black_leaves_no_trace_of_the_picture_before() -> None:
+    plan = replace(PLAN, background=(0.0, 0.0, 0.0))
+    made, shot = PicturePass(DEVICE, plan, len(GIVEN.means)), camera(96, 80)
+    small, other = (GIVEN._replace(means=0.15 * GIVEN.means + np.float32([x, 0, 0])) for x in (0.25, -0.3))
+    view = view_of(np.zeros((4, 80, 96)), shot)
+    view.target[:] = 0
+    view.target[:, 50:, 70:] = 0.5
+    view.exposure[:, 1] = 0
+    made.load_views([view])
+    for given in (other, small):
+        for array in (made.grad_means, made.grad_factors, made.grad_features):
+            array.zero_()
+        made.launch(index(0), index(0), *given.on_device(), 1.0)
+        row, true = reference(view, given, plan)
+        assert made.log.numpy()[0, [IMAGE_LOSS, MASK_LOSS, SQUARES]] == pytest.approx(row, rel=CLOSE)
+        for mine, expected in zip(gradients(made), true, strict=True):
+            assert apart(mine, expected) < CLOSE
 
 
 def test_the_generation_tells_when_buffers_were_replaced() -> None:

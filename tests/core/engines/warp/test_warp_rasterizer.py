@@ -90,6 +90,16 @@ def test_lists_of_several_segments() -> None:
     assert mine.log.numpy()[0, PAIRS] == sum(lengths)
 
 
+def test_lists_that_are_sorted_in_global_memory() -> None:
+    given, shot = cloud(5000, radius=0.1, faint=0.01), camera(8, 8)
+    mine = Drawn(given, shot)
+    depths = given.means @ shot.pose[2, :3] + shot.pose[2, 3]
+    (entries,) = (entries for entries in mine.lists if entries)
+    assert len(entries) > 4500
+    assert (np.diff(depths[entries]) > -1e-6).all()
+    assert len(set(entries)) == len(entries)
+
+
 def test_lists_of_segments_of_which_none_finishes_a_pixel() -> None:
     given = cloud(500, radius=0.15)
     mine = compared(given._replace(opacities=given.opacities * 0.02), camera(24, 20))
