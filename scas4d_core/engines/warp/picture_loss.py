@@ -232,7 +232,7 @@ def picture_loss(
 ) -> None:
     """Adds up the loss of a view, and keeps its derivatives by the quantities of SSIM's window.
 
-    Windows of which picture and target are 0 have no loss. Their derivatives are multiplied by 0 where they are read.
+    Windows of which picture and target are 0 have no loss; their derivatives are left as they are, and not read.
 
     The launch is [4, bands of ``ROWS`` rows, columns]; each block is within one channel.
 
@@ -251,12 +251,7 @@ def picture_loss(
     loss = wp.float32(0.0)
     squared = wp.float32(0.0)
     shift = wp.float32(0.0)
-    nothing = nothing_near(at, tiles_x, starts, background, blank)
-    if at.compared == 1 and nothing:
-        for k in range(BAND):
-            if at.y + k < at.height:
-                by_window[channel, at.y + k, x] = wp.vec3(0.0, 0.0, 0.0)
-    elif at.compared == 1:
+    if at.compared == 1 and not nothing_near(at, tiles_x, starts, background, blank):
         mean = wp.vec4(0.0, 0.0, 0.0, 0.0)
         square = wp.vec4(0.0, 0.0, 0.0, 0.0)
         product = wp.vec4(0.0, 0.0, 0.0, 0.0)
