@@ -288,29 +288,31 @@ def join_segments(
         planes[4, spot.y, spot.x] = light.passed
 
 
-# A transposing butterfly: 16 shuffles for ten sums, each of which ends in a lane that adds it. The compiler knows each
-# index, so that the numbers stay in registers.
+# A transposing butterfly: ten sums over 32 lanes fold into five over 16, three over 8, two over 4 and one over 2, each in a
+# lane that adds it. The compiler knows each index, so that the numbers stay in registers.
 @wp.func_native("""
 float* record = reinterpret_cast<float*>(records.data + row);
 #if defined(__CUDA_ARCH__)
-float v[16] = {a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, 0.f, 0.f, 0.f, 0.f, 0.f, 0.f};
+float v[10] = {a0, a1, a2, a3, a4, a5, a6, a7, a8, a9};
 const int own = threadIdx.x & 31;
-const auto halve = [&](const int half) {
-    const bool upper = own & (2 * half);
+const auto fold = [&](const int count, const int half, const int bit) {
+    const bool upper = own & bit;
 #pragma unroll
-    for (int k = 0; k < 8; ++k)
+    for (int k = 0; k < 5; ++k)
         if (k < half) {
-            const float given = upper ? v[k] : v[k + half], kept = upper ? v[k + half] : v[k];
-            v[k] = kept + __shfl_xor_sync(0xffffffffu, given, 2 * half);
+            const float far = k + half < count ? v[k + half] : 0.f;
+            const float given = upper ? v[k] : far, kept = upper ? far : v[k];
+            v[k] = kept + __shfl_xor_sync(0xffffffffu, given, bit);
         }
 };
-halve(8);
-halve(4);
-halve(2);
-halve(1);
+fold(10, 5, 16);
+fold(5, 3, 8);
+fold(3, 2, 4);
+fold(2, 1, 2);
 v[0] += __shfl_xor_sync(0xffffffffu, v[0], 1);
-const int which = own >> 1;
-if (!(own & 1) && which < 10) atomicAdd(record + which, v[0]);
+const int last = (own & 4 ? 2 : 0) + (own & 2 ? 1 : 0);
+const int which = (own & 16 ? 5 : 0) + (own & 8 ? 3 : 0) + last;
+if (!(own & 1) && last < (own & 8 ? 2 : 3)) atomicAdd(record + which, v[0]);
 #else
 const float v[10] = {a0, a1, a2, a3, a4, a5, a6, a7, a8, a9};
 for (int k = 0; k < 10; ++k) record[k] += v[k];

@@ -114,8 +114,9 @@ def test_gaussians_beside_and_behind_the_camera() -> None:
     assert (np.abs(given.means[:, 0]) > 1.3 * depths)[depths > LIMITS.near].sum() > 10  # beyond the tangents' bounds
 
 
-def test_lists_hold_exactly_the_supports_that_meet_a_tile_nearest_first() -> None:
-    given, shot = cloud(200), camera(61, 43)
+@pytest.mark.parametrize(("count", "width", "height"), [(200, 61, 43), (40, 720, 400)])  # 12 tiles, and 1125
+def test_lists_hold_exactly_the_supports_that_meet_a_tile_nearest_first(count: int, width: int, height: int) -> None:
+    given, shot = cloud(count), camera(width, height)
     mine = Drawn(given, shot)
     tensors = [tensor.detach() for tensor in given.tensors()]
     splats = project(tensors[0], tensors[1], CameraParams.of_arrays(shot), LIMITS)
