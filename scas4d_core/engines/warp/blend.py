@@ -288,7 +288,7 @@ def join_segments(
         planes[4, spot.y, spot.x] = light.passed
 
 
-# A transposing butterfly: ten sums over 32 lanes fold into five over 16, three over 8, two over 4 and one over 2, each in a
+# A transposing butterfly: ten sums over 32 lanes fold into five over 16, three over 8, two over 4, one over 2, each in a
 # lane that adds it. The compiler knows each index, so that the numbers stay in registers.
 @wp.func_native("""
 float* record = reinterpret_cast<float*>(records.data + row);
