@@ -288,8 +288,8 @@ def join_segments(
         planes[4, spot.y, spot.x] = light.passed
 
 
-# A transposing butterfly: ten sums over 32 lanes fold into five over 16, three over 8, two over 4 and one over 2, each of
-# which ends in a lane that adds it. The compiler knows each index, so that the numbers stay in registers.
+# A transposing butterfly: ten sums over 32 lanes fold into five over 16, three over 8, two over 4 and one over 2.
+# The compiler knows each index, so that the numbers stay in registers.
 @wp.func_native("""
 float* record = reinterpret_cast<float*>(records.data + row);
 #if defined(__CUDA_ARCH__)

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import warp as wp
 
 from scas4d_core.engines.plan import UpdatePlan
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.engines.warp.picture_loss import COLUMNS, PictureLoss
+from scas4d_core.engines.warp.projection import ACTED
 from scas4d_core.engines.warp.rasterizer import Rasterizer
+from scas4d_core.guards import GuardCounts
 
 
 class PicturePass:
@@ -57,6 +60,16 @@ class PicturePass:
     @property
     def overflow(self) -> wp.array:  # noqa: D102
         return self._rasterizer.overflow
+
+    def guards(self) -> GuardCounts:
+        """How often the guards of pictures have acted since ``forget_guards``; waits for the device."""
+        counts = GuardCounts(*ACTED)
+        counts.add(ACTED, self._rasterizer.acted.numpy().astype(np.int64))
+        return counts
+
+    def forget_guards(self) -> None:
+        """Sets the counts of the guards to 0."""
+        self._rasterizer.acted.zero_()
 
     def load_views(self, views: Sequence[TrainingView]) -> None:
         """Takes the pictures, cameras and exposures of a frame; pictures that it has are not sent again."""

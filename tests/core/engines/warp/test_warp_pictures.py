@@ -148,3 +148,21 @@ def test_the_generation_tells_when_buffers_were_replaced() -> None:
     assert made.overflow.numpy()[0] == 0
     made.launch(index(3), index(0), *GIVEN.on_device(), 1.0)
     assert made.log.numpy()[0, PAIRS] > 100
+
+
+def test_guards_are_counted_and_what_they_hold_back_has_no_gradient() -> None:
+    made, factors, features = loaded(), GIVEN.factors.copy(), GIVEN.features.copy()
+    middle = np.argsort(np.abs(GIVEN.means).sum(axis=1))[:4]
+    factors[middle[0]] *= 1e12
+    factors[middle[1]] = np.nan
+    features[middle[2], 3] = np.inf
+    given = GIVEN._replace(factors=factors, features=features)
+    for _ in range(2):
+        made.launch(index(0), index(0), *given.on_device(), 1.0)
+    assert dict(made.guards()) == {"not_finite": 4, "footprint_ceiling": 2, "gradient_not_finite": 0}
+    assert not any(gradient[middle[:3]].any() for gradient in gradients(made))
+    made.forget_guards()
+    made.launch(index(0), index(0), *GIVEN.on_device(), 1e38)
+    assert made.guards()["gradient_not_finite"] > 0
+    assert made.guards()["not_finite"] == 0
+    assert all(np.isfinite(gradient).all() for gradient in gradients(made))
