@@ -1,18 +1,16 @@
 """Functions of kernels in which the lanes of a warp work together.
 
 A warp has 32 lanes on a GPU and one on Warp's CPU device; with these functions, a kernel is written once for both. All
-lanes of a warp must call those that exchange something. ``native`` code has a branch for each of the two devices.
+lanes of a warp must call those that exchange something. Code that Warp hands to the compiler as it is has a
+branch for each of the two devices.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-from scas4d_core.guards import COVER_SLACK
-
+wp.config.log_level = wp.LOG_WARNING  # it would write what it compiles among the output of commands
 wp.set_module_options({"enable_backward": False})
-
-SLACK = wp.constant(wp.float32(COVER_SLACK))
 
 
 def lanes_of(device: str) -> int:

@@ -18,7 +18,8 @@ from scas4d_core.guards import GuardCounts
 class PicturePass:
     """Renders, compares and carries back the views of an iteration, one after the other.
 
-    ``launch`` and ``measure`` can be captured in a CUDA graph. A graph holds as long as ``generation`` stays the same.
+    ``launch`` and ``measure`` can be captured in a CUDA graph, once each has run: kernels are compiled when they are first
+    launched. A graph holds as long as ``generation`` stays the same.
 
     Args:
         device: of Warp, as "cpu" or "cuda:0". plan: of the updates. count: N Gaussians.
@@ -97,7 +98,8 @@ class PicturePass:
 
         Args:
             view: [1] int32, index of the view. record: [1] int32, row of the log.
-            means, factors, opacities, features: [N] of vec3, mat33, float32, and vec4 as the camera sees them.
+            means, factors, opacities, features: [N] of vec3, mat33, float32, and vec4 as the camera sees them;
+                contiguous.
         """
         cameras, log = self._loss.cameras, self.log
         self._rasterizer.project(cameras, view, means, factors, opacities, features, record, log)

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from scas4d_core.engines.warp.lanes import SLACK, load, store, sync_lanes
+from scas4d_core.engines.warp.lanes import load, store, sync_lanes
 from scas4d_core.engines.warp.layout import TILE, Camera, Raster
-from scas4d_core.engines.warp.supports import enter_lists
+from scas4d_core.engines.warp.supports import SLACK, enter_lists
 from scas4d_core.guards import FEATURE_CEILING, FOOTPRINT_CEILING, GRADIENT_NOT_FINITE, NOT_FINITE
 
 wp.set_module_options({"enable_backward": False})

@@ -20,10 +20,12 @@ from scas4d_core.engines.warp.lanes import (
     lowest,
 )
 from scas4d_core.engines.warp.layout import TILE, Camera, Raster
+from scas4d_core.guards import COVER_SLACK
 
 wp.set_module_options({"enable_backward": False})
 
 SIDE = wp.constant(TILE)
+SLACK = wp.constant(wp.float32(COVER_SLACK))
 HUGE = wp.constant(wp.float32(3.0e38))
 FEW = wp.constant(4)  # tiles that a lane goes through by itself; those of a larger box are shared among the warp
 NONE = wp.constant(wp.uint32(0))
