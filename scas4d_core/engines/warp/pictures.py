@@ -18,7 +18,7 @@ from scas4d_core.guards import GuardCounts
 class PicturePass:
     """Renders, compares and carries back the views of an iteration, one after the other.
 
-    ``launch`` and ``measure`` can be captured in a CUDA graph, once each has run: kernels are compiled when they are first
+    ``launch`` and ``measure`` can be captured in a CUDA graph, once each has run: a kernel is compiled when it is first
     launched. A graph holds as long as ``generation`` stays the same.
 
     Args:

@@ -106,6 +106,21 @@ def test_lists_of_segments_of_which_none_finishes_a_pixel() -> None:
     assert mine.planes[4].min() > 0.005
 
 
+@pytest.mark.parametrize("shape", ["needles", "points", "wide", "opaque"])
+def test_gaussians_of_extreme_shapes(shape: str) -> None:
+    given = cloud(200, seed=4)
+    factors = {
+        "needles": 5 * given.factors * np.float32([1, 1e-3, 1e-4]),
+        "points": 1e-3 * given.factors,
+        "wide": 10 * given.factors,
+        "opaque": given.factors,
+    }[shape]
+    opacities = np.full(200, 0.9999, np.float32) if shape == "opaque" else given.opacities
+    # The conic of a needle is a small difference of large numbers.
+    tolerance = 1e-3 if shape == "needles" else CLOSE
+    compared(given._replace(factors=factors, opacities=opacities), camera(41, 33), tolerance=tolerance)
+
+
 def test_gaussians_beside_and_behind_the_camera() -> None:
     given = cloud(300, radius=1.5)
     mine = compared(given, camera(40, 24, distance=0.5))
