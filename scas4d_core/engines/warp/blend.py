@@ -29,10 +29,6 @@ from scas4d_core.engines.warp.supports import least_form
 
 wp.set_module_options({"enable_backward": False})
 
-SIDE = wp.constant(TILE)
-AREA = wp.constant(PIXELS)
-LENGTH = wp.constant(SEGMENT)
-RECORD_ROWS = wp.constant(RECORD)
 NONE = wp.constant(wp.uint32(0))
 ONE = wp.constant(wp.uint32(1))
 
@@ -55,8 +51,8 @@ def spot_of(raster: Raster, camera: Camera, tile: wp.int32, k: wp.int32) -> Spot
     """The k-th pixel of a tile; 32 in turn are 8×4."""
     group = k // 32
     within = k - group * 32
-    x0 = (tile % raster.tiles_x) * SIDE + (group % 2) * 8
-    y0 = (tile // raster.tiles_x) * SIDE + (group // 2) * 4
+    x0 = (tile % raster.tiles_x) * TILE + (group % 2) * 8
+    y0 = (tile // raster.tiles_x) * TILE + (group // 2) * 4
     spot = Spot()
     spot.x = x0 + within % 8
     spot.y = y0 + within // 8
@@ -193,20 +189,20 @@ def blend_segments(
         segment_light, segment_features: out [segments · 256] the light that a segment lets pass at each pixel of its
             tile, below the stop where the pixel is finished even by this segment alone, and the features drawn.
     """
-    parts = AREA // lane_count()
+    parts = PIXELS // lane_count()
     total = segment_starts[raster.tiles_x * raster.tiles_y] * parts
     unit = wp.int32(wp.tid() // lane_count())
     while unit < total:
         segment = unit // parts
         k = (unit - segment * parts) * lane_count() + lane()
         tile = segment_tiles[segment]
-        begin = starts[tile] + (segment - segment_starts[tile]) * LENGTH
+        begin = starts[tile] + (segment - segment_starts[tile]) * SEGMENT
         spot = spot_of(raster, cameras[view[0]], tile, k)
         light = draw_entries(
-            raster, splats, features, items, begin, wp.min(begin + LENGTH, starts[tile + 1]), spot, spot.inside, 1.0, 0
+            raster, splats, features, items, begin, wp.min(begin + SEGMENT, starts[tile + 1]), spot, spot.inside, 1.0, 0
         )
-        segment_light[segment * AREA + k] = light.passed
-        store(segment_features, segment * AREA + k, light.features)
+        segment_light[segment * PIXELS + k] = light.passed
+        store(segment_features, segment * PIXELS + k, light.features)
         unit += warps
 
 
@@ -235,8 +231,8 @@ def join_segments(
         planes: out [5, rows, columns] the features, background included, and the transmittance left.
     """
     camera = cameras[view[0]]
-    tile = wp.tid() // AREA
-    k = wp.tid() - tile * AREA
+    tile = wp.tid() // PIXELS
+    k = wp.tid() - tile * PIXELS
     spot = spot_of(raster, camera, tile, k)
     light = Light()
     light.passed = 1.0
@@ -244,7 +240,7 @@ def join_segments(
     begin = starts[tile]
     end = starts[tile + 1]
     segments = segment_starts[tile + 1] - segment_starts[tile]
-    at = segment_starts[tile] * AREA + k
+    at = segment_starts[tile] * PIXELS + k
     count = wp.int32(0)
     segment = wp.int32(0)
     # The next segment's numbers are loaded before they are needed.
@@ -257,8 +253,8 @@ def join_segments(
         passed = next_passed
         drawn = next_drawn
         if segment + 1 < segments:
-            next_passed = segment_light[at + AREA]
-            next_drawn = load(segment_features, at + AREA)
+            next_passed = segment_light[at + PIXELS]
+            next_drawn = load(segment_features, at + PIXELS)
         anew = wp.int32(0)
         if light.open == 1:
             segment_light[at] = light.passed
@@ -271,14 +267,14 @@ def join_segments(
                 anew = wp.int32(1)
         if ballot(anew) != NONE:
             again = draw_entries(
-                raster, splats, features, items, begin, wp.min(begin + LENGTH, end), spot, anew, light.passed, 1
+                raster, splats, features, items, begin, wp.min(begin + SEGMENT, end), spot, anew, light.passed, 1
             )
             if anew == 1:
                 light.passed = again.passed
                 light.features = light.features + again.features
                 light.open = again.open
-        begin += LENGTH
-        at += AREA
+        begin += SEGMENT
+        at += PIXELS
         segment += 1
     if spot.inside == 1:
         begun[spot.y, spot.x] = count
@@ -352,7 +348,7 @@ def blend_backward(
         g_planes: [4, rows, columns] dL/dplanes of the features.
         records: [4 N], added to; see ``projection``.
     """
-    parts = AREA // lane_count()
+    parts = PIXELS // lane_count()
     total = segment_starts[raster.tiles_x * raster.tiles_y] * parts
     unit = wp.int32(wp.tid() // lane_count())
     while unit < total:
@@ -360,8 +356,8 @@ def blend_backward(
         k = (unit - segment * parts) * lane_count() + lane()
         tile = segment_tiles[segment]
         number = segment - segment_starts[tile]
-        base = starts[tile] + number * LENGTH
-        end = wp.min(base + LENGTH, starts[tile + 1])
+        base = starts[tile] + number * SEGMENT
+        end = wp.min(base + SEGMENT, starts[tile + 1])
         spot = spot_of(raster, cameras[view[0]], tile, k)
         open = wp.int32(0)
         passed = wp.float32(1.0)
@@ -377,8 +373,8 @@ def blend_backward(
                     planes[0, spot.y, spot.x], planes[1, spot.y, spot.x], planes[2, spot.y, spot.x],
                     planes[3, spot.y, spot.x],
                 )  # fmt: skip
-                passed = segment_light[segment * AREA + k]
-                behind = wp.dot(g, shown - load(segment_features, segment * AREA + k))
+                passed = segment_light[segment * PIXELS + k]
+                behind = wp.dot(g, shown - load(segment_features, segment * PIXELS + k))
                 if g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0 or g[3] != 0.0:
                     open = wp.int32(1)
         alive = ballot(open)
@@ -436,7 +432,7 @@ def blend_backward(
                     gx = g_power * dx
                     gy = g_power * dy
                     add_record(
-                        records, RECORD_ROWS * row, g_power, gx, gy, gx * dx, gx * dy, gy * dy, weight * g[0],
+                        records, RECORD * row, g_power, gx, gy, gx * dx, gx * dy, gy * dy, weight * g[0],
                         weight * g[1], weight * g[2], weight * g[3],
                     )  # fmt: skip
             alive = ballot(open)

@@ -1,4 +1,4 @@
-"""The structures that the kernels of a picture share: cameras, and the sizes of pictures and lists.
+"""The structures that the kernels of a picture share: cameras, the sizes of pictures and lists, the log.
 
 Sizes of launches are constants of a CUDA graph, so buffers have the size of the largest picture; a kernel reads the
 size of the picture at hand from its camera. All pictures have as many columns of tiles as the largest.
@@ -21,6 +21,12 @@ PIXELS = TILE * TILE
 """Pixels of a tile, and threads of a block that draws one."""
 SEGMENT = 128
 """Entries of a segment: lists are drawn a segment at a time, side by side. 64 and 256 take 5 to 15 % longer."""
+
+COLUMNS = 8
+"""Numbers of a row of the log, which has a row for each rendering."""
+IMAGE_LOSS, MASK_LOSS, SQUARES, SHIFT, PAIRS = 0, 1, 2, 3, 6
+"""Columns of the log: weighted losses, sum of squared RGB differences, mean of the picture minus mean of the rendering
+(three columns, RGB in 0…1, exposure included), entries of the tile lists."""
 
 
 @wp.struct

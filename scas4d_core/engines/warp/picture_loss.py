@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.engines.renderer import CHANNELS
 from scas4d_core.engines.views import TrainingView
-from scas4d_core.engines.warp.layout import TILE, Camera, camera_of
+from scas4d_core.engines.warp.layout import IMAGE_LOSS, MASK_LOSS, SHIFT, SQUARES, TILE, Camera, camera_of
 from scas4d_core.engines.warp.rasterizer import Rasterizer
 from scas4d_core.guards import SSIM_C1, SSIM_C2
 
@@ -28,22 +28,12 @@ REACH = 5
 """Pixels of the window on either side of its centre."""
 ROWS = 4
 """Pixels of a thread."""
-COLUMNS = 8
-"""Numbers of a row of the log."""
-IMAGE_LOSS, MASK_LOSS, SQUARES, SHIFT, PAIRS = 0, 1, 2, 3, 6
-"""Columns of the log: weighted losses, sum of squared RGB differences, mean of the picture minus mean of the rendering
-(three columns, RGB in 0…1, exposure included), entries of the tile lists."""
 
 _taps = np.exp(-((np.arange(2 * REACH + 1) - REACH) ** 2) / (2 * 1.5**2))
 _taps /= _taps.sum()
 PADDED_TAPS = np.float32([0.0] * (ROWS - 1) + _taps.tolist() + [0.0] * (ROWS - 1))
 """[17] weights of the window, with zeros on either side for those of four rows that a window does not reach."""
-
-
-HALF = wp.constant(REACH)
-BAND = wp.constant(ROWS)
-SIDE = wp.constant(TILE)
-PAD = wp.constant(ROWS - 1)
+PAD = ROWS - 1
 C1 = wp.constant(wp.float32(SSIM_C1))
 C2 = wp.constant(wp.float32(SSIM_C2))
 L1_PART = wp.constant(wp.float32(0.8))
@@ -125,7 +115,7 @@ def place_of(
     here.width = camera.width
     here.height = camera.height
     here.x = x
-    here.y = band * BAND
+    here.y = band * ROWS
     exposure = exposures[here.view, channel]
     here.gain = exposure[0]
     here.offset = exposure[1]
@@ -157,12 +147,12 @@ def target_moments(
         mean = wp.float32(0.0)
         square = wp.float32(0.0)
         for down in range(window):
-            row = y + down - HALF
+            row = y + down - REACH
             if row >= 0 and row < camera.height:
                 sum_mean = wp.float32(0.0)
                 sum_square = wp.float32(0.0)
                 for across in range(window):
-                    column = x + across - HALF
+                    column = x + across - REACH
                     if column >= 0 and column < camera.width:
                         value = targets[view, channel, row, column]
                         sum_mean += taps[across + PAD] * value
@@ -185,8 +175,8 @@ def find_blank(cameras: wp.array[Camera], targets: wp.array4d[wp.float32], blank
     camera = cameras[view]
     found = wp.int32(1)
     for channel in range(4):
-        for y in range(tile_y * SIDE, wp.min(tile_y * SIDE + SIDE, camera.height)):
-            for x in range(tile_x * SIDE, wp.min(tile_x * SIDE + SIDE, camera.width)):
+        for y in range(tile_y * TILE, wp.min(tile_y * TILE + TILE, camera.height)):
+            for x in range(tile_x * TILE, wp.min(tile_x * TILE + TILE, camera.width)):
                 if targets[view, channel, y, x] != 0.0:
                     found = wp.int32(0)
     blank[view, tile_y, tile_x] = found
@@ -200,10 +190,10 @@ def nothing_near(
     """True where the windows of a thread's pixels are 0 in the picture and in the target."""
     nothing = here.offset == 0.0 and background[0][here.channel] == 0.0
     if nothing:
-        x1 = wp.min(here.x + HALF, here.width - 1) // SIDE
-        y1 = wp.min(here.y + BAND - 1 + HALF, here.height - 1) // SIDE
-        for y in range(wp.max(here.y - HALF, 0) // SIDE, y1 + 1):
-            for x in range(wp.max(here.x - HALF, 0) // SIDE, x1 + 1):
+        x1 = wp.min(here.x + REACH, here.width - 1) // TILE
+        y1 = wp.min(here.y + ROWS - 1 + REACH, here.height - 1) // TILE
+        for y in range(wp.max(here.y - REACH, 0) // TILE, y1 + 1):
+            for x in range(wp.max(here.x - REACH, 0) // TILE, x1 + 1):
                 tile = y * tiles_x + x
                 nothing = nothing and starts[tile + 1] == starts[tile] and blank[here.view, y, x] == 1
     return nothing
@@ -256,13 +246,13 @@ def picture_loss(
         square = wp.vec4(0.0, 0.0, 0.0, 0.0)
         product = wp.vec4(0.0, 0.0, 0.0, 0.0)
         for down in range(window + PAD):
-            row = at.y + down - HALF
+            row = at.y + down - REACH
             if row >= 0 and row < at.height:
                 sum_mean = wp.float32(0.0)
                 sum_square = wp.float32(0.0)
                 sum_product = wp.float32(0.0)
                 for across in range(window):
-                    column = x + across - HALF
+                    column = x + across - REACH
                     if column >= 0 and column < at.width:
                         value = at.gain * planes[channel, row, column] + at.offset
                         weighted = taps[across + PAD] * value
@@ -273,7 +263,7 @@ def picture_loss(
                 mean += rows * sum_mean
                 square += rows * sum_square
                 product += rows * sum_product
-        for k in range(BAND):
+        for k in range(ROWS):
             y = at.y + k
             if y < at.height:
                 m1 = mean[k]
@@ -297,11 +287,11 @@ def picture_loss(
     if leads() == 1 and channel < channels[at.view]:
         row = record[0]
         if channel < 3:
-            wp.atomic_add(log, row, 0, at.share * sums[0])
-            wp.atomic_add(log, row, 2, sums[1])
-            wp.atomic_add(log, row, 3 + channel, sums[2] / (wp.float32(at.width) * wp.float32(at.height)))
+            wp.atomic_add(log, row, IMAGE_LOSS, at.share * sums[0])
+            wp.atomic_add(log, row, SQUARES, sums[1])
+            wp.atomic_add(log, row, SHIFT + channel, sums[2] / (wp.float32(at.width) * wp.float32(at.height)))
         else:
-            wp.atomic_add(log, row, 1, at.share * sums[0])
+            wp.atomic_add(log, row, MASK_LOSS, at.share * sums[0])
 
 
 @wp.kernel
@@ -332,7 +322,7 @@ def picture_gradient(
     at = place_of(cameras, channels, view, exposures, weights, channel, band, x)
     some = wp.int32(0)
     if at.shown == 1:
-        tile = (at.y // SIDE) * tiles_x + x // SIDE
+        tile = (at.y // TILE) * tiles_x + x // TILE
         some = starts[tile + 1] - starts[tile]
     if some > 0:
         by_mean = wp.vec4(0.0, 0.0, 0.0, 0.0)
@@ -340,18 +330,18 @@ def picture_gradient(
         by_product = wp.vec4(0.0, 0.0, 0.0, 0.0)
         if at.compared == 1:
             for down in range(window + PAD):
-                row = at.y + down - HALF
+                row = at.y + down - REACH
                 if row >= 0 and row < at.height:
                     sums = wp.vec3(0.0, 0.0, 0.0)
                     for across in range(window):
-                        column = x + across - HALF
+                        column = x + across - REACH
                         if column >= 0 and column < at.width:
                             sums += taps[across + PAD] * by_window[channel, row, column]
                     rows = wp.vec4(taps[down + 3], taps[down + 2], taps[down + 1], taps[down])
                     by_mean += rows * sums[0]
                     by_square += rows * sums[1]
                     by_product += rows * sums[2]
-        for k in range(BAND):
+        for k in range(ROWS):
             y = at.y + k
             if y < at.height:
                 g = wp.float32(0.0)

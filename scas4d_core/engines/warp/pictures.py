@@ -9,7 +9,8 @@ import warp as wp
 
 from scas4d_core.engines.plan import UpdatePlan
 from scas4d_core.engines.views import TrainingView
-from scas4d_core.engines.warp.picture_loss import COLUMNS, PictureLoss
+from scas4d_core.engines.warp.layout import COLUMNS
+from scas4d_core.engines.warp.picture_loss import PictureLoss
 from scas4d_core.engines.warp.projection import ACTED
 from scas4d_core.engines.warp.rasterizer import Rasterizer
 from scas4d_core.guards import GuardCounts
@@ -28,7 +29,7 @@ class PicturePass:
         grad_means, grad_factors, grad_features: [N] of vec3, mat33 and vec4; ``launch`` adds to them.
         planes: [5, rows, columns] of the last rendering: RGB before exposure, label, transmittance left.
         exposures: [views, 4] of vec2, gain and offset; may be changed between launches.
-        log: [records, 8] float32, columns as in ``picture_loss``.
+        log: [records, 8] float32, columns as in ``layout``.
         overflow: [1] int32, set to 1 when a picture had no room and was drawn empty; see ``grow``.
         generation: number of times that buffers were replaced.
     """

@@ -15,7 +15,6 @@ from scas4d_core.guards import FEATURE_CEILING, FOOTPRINT_CEILING, GRADIENT_NOT_
 
 wp.set_module_options({"enable_backward": False})
 
-SIDE = wp.constant(TILE)
 FARTHEST = wp.constant(wp.float32(NOT_FINITE))
 BRIGHTEST = wp.constant(wp.float32(FEATURE_CEILING))
 WIDEST = wp.constant(wp.float32(FOOTPRINT_CEILING))
@@ -27,7 +26,6 @@ RECORD = 4
 the offset (x, y) from the mean, and dL/dfeatures; the rest pads them to 64 bytes."""
 FEATURES = 6
 """The first of the ten numbers that is of features."""
-RECORD_ROWS = wp.constant(RECORD)
 
 
 @wp.func
@@ -69,7 +67,7 @@ def project_one(
     """Projects a Gaussian; returns 1 if its box meets the picture, else 0. See ``project``."""
     zero = wp.vec4(0.0, 0.0, 0.0, 0.0)
     for k in range(3):
-        store(records, RECORD_ROWS * i + k, zero)
+        store(records, RECORD * i + k, zero)
     mean = means[i]
     factor = factors[i]
     opacity = opacities[i]
@@ -107,10 +105,10 @@ def project_one(
             if x + half_x > 0.0 and x - half_x < width and y + half_y > 0.0 and y - half_y < height:
                 drawn = wp.int32(1)
                 second = wp.vec4(xx / determinant, log_opacity, reach * (1.0 + SLACK) + SLACK, place[2])
-                x0 = wp.int32(wp.max(x - half_x, 0.0)) // SIDE
-                y0 = wp.int32(wp.max(y - half_y, 0.0)) // SIDE
-                x1 = wp.int32(wp.min(x + half_x, width - 1.0)) // SIDE + 1
-                y1 = wp.int32(wp.min(y + half_y, height - 1.0)) // SIDE + 1
+                x0 = wp.int32(wp.max(x - half_x, 0.0)) // TILE
+                y0 = wp.int32(wp.max(y - half_y, 0.0)) // TILE
+                x1 = wp.int32(wp.min(x + half_x, width - 1.0)) // TILE + 1
+                y1 = wp.int32(wp.min(y + half_y, height - 1.0)) // TILE + 1
                 boxes[i] = wp.vec4i(x0, y0, x1, y1)
                 store(splats, 2 * i, wp.vec4(x, y, yy / determinant, -xy / determinant))
     store(splats, 2 * i + 1, second)
@@ -176,9 +174,9 @@ def project_backward(
     second = load(splats, 2 * i + 1)
     if second[2] > 0.0:
         first = load(splats, 2 * i)
-        r0 = load(records, RECORD_ROWS * i)
-        r1 = load(records, RECORD_ROWS * i + 1)
-        r2 = load(records, RECORD_ROWS * i + 2)
+        r0 = load(records, RECORD * i)
+        r1 = load(records, RECORD * i + 1)
+        r2 = load(records, RECORD * i + 2)
         camera = cameras[view[0]]
         place = camera.rotation * means[i] + camera.translation
         inverse = 1.0 / place[2]

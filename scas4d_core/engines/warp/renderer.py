@@ -12,8 +12,8 @@ from scas4d_core.engines.cpu.gloss import features_seen
 from scas4d_core.engines.limits import DEFAULT, Limits
 from scas4d_core.engines.renderer import BLOCK, CHANNELS, Comparison, Picture
 from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView
-from scas4d_core.engines.warp.layout import Camera, camera_of
-from scas4d_core.engines.warp.picture_loss import COLUMNS, IMAGE_LOSS, SHIFT, SQUARES, PictureLoss
+from scas4d_core.engines.warp.layout import COLUMNS, IMAGE_LOSS, SHIFT, SQUARES, Camera, camera_of
+from scas4d_core.engines.warp.picture_loss import PictureLoss
 from scas4d_core.engines.warp.projection import FEATURES, RECORD
 from scas4d_core.engines.warp.rasterizer import Rasterizer
 from scas4d_core.gaussians import Gaussians

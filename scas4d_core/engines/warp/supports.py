@@ -24,7 +24,6 @@ from scas4d_core.guards import COVER_SLACK
 
 wp.set_module_options({"enable_backward": False})
 
-SIDE = wp.constant(TILE)
 SLACK = wp.constant(wp.float32(COVER_SLACK))
 HUGE = wp.constant(wp.float32(3.0e38))
 FEW = wp.constant(4)  # tiles that a lane goes through by itself; those of a larger box are shared among the warp
@@ -57,10 +56,10 @@ def least_form(
 @wp.func
 def tile_form(camera: Camera, first: wp.vec4, second: wp.vec4, tile_x: wp.int32, tile_y: wp.int32) -> wp.float32:
     """The least of a splat's form over the centres of a tile's pixels."""
-    left = wp.float32(tile_x * SIDE) + 0.5 - first[0]
-    top = wp.float32(tile_y * SIDE) + 0.5 - first[1]
-    across = wp.float32(wp.min(SIDE, camera.width - tile_x * SIDE) - 1)
-    down = wp.float32(wp.min(SIDE, camera.height - tile_y * SIDE) - 1)
+    left = wp.float32(tile_x * TILE) + 0.5 - first[0]
+    top = wp.float32(tile_y * TILE) + 0.5 - first[1]
+    across = wp.float32(wp.min(TILE, camera.width - tile_x * TILE) - 1)
+    down = wp.float32(wp.min(TILE, camera.height - tile_y * TILE) - 1)
     return least_form(first[2], first[3], second[0], left, left + across, top, top + down)
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import warp as wp
 
 from scas4d_core.engines.warp.lanes import load
-from scas4d_core.engines.warp.layout import SEGMENT, TILE, Camera, Raster
+from scas4d_core.engines.warp.layout import COLUMNS, PAIRS, SEGMENT, TILE, Camera, Raster
 from scas4d_core.engines.warp.supports import enter_lists, least_form
 
 wp.set_module_options({"enable_backward": False})
@@ -19,8 +19,6 @@ SCAN_BLOCK = 1024
 """Threads of the one block that places the lists."""
 SORT_BLOCK = 512
 """Threads of a block that sorts a list."""
-PER_SEGMENT = wp.constant(SEGMENT)
-SIDE = wp.constant(TILE)
 
 
 @wp.func_native("""
@@ -100,13 +98,13 @@ def place_lists(
         threads: of the block, 1 on the CPU device. tile_counts: [tiles] entries of each list; left 0.
         starts, segment_starts: out [tiles + 1]; all 0 if the lists have more entries than there is room for.
         overflow: [1], set to 1 in that case.
-        record: [1] row of the log that is begun. log: [records, 8] see ``picture_loss``.
+        record: [1] row of the log that is begun. log: [records, ``COLUMNS``].
     """
-    scan_lists(wp.tid(), raster.capacity, PER_SEGMENT, tile_counts, starts, segment_starts, overflow)
+    scan_lists(wp.tid(), raster.capacity, SEGMENT, tile_counts, starts, segment_starts, overflow)
     if wp.tid() == threads - 1:
-        for column in range(8):
+        for column in range(COLUMNS):
             log[record[0], column] = 0.0
-        log[record[0], 6] = wp.float32(starts[raster.tiles_x * raster.tiles_y])
+        log[record[0], PAIRS] = wp.float32(starts[raster.tiles_x * raster.tiles_y])
 
 
 @wp.kernel
@@ -232,7 +230,7 @@ def mark_blocks(
     if second[2] > 0.0:
         camera = cameras[0]
         box = boxes[i]
-        blocks = SIDE // side
+        blocks = TILE // side
         for y in range(box[1] * blocks, wp.min(box[3] * blocks, (camera.height + side - 1) // side)):
             top = wp.float32(y * side) + 0.5 - first[1]
             bottom = top + wp.float32(wp.min(side, camera.height - y * side) - 1)

@@ -15,8 +15,8 @@ from warp_cases import DEVICE, camera, index, view_of
 from scas4d_core.engines.torch import losses
 from scas4d_core.engines.torch.parameters import leaf
 from scas4d_core.engines.views import TrainingView
-from scas4d_core.engines.warp.layout import TILE
-from scas4d_core.engines.warp.picture_loss import COLUMNS, IMAGE_LOSS, MASK_LOSS, SHIFT, SQUARES, PictureLoss
+from scas4d_core.engines.warp.layout import COLUMNS, IMAGE_LOSS, MASK_LOSS, SHIFT, SQUARES, TILE
+from scas4d_core.engines.warp.picture_loss import PictureLoss
 from scas4d_core.engines.warp.rasterizer import Rasterizer
 
 CLOSE = 1e-4

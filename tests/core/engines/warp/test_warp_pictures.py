@@ -17,7 +17,7 @@ from scas4d_core.engines.plan import UpdatePlan
 from scas4d_core.engines.torch import losses
 from scas4d_core.engines.torch.parameters import leaf
 from scas4d_core.engines.views import TrainingView
-from scas4d_core.engines.warp.picture_loss import IMAGE_LOSS, MASK_LOSS, PAIRS, SQUARES
+from scas4d_core.engines.warp.layout import IMAGE_LOSS, MASK_LOSS, PAIRS, SQUARES
 from scas4d_core.engines.warp.pictures import PicturePass
 
 CLOSE = 1e-4

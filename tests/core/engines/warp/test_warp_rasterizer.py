@@ -17,8 +17,7 @@ from warp_cases import BACKGROUND, DEVICE, LIMITS, Cloud, camera, cloud, drawn, 
 from scas4d_core.engines.limits import Limits
 from scas4d_core.engines.torch.rasterizer import CameraParams, project
 from scas4d_core.engines.views import CameraArrays
-from scas4d_core.engines.warp.layout import TILE, Camera, camera_of
-from scas4d_core.engines.warp.picture_loss import COLUMNS, PAIRS
+from scas4d_core.engines.warp.layout import COLUMNS, PAIRS, TILE, Camera, camera_of
 from scas4d_core.engines.warp.rasterizer import Rasterizer
 from scas4d_core.guards import COVER_SLACK
 
