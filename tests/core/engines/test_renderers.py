@@ -1,4 +1,4 @@
-"""The renderer of the CPU against that of the reference."""
+"""Each renderer against that of the reference."""
 
 from __future__ import annotations
 
@@ -8,20 +8,33 @@ from engine_cases import apart, case, gaussians, rig
 
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.limits import Limits
+from scas4d_core.engines.renderer import Renderer
 from scas4d_core.engines.torch.renderer import TorchRenderer
 from scas4d_core.engines.views import LABEL, CameraArrays
 
 BACKGROUND, LIMITS = (0.1, 0.2, 0.3), Limits(near=0.2)
-MINE, TRUE = CpuRenderer(BACKGROUND, limits=LIMITS), TorchRenderer(BACKGROUND, LIMITS)
+TRUE = TorchRenderer(BACKGROUND, LIMITS)
 CAMERA = CameraArrays.of(rig().cameras[1])
 CLOSE = 1e-4
 """Relative to the norm: float32 against float64."""
 
 
+@pytest.fixture(params=["cpu", "warp"], scope="module")
+def tested(request) -> Renderer:  # type: ignore[no-untyped-def]
+    if request.param == "cpu":
+        return CpuRenderer(BACKGROUND, limits=LIMITS)
+    pytest.importorskip("warp", reason="NVIDIA Warp is not installed: pip install warp-lang")
+    from warp_cases import DEVICE
+
+    from scas4d_core.engines.warp.renderer import WarpRenderer
+
+    return WarpRenderer(BACKGROUND, LIMITS, DEVICE)
+
+
 @pytest.mark.parametrize("glossy", [False, True])
-def test_pictures(glossy: bool) -> None:
+def test_pictures(tested: Renderer, glossy: bool) -> None:
     state = gaussians(glossy=glossy)
-    mine, true = MINE.render(state, CAMERA), TRUE.render(state, CAMERA)
+    mine, true = tested.render(state, CAMERA), TRUE.render(state, CAMERA)
     assert mine.features.shape == true.features.shape == (4, 40, 48)
     assert apart(mine.features, true.features) < CLOSE
     assert apart(mine.rest, true.rest) < CLOSE
@@ -30,49 +43,60 @@ def test_pictures(glossy: bool) -> None:
         assert apart(dull.features, true.features) > 0.01
 
 
-def test_depth_features_and_another_background() -> None:
+def test_depth_features_and_another_background(tested: Renderer) -> None:
     state, rng = gaussians(), np.random.default_rng(0)
     given = rng.uniform(size=(len(state), 4)).astype(np.float32)
     behind = np.float32([0.4, 0, 0.9, 7])
     mine, true = (
         renderer.render(state, CAMERA, given.copy(), depth_channel=LABEL, background=behind)
-        for renderer in (MINE, TRUE)
+        for renderer in (tested, TRUE)
     )
     assert apart(mine.features, true.features) < CLOSE
     assert true.features[LABEL].max() > 1.5  # metres
 
 
-def test_comparisons() -> None:
+def test_eight_features_of_gaussians_that_are_not_all_sound(tested: Renderer) -> None:
+    state, rng = gaussians(), np.random.default_rng(0)
+    means, given = state.means.copy(), rng.uniform(size=(len(state), 8)).astype(np.float32)
+    means[11], given[20, 6], given[30, 1] = np.nan, np.inf, 1e12
+    state = state.replace(means=means)
+    mine, true = (renderer.render(state, CAMERA, given) for renderer in (tested, TRUE))
+    assert mine.features.shape == (8, 40, 48)
+    assert apart(mine.features, true.features) < CLOSE
+    assert apart(mine.rest, true.rest) < CLOSE
+
+
+def test_comparisons(tested: Renderer) -> None:
     scene = case(gaussians())
     for view in scene.views[:3]:
-        mine, true = (renderer.compare(scene.previous, view) for renderer in (MINE, TRUE))
+        mine, true = (renderer.compare(scene.previous, view) for renderer in (tested, TRUE))
         assert mine.psnr == pytest.approx(true.psnr, abs=1e-3)
         assert mine.image_loss == pytest.approx(true.image_loss, rel=CLOSE)
         assert mine.colour_shift == pytest.approx(true.colour_shift, abs=1e-6)
 
 
-def test_sums_over_pixels() -> None:
+def test_sums_over_pixels(tested: Renderer) -> None:
     state, rng = gaussians(), np.random.default_rng(3)
     planes = rng.uniform(-1, 1, (3, 40, 48)).astype(np.float32)
     planes[0] = 1
-    mine, true = (renderer.gather(state, CAMERA, planes) for renderer in (MINE, TRUE))
+    mine, true = (renderer.gather(state, CAMERA, planes) for renderer in (tested, TRUE))
     assert mine.shape == (len(state), 3)
     assert apart(mine, true) < CLOSE
 
 
-def test_residuals_of_some_gaussians() -> None:
+def test_residuals_of_some_gaussians(tested: Renderer) -> None:
     scene = case(gaussians())
     learnt = (np.arange(len(scene.previous)) % 3 == 0).astype(np.uint8)
-    mine, true = (renderer.residuals(scene.previous, scene.views[2], learnt, 0.05) for renderer in (MINE, TRUE))
+    mine, true = (renderer.residuals(scene.previous, scene.views[2], learnt, 0.05) for renderer in (tested, TRUE))
     assert apart(mine[0][learnt == 1], true[0][learnt == 1]) < 1e-3  # small differences of pictures
     assert apart(mine[1][learnt == 1], true[1][learnt == 1]) < CLOSE
     assert not true[1][learnt == 0].any()
 
 
-def test_blocks_that_are_reached() -> None:
+def test_blocks_that_are_reached(tested: Renderer) -> None:
     state = gaussians()
     rows = np.arange(0, 40)
-    mine, true = (renderer.reached(state, rows, CAMERA) for renderer in (MINE, TRUE))
+    mine, true = (renderer.reached(state, rows, CAMERA) for renderer in (tested, TRUE))
     assert mine.shape == true.shape
     assert not (true & ~mine).any()  # a support may pass between the centres of pixels
     assert (mine & ~true).sum() <= 0.2 * mine.sum()

@@ -1,0 +1,439 @@
+"""Front-to-back blending of tiles, four features at a time, and its backward pass.
+
+A tile is 16×16 pixels, and a warp draws 8×4 of them: its lanes look at as many entries of the list at once, and draw
+those whose support meets these pixels. On the CPU device a warp is one lane, and draws one pixel.
+
+Few tiles hold most of what is drawn, so a list is drawn in segments side by side: ``blend_segments`` draws each as if
+nothing were before it, and ``join_segments`` puts them together. A pixel that is finished within a segment is drawn
+anew there, so that it ends where the rule says. What each segment starts from is kept for the backward pass.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from scas4d_core.engines.warp.lanes import (
+    ballot,
+    broadcast,
+    fast_divide,
+    fast_exp,
+    lane,
+    lane_count,
+    load,
+    lowest,
+    store,
+)
+from scas4d_core.engines.warp.layout import PIXELS, SEGMENT, TILE, Camera, Raster
+from scas4d_core.engines.warp.projection import RECORD
+from scas4d_core.engines.warp.supports import least_form
+
+wp.set_module_options({"enable_backward": False})
+
+NONE = wp.constant(wp.uint32(0))
+ONE = wp.constant(wp.uint32(1))
+
+
+@wp.struct
+class Spot:
+    """A lane's pixel: its place and centre, whether it is in the picture, and its warp's upper left pixel's centre."""
+
+    x: wp.int32
+    y: wp.int32
+    inside: wp.int32
+    centre_x: wp.float32
+    centre_y: wp.float32
+    left: wp.float32
+    top: wp.float32
+
+
+@wp.func
+def spot_of(raster: Raster, camera: Camera, tile: wp.int32, k: wp.int32) -> Spot:
+    """The k-th pixel of a tile; 32 in turn are 8×4."""
+    group = k // 32
+    within = k - group * 32
+    x0 = (tile % raster.tiles_x) * TILE + (group % 2) * 8
+    y0 = (tile // raster.tiles_x) * TILE + (group // 2) * 4
+    spot = Spot()
+    spot.x = x0 + within % 8
+    spot.y = y0 + within // 8
+    spot.inside = wp.where(spot.x < camera.width and spot.y < camera.height, 1, 0)
+    spot.centre_x = wp.float32(spot.x) + 0.5
+    spot.centre_y = wp.float32(spot.y) + 0.5
+    spot.left = spot.centre_x
+    spot.top = spot.centre_y
+    if lane_count() > 1:
+        spot.left = wp.float32(x0) + 0.5
+        spot.top = wp.float32(y0) + 0.5
+    return spot
+
+
+@wp.func
+def meets(spot: Spot, first: wp.vec4, second: wp.vec4) -> wp.int32:
+    """1 where a support meets the warp's pixels."""
+    met = wp.int32(0)
+    if second[2] > 0.0:
+        across = wp.where(lane_count() > 1, 7.0, 0.0)
+        down = wp.where(lane_count() > 1, 3.0, 0.0)
+        left = spot.left - first[0]
+        top = spot.top - first[1]
+        form = least_form(first[2], first[3], second[0], left, left + across, top, top + down)
+        if form <= second[2]:
+            met = wp.int32(1)
+    return met
+
+
+@wp.func
+def power_at(first: wp.vec4, second: wp.vec4, dx: wp.float32, dy: wp.float32) -> wp.float32:
+    """The logarithm of a splat's alpha at an offset from its mean."""
+    return second[1] - 0.5 * (first[2] * dx * dx + second[0] * dy * dy) - first[3] * dx * dy
+
+
+@wp.struct
+class Light:
+    """A pixel while it is drawn: transmittance, the features so far, and whether it is unfinished."""
+
+    passed: wp.float32
+    features: wp.vec4
+    open: wp.int32
+
+
+@wp.func
+def draw_entries(
+    raster: Raster,
+    splats: wp.array[wp.vec4],
+    features: wp.array[wp.vec4],
+    items: wp.array[wp.int32],
+    begin: wp.int32,
+    end: wp.int32,
+    spot: Spot,
+    open: wp.int32,
+    passed: wp.float32,
+    exact: wp.int32,
+) -> Light:
+    """Draws entries of a list from a transmittance on; called by all lanes of a warp.
+
+    Args:
+        begin, end: entries. open: 1 for pixels that are drawn. passed: transmittance before.
+        exact: 0: a pixel that is finished here is left with a transmittance below the stop; 1: with that before.
+    """
+    light = Light()
+    light.passed = passed
+    light.open = open
+    base = wp.int32(begin)
+    alive = ballot(light.open)
+    # The numbers of the next candidates, and those of the next one that is drawn, are loaded before they are needed.
+    item = wp.int32(0)
+    first = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    second = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    if base + lane() < end:
+        item = items[base + lane()]
+        first = load(splats, 2 * item)
+        second = load(splats, 2 * item + 1)
+    while base < end and alive != NONE:
+        candidates = ballot(meets(spot, first, second))
+        mine = item
+        base += lane_count()
+        second = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        if base + lane() < end:
+            item = items[base + lane()]
+            first = load(splats, 2 * item)
+            second = load(splats, 2 * item + 1)
+        ahead = broadcast(mine, lowest(candidates))
+        next_first = load(splats, 2 * ahead)
+        next_second = load(splats, 2 * ahead + 1)
+        next_features = load(features, ahead)
+        while candidates != NONE:
+            here = next_first
+            shape = next_second
+            feature = next_features
+            candidates = candidates & (candidates - ONE)
+            ahead = broadcast(mine, lowest(candidates))
+            next_first = load(splats, 2 * ahead)
+            next_second = load(splats, 2 * ahead + 1)
+            next_features = load(features, ahead)
+            power = power_at(here, shape, spot.centre_x - here[0], spot.centre_y - here[1])
+            if light.open == 1 and power >= raster.log_floor:
+                weight = wp.min(fast_exp(power), raster.alpha_cap) * light.passed
+                after = light.passed - weight
+                if after < raster.stop:
+                    light.open = 0
+                    if exact == 0:
+                        light.passed = after
+                else:
+                    light.passed = after
+                    light.features = light.features + weight * feature
+        alive = ballot(light.open)
+    return light
+
+
+@wp.kernel(launch_bounds=(PIXELS, 3))
+def blend_segments(
+    raster: Raster,
+    cameras: wp.array[Camera],
+    view: wp.array[wp.int32],
+    splats: wp.array[wp.vec4],
+    features: wp.array[wp.vec4],
+    items: wp.array[wp.int32],
+    starts: wp.array[wp.int32],
+    segment_starts: wp.array[wp.int32],
+    segment_tiles: wp.array[wp.int32],
+    warps: wp.int32,
+    segment_light: wp.array[wp.float32],
+    segment_features: wp.array[wp.vec4],
+) -> None:
+    """Draws each segment by itself; a warp for the next segment and some pixels of its tile, until all are done.
+
+    Args:
+        splats: [2 N]. features: [N]. items, starts, segment_starts, segment_tiles: the lists, see ``tiles``.
+        warps: of the launch.
+        segment_light, segment_features: out [segments · 256] the light that a segment lets pass at each pixel of its
+            tile, below the stop where the pixel is finished even by this segment alone, and the features drawn.
+    """
+    parts = PIXELS // lane_count()
+    total = segment_starts[raster.tiles_x * raster.tiles_y] * parts
+    unit = wp.int32(wp.tid() // lane_count())
+    while unit < total:
+        segment = unit // parts
+        k = (unit - segment * parts) * lane_count() + lane()
+        tile = segment_tiles[segment]
+        begin = starts[tile] + (segment - segment_starts[tile]) * SEGMENT
+        spot = spot_of(raster, cameras[view[0]], tile, k)
+        light = draw_entries(
+            raster, splats, features, items, begin, wp.min(begin + SEGMENT, starts[tile + 1]), spot, spot.inside, 1.0, 0
+        )
+        segment_light[segment * PIXELS + k] = light.passed
+        store(segment_features, segment * PIXELS + k, light.features)
+        unit += warps
+
+
+@wp.kernel(launch_bounds=(PIXELS, 3))
+def join_segments(
+    raster: Raster,
+    cameras: wp.array[Camera],
+    view: wp.array[wp.int32],
+    splats: wp.array[wp.vec4],
+    features: wp.array[wp.vec4],
+    items: wp.array[wp.int32],
+    starts: wp.array[wp.int32],
+    segment_starts: wp.array[wp.int32],
+    background: wp.array[wp.vec4],
+    segment_light: wp.array[wp.float32],
+    segment_features: wp.array[wp.vec4],
+    begun: wp.array2d[wp.int32],
+    planes: wp.array3d[wp.float32],
+) -> None:
+    """Puts the segments of each list together; a thread for each pixel of each tile.
+
+    Args:
+        background: [1] behind everything. segment_light, segment_features: from ``blend_segments``; left with what
+            each segment of an unfinished pixel starts from.
+        begun: out [rows, columns] how many segments a pixel was unfinished at the start of.
+        planes: out [5, rows, columns] the features, background included, and the transmittance left.
+    """
+    camera = cameras[view[0]]
+    tile = wp.tid() // PIXELS
+    k = wp.tid() - tile * PIXELS
+    spot = spot_of(raster, camera, tile, k)
+    light = Light()
+    light.passed = 1.0
+    light.open = spot.inside
+    begin = starts[tile]
+    end = starts[tile + 1]
+    segments = segment_starts[tile + 1] - segment_starts[tile]
+    at = segment_starts[tile] * PIXELS + k
+    count = wp.int32(0)
+    segment = wp.int32(0)
+    # The next segment's numbers are loaded before they are needed.
+    next_passed = wp.float32(1.0)
+    next_drawn = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    if segments > 0:
+        next_passed = segment_light[at]
+        next_drawn = load(segment_features, at)
+    while segment < segments and ballot(light.open) != NONE:
+        passed = next_passed
+        drawn = next_drawn
+        if segment + 1 < segments:
+            next_passed = segment_light[at + PIXELS]
+            next_drawn = load(segment_features, at + PIXELS)
+        anew = wp.int32(0)
+        if light.open == 1:
+            segment_light[at] = light.passed
+            store(segment_features, at, light.features)
+            count = segment + 1
+            if light.passed * passed >= raster.stop:
+                light.features = light.features + light.passed * drawn
+                light.passed = light.passed * passed
+            else:
+                anew = wp.int32(1)
+        if ballot(anew) != NONE:
+            again = draw_entries(
+                raster, splats, features, items, begin, wp.min(begin + SEGMENT, end), spot, anew, light.passed, 1
+            )
+            if anew == 1:
+                light.passed = again.passed
+                light.features = light.features + again.features
+                light.open = again.open
+        begin += SEGMENT
+        at += PIXELS
+        segment += 1
+    if spot.inside == 1:
+        begun[spot.y, spot.x] = count
+        shown = light.features + light.passed * background[0]
+        for channel in range(4):
+            planes[channel, spot.y, spot.x] = shown[channel]
+        planes[4, spot.y, spot.x] = light.passed
+
+
+# A transposing butterfly: ten sums over 32 lanes fold into five over 16, three over 8, two over 4 and one over 2.
+# The compiler knows each index, so that the numbers stay in registers.
+@wp.func_native("""
+float* record = reinterpret_cast<float*>(records.data + row);
+#if defined(__CUDA_ARCH__)
+float v[10] = {a0, a1, a2, a3, a4, a5, a6, a7, a8, a9};
+const int own = threadIdx.x & 31;
+const auto fold = [&](const int count, const int half, const int bit) {
+    const bool upper = own & bit;
+#pragma unroll
+    for (int k = 0; k < 5; ++k)
+        if (k < half) {
+            const float far = k + half < count ? v[k + half] : 0.f;
+            const float given = upper ? v[k] : far, kept = upper ? far : v[k];
+            v[k] = kept + __shfl_xor_sync(0xffffffffu, given, bit);
+        }
+};
+fold(10, 5, 16);
+fold(5, 3, 8);
+fold(3, 2, 4);
+fold(2, 1, 2);
+v[0] += __shfl_xor_sync(0xffffffffu, v[0], 1);
+const int last = (own & 4 ? 2 : 0) + (own & 2 ? 1 : 0);
+const int which = (own & 16 ? 5 : 0) + (own & 8 ? 3 : 0) + last;
+if (!(own & 1) && last < (own & 8 ? 2 : 3)) atomicAdd(record + which, v[0]);
+#else
+const float v[10] = {a0, a1, a2, a3, a4, a5, a6, a7, a8, a9};
+for (int k = 0; k < 10; ++k) record[k] += v[k];
+#endif
+""")
+def add_record(
+    records: wp.array[wp.vec4], row: wp.int32, a0: wp.float32, a1: wp.float32, a2: wp.float32, a3: wp.float32,
+    a4: wp.float32, a5: wp.float32, a6: wp.float32, a7: wp.float32, a8: wp.float32, a9: wp.float32,
+) -> None:  # fmt: skip
+    """Adds ten numbers, summed over the lanes, to a record from a row on."""
+    ...
+
+
+@wp.kernel(launch_bounds=(PIXELS, 3))
+def blend_backward(
+    raster: Raster,
+    cameras: wp.array[Camera],
+    view: wp.array[wp.int32],
+    splats: wp.array[wp.vec4],
+    features: wp.array[wp.vec4],
+    items: wp.array[wp.int32],
+    starts: wp.array[wp.int32],
+    segment_starts: wp.array[wp.int32],
+    segment_tiles: wp.array[wp.int32],
+    warps: wp.int32,
+    segment_light: wp.array[wp.float32],
+    segment_features: wp.array[wp.vec4],
+    begun: wp.array2d[wp.int32],
+    planes: wp.array3d[wp.float32],
+    g_planes: wp.array3d[wp.float32],
+    records: wp.array[wp.vec4],
+) -> None:
+    """Carries the gradient of the planes to the splats; a warp for the next segment and some pixels, as forward.
+
+    Args:
+        segment_light, segment_features, begun, planes: from ``join_segments``.
+        g_planes: [4, rows, columns] dL/dplanes of the features.
+        records: [4 N], added to; see ``projection``.
+    """
+    parts = PIXELS // lane_count()
+    total = segment_starts[raster.tiles_x * raster.tiles_y] * parts
+    unit = wp.int32(wp.tid() // lane_count())
+    while unit < total:
+        segment = unit // parts
+        k = (unit - segment * parts) * lane_count() + lane()
+        tile = segment_tiles[segment]
+        number = segment - segment_starts[tile]
+        base = starts[tile] + number * SEGMENT
+        end = wp.min(base + SEGMENT, starts[tile + 1])
+        spot = spot_of(raster, cameras[view[0]], tile, k)
+        open = wp.int32(0)
+        passed = wp.float32(1.0)
+        behind = wp.float32(0.0)  # what the entries behind the present one contribute, background included
+        g = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        if spot.inside == 1:  # noqa: SIM102  # Warp reads both sides of an `and`
+            if number < begun[spot.y, spot.x]:
+                g = wp.vec4(
+                    g_planes[0, spot.y, spot.x], g_planes[1, spot.y, spot.x], g_planes[2, spot.y, spot.x],
+                    g_planes[3, spot.y, spot.x],
+                )  # fmt: skip
+                shown = wp.vec4(
+                    planes[0, spot.y, spot.x], planes[1, spot.y, spot.x], planes[2, spot.y, spot.x],
+                    planes[3, spot.y, spot.x],
+                )  # fmt: skip
+                passed = segment_light[segment * PIXELS + k]
+                behind = wp.dot(g, shown - load(segment_features, segment * PIXELS + k))
+                if g[0] != 0.0 or g[1] != 0.0 or g[2] != 0.0 or g[3] != 0.0:
+                    open = wp.int32(1)
+        alive = ballot(open)
+        item = wp.int32(0)
+        first = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        second = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        if alive != NONE and base + lane() < end:
+            item = items[base + lane()]
+            first = load(splats, 2 * item)
+            second = load(splats, 2 * item + 1)
+        while base < end and alive != NONE:
+            candidates = ballot(meets(spot, first, second))
+            mine = item
+            base += lane_count()
+            second = wp.vec4(0.0, 0.0, 0.0, 0.0)
+            if base + lane() < end:
+                item = items[base + lane()]
+                first = load(splats, 2 * item)
+                second = load(splats, 2 * item + 1)
+            ahead = broadcast(mine, lowest(candidates))
+            next_first = load(splats, 2 * ahead)
+            next_second = load(splats, 2 * ahead + 1)
+            next_features = load(features, ahead)
+            while candidates != NONE:
+                row = ahead
+                here = next_first
+                shape = next_second
+                feature = next_features
+                candidates = candidates & (candidates - ONE)
+                ahead = broadcast(mine, lowest(candidates))
+                next_first = load(splats, 2 * ahead)
+                next_second = load(splats, 2 * ahead + 1)
+                next_features = load(features, ahead)
+                dx = spot.centre_x - here[0]
+                dy = spot.centre_y - here[1]
+                power = power_at(here, shape, dx, dy)
+                weight = wp.float32(0.0)
+                g_power = wp.float32(0.0)
+                drawn = wp.int32(0)
+                if open == 1 and power >= raster.log_floor:
+                    alpha = wp.min(fast_exp(power), raster.alpha_cap)
+                    weight = alpha * passed
+                    after = passed - weight
+                    if after < raster.stop:
+                        open = wp.int32(0)
+                        weight = wp.float32(0.0)
+                    else:
+                        passed = after
+                        drawn = wp.int32(1)
+                        own = weight * wp.dot(g, feature)
+                        behind -= own
+                        if alpha < raster.alpha_cap:
+                            g_power = own - behind * fast_divide(alpha, 1.0 - alpha)
+                if ballot(drawn) != NONE:
+                    gx = g_power * dx
+                    gy = g_power * dy
+                    add_record(
+                        records, RECORD * row, g_power, gx, gy, gx * dx, gx * dy, gy * dy, weight * g[0],
+                        weight * g[1], weight * g[2], weight * g[3],
+                    )  # fmt: skip
+            alive = ballot(open)
+        unit += warps

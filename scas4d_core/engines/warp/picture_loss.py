@@ -1,0 +1,454 @@
+"""The picture loss 0.8 L1 + 0.2 (1 − SSIM) of views, and its gradient. Reference: ``engines.torch.losses``.
+
+SSIM is that of 3D Gaussian Splatting: 11×11 Gaussian window, sigma 1.5, zero padding. A thread computes four pixels one
+above the other: it filters the 14 rows that their windows meet along the row, and adds each up for the four. Windows
+are filtered anew instead of being kept: arithmetic is cheap where all pixels of a picture fill a tenth of a GPU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from scas4d_core.engines.renderer import CHANNELS
+from scas4d_core.engines.views import TrainingView
+from scas4d_core.engines.warp.layout import IMAGE_LOSS, MASK_LOSS, SHIFT, SQUARES, TILE, Camera, camera_of
+from scas4d_core.engines.warp.rasterizer import Rasterizer
+from scas4d_core.guards import SSIM_C1, SSIM_C2
+
+# Loops over the window stay loops, of a length that the compiler does not know: written out, they take all registers.
+wp.set_module_options({"enable_backward": False, "max_unroll": 4})
+
+Array = NDArray[np.float32]
+
+REACH = 5
+"""Pixels of the window on either side of its centre."""
+ROWS = 4
+"""Pixels of a thread."""
+
+_taps = np.exp(-((np.arange(2 * REACH + 1) - REACH) ** 2) / (2 * 1.5**2))
+_taps /= _taps.sum()
+PADDED_TAPS = np.float32([0.0] * (ROWS - 1) + _taps.tolist() + [0.0] * (ROWS - 1))
+"""[17] weights of the window, with zeros on either side for those of four rows that a window does not reach."""
+PAD = ROWS - 1
+C1 = wp.constant(wp.float32(SSIM_C1))
+C2 = wp.constant(wp.float32(SSIM_C2))
+L1_PART = wp.constant(wp.float32(0.8))
+SSIM_PART = wp.constant(wp.float32(0.2))
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+return threadIdx.x == 0;
+#else
+return 1;
+#endif
+""")
+def leads() -> wp.int32:
+    """1 in the thread of a block that has ``sum_over_block``; on the CPU device each thread is a block."""
+    ...
+
+
+@wp.func_native("""
+#if defined(__CUDA_ARCH__)
+__shared__ float parts[3][32];
+float x = value[0], y = value[1], z = value[2];
+for (int k = 16; k > 0; k >>= 1) {
+    x += __shfl_xor_sync(0xffffffffu, x, k);
+    y += __shfl_xor_sync(0xffffffffu, y, k);
+    z += __shfl_xor_sync(0xffffffffu, z, k);
+}
+const int warp = threadIdx.x >> 5, warps = blockDim.x >> 5;
+__syncthreads();
+if ((threadIdx.x & 31) == 0) {
+    parts[0][warp] = x;
+    parts[1][warp] = y;
+    parts[2][warp] = z;
+}
+__syncthreads();
+if (threadIdx.x == 0)
+    for (int k = 1; k < warps; ++k) {
+        x += parts[0][k];
+        y += parts[1][k];
+        z += parts[2][k];
+    }
+return wp::vec_t<3, wp::float32>(x, y, z);
+#else
+return value;
+#endif
+""")
+def sum_over_block(value: wp.vec3) -> wp.vec3:
+    """The sum over the threads of a block, in its first thread; called by all of them."""
+    ...
+
+
+@wp.struct
+class Place:
+    """What a thread of the loss knows: its view and channel, the picture's size, and its first pixel."""
+
+    view: wp.int32
+    channel: wp.int32
+    width: wp.int32
+    height: wp.int32
+    x: wp.int32
+    y: wp.int32
+    shown: wp.int32  # 1 where the pixel is in the picture
+    compared: wp.int32  # 1 where the target has this channel too
+    gain: wp.float32
+    offset: wp.float32
+    share: wp.float32  # weight of one pixel in the loss
+
+
+@wp.func
+def place_of(
+    cameras: wp.array[Camera], channels: wp.array[wp.int32], view: wp.array[wp.int32],
+    exposures: wp.array2d[wp.vec2], weights: wp.vec4, channel: wp.int32, band: wp.int32, x: wp.int32,
+) -> Place:  # fmt: skip
+    """What a thread has to know."""
+    here = Place()
+    here.view = view[0]
+    here.channel = channel
+    camera = cameras[here.view]
+    here.width = camera.width
+    here.height = camera.height
+    here.x = x
+    here.y = band * ROWS
+    exposure = exposures[here.view, channel]
+    here.gain = exposure[0]
+    here.offset = exposure[1]
+    here.share = weights[channel] / (wp.float32(here.width) * wp.float32(here.height))
+    if x < here.width and here.y < here.height:
+        here.shown = 1
+        if channel < channels[here.view]:
+            here.compared = 1
+    return here
+
+
+@wp.kernel
+def target_moments(
+    cameras: wp.array[Camera],
+    window: wp.int32,
+    taps: wp.array[wp.float32],
+    targets: wp.array4d[wp.float32],
+    means: wp.array4d[wp.float32],
+    squares: wp.array4d[wp.float32],
+) -> None:
+    """Fills the window's means of each target and of its square.
+
+    Args:
+        targets: [views, 4, rows, columns]. means, squares: out, the same; beyond a picture, as it is.
+    """
+    view, channel, y, x = wp.tid()
+    camera = cameras[view]
+    if x < camera.width and y < camera.height:
+        mean = wp.float32(0.0)
+        square = wp.float32(0.0)
+        for down in range(window):
+            row = y + down - REACH
+            if row >= 0 and row < camera.height:
+                sum_mean = wp.float32(0.0)
+                sum_square = wp.float32(0.0)
+                for across in range(window):
+                    column = x + across - REACH
+                    if column >= 0 and column < camera.width:
+                        value = targets[view, channel, row, column]
+                        sum_mean += taps[across + PAD] * value
+                        sum_square += taps[across + PAD] * value * value
+                tap = taps[down + PAD]
+                mean += tap * sum_mean
+                square += tap * sum_square
+        means[view, channel, y, x] = mean
+        squares[view, channel, y, x] = square
+
+
+@wp.kernel
+def find_blank(cameras: wp.array[Camera], targets: wp.array4d[wp.float32], blank: wp.array3d[wp.int32]) -> None:
+    """Marks the tiles in which each target is 0; a thread for each tile.
+
+    Args:
+        targets: [views, 4, rows, columns]. blank: out [views, tile rows, tile columns] 1 or 0.
+    """
+    view, tile_y, tile_x = wp.tid()
+    camera = cameras[view]
+    found = wp.int32(1)
+    for channel in range(4):
+        for y in range(tile_y * TILE, wp.min(tile_y * TILE + TILE, camera.height)):
+            for x in range(tile_x * TILE, wp.min(tile_x * TILE + TILE, camera.width)):
+                if targets[view, channel, y, x] != 0.0:
+                    found = wp.int32(0)
+    blank[view, tile_y, tile_x] = found
+
+
+@wp.func
+def nothing_near(
+    here: Place, tiles_x: wp.int32, starts: wp.array[wp.int32], background: wp.array[wp.vec4],
+    blank: wp.array3d[wp.int32],
+) -> wp.bool:  # fmt: skip
+    """True where the windows of a thread's pixels are 0 in the picture and in the target."""
+    nothing = here.offset == 0.0 and background[0][here.channel] == 0.0
+    if nothing:
+        x1 = wp.min(here.x + REACH, here.width - 1) // TILE
+        y1 = wp.min(here.y + ROWS - 1 + REACH, here.height - 1) // TILE
+        for y in range(wp.max(here.y - REACH, 0) // TILE, y1 + 1):
+            for x in range(wp.max(here.x - REACH, 0) // TILE, x1 + 1):
+                tile = y * tiles_x + x
+                nothing = nothing and starts[tile + 1] == starts[tile] and blank[here.view, y, x] == 1
+    return nothing
+
+
+@wp.kernel
+def picture_loss(
+    cameras: wp.array[Camera],
+    channels: wp.array[wp.int32],
+    view: wp.array[wp.int32],
+    record: wp.array[wp.int32],
+    window: wp.int32,
+    taps: wp.array[wp.float32],
+    exposures: wp.array2d[wp.vec2],
+    weights: wp.vec4,
+    planes: wp.array3d[wp.float32],
+    targets: wp.array4d[wp.float32],
+    means: wp.array4d[wp.float32],
+    squares: wp.array4d[wp.float32],
+    tiles_x: wp.int32,
+    starts: wp.array[wp.int32],
+    background: wp.array[wp.vec4],
+    blank: wp.array3d[wp.int32],
+    by_window: wp.array3d[wp.vec3],
+    log: wp.array2d[wp.float32],
+) -> None:
+    """Adds up the loss of a view, and keeps its derivatives by the quantities of SSIM's window.
+
+    Windows of which picture and target are 0 have no loss; their derivatives are left as they are, and not read.
+
+    The launch is [4, bands of ``ROWS`` rows, columns]; each block is within one channel.
+
+    Args:
+        channels: [views] of each target. view, record: [1] index of the view, and row of the log.
+        window: 11. taps: see ``PADDED_TAPS``. exposures: [views, 4] gain and offset.
+        weights: of the mean over a plane, by channel.
+        planes: [4 or more, rows, columns] the rendering.
+        targets, means, squares: [views, 4, rows, columns] see ``target_moments``.
+        tiles_x, starts, background: of the picture's tile lists, and behind everything. blank: see ``find_blank``.
+        by_window: out [4, rows, columns] derivatives of SSIM by the window's mean, mean square and mean product.
+        log: [records, ``COLUMNS``], added to.
+    """
+    channel, band, x = wp.tid()
+    at = place_of(cameras, channels, view, exposures, weights, channel, band, x)
+    loss = wp.float32(0.0)
+    squared = wp.float32(0.0)
+    shift = wp.float32(0.0)
+    if at.compared == 1 and not nothing_near(at, tiles_x, starts, background, blank):
+        mean = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        square = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        product = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        for down in range(window + PAD):
+            row = at.y + down - REACH
+            if row >= 0 and row < at.height:
+                sum_mean = wp.float32(0.0)
+                sum_square = wp.float32(0.0)
+                sum_product = wp.float32(0.0)
+                for across in range(window):
+                    column = x + across - REACH
+                    if column >= 0 and column < at.width:
+                        value = at.gain * planes[channel, row, column] + at.offset
+                        weighted = taps[across + PAD] * value
+                        sum_mean += weighted
+                        sum_square += weighted * value
+                        sum_product += weighted * targets[at.view, channel, row, column]
+                rows = wp.vec4(taps[down + 3], taps[down + 2], taps[down + 1], taps[down])
+                mean += rows * sum_mean
+                square += rows * sum_square
+                product += rows * sum_product
+        for k in range(ROWS):
+            y = at.y + k
+            if y < at.height:
+                m1 = mean[k]
+                m2 = means[at.view, channel, y, x]
+                a1 = 2.0 * m1 * m2 + C1
+                a2 = 2.0 * (product[k] - m1 * m2) + C2
+                b1 = m1 * m1 + m2 * m2 + C1
+                b2 = square[k] - m1 * m1 + squares[at.view, channel, y, x] - m2 * m2 + C2
+                inverse = 1.0 / (b1 * b2)
+                ssim = a1 * a2 * inverse
+                by_product = 2.0 * a1 * inverse
+                by_square = -ssim * b1 * inverse
+                by_mean = 2.0 * (m2 * a2 * inverse - ssim * m1 * b2 * inverse - m1 * by_square) - m2 * by_product
+                by_window[channel, y, x] = wp.vec3(by_mean, by_square, by_product)
+                value = at.gain * planes[channel, y, x] + at.offset
+                difference = value - targets[at.view, channel, y, x]
+                loss += L1_PART * wp.abs(difference) + SSIM_PART * (1.0 - ssim)
+                squared += difference * difference
+                shift -= difference
+    sums = sum_over_block(wp.vec3(loss, squared, shift))
+    if leads() == 1 and channel < channels[at.view]:
+        row = record[0]
+        if channel < 3:
+            wp.atomic_add(log, row, IMAGE_LOSS, at.share * sums[0])
+            wp.atomic_add(log, row, SQUARES, sums[1])
+            wp.atomic_add(log, row, SHIFT + channel, sums[2] / (wp.float32(at.width) * wp.float32(at.height)))
+        else:
+            wp.atomic_add(log, row, MASK_LOSS, at.share * sums[0])
+
+
+@wp.kernel
+def picture_gradient(
+    cameras: wp.array[Camera],
+    channels: wp.array[wp.int32],
+    view: wp.array[wp.int32],
+    window: wp.int32,
+    taps: wp.array[wp.float32],
+    exposures: wp.array2d[wp.vec2],
+    weights: wp.vec4,
+    planes: wp.array3d[wp.float32],
+    targets: wp.array4d[wp.float32],
+    tiles_x: wp.int32,
+    starts: wp.array[wp.int32],
+    by_window: wp.array3d[wp.vec3],
+    g_planes: wp.array3d[wp.float32],
+) -> None:
+    """Fills the gradient of the loss of a view by its planes; the launch is that of ``picture_loss``.
+
+    Tiles whose lists are empty are left as they are: nothing there has a gradient.
+
+    Args:
+        weights: of the mean over a plane, by channel. by_window: from ``picture_loss``.
+        g_planes: out [4, rows, columns]; 0 in a channel that the target lacks. The others: see ``picture_loss``.
+    """
+    channel, band, x = wp.tid()
+    at = place_of(cameras, channels, view, exposures, weights, channel, band, x)
+    some = wp.int32(0)
+    if at.shown == 1:
+        tile = (at.y // TILE) * tiles_x + x // TILE
+        some = starts[tile + 1] - starts[tile]
+    if some > 0:
+        by_mean = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        by_square = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        by_product = wp.vec4(0.0, 0.0, 0.0, 0.0)
+        if at.compared == 1:
+            for down in range(window + PAD):
+                row = at.y + down - REACH
+                if row >= 0 and row < at.height:
+                    sums = wp.vec3(0.0, 0.0, 0.0)
+                    for across in range(window):
+                        column = x + across - REACH
+                        if column >= 0 and column < at.width:
+                            sums += taps[across + PAD] * by_window[channel, row, column]
+                    rows = wp.vec4(taps[down + 3], taps[down + 2], taps[down + 1], taps[down])
+                    by_mean += rows * sums[0]
+                    by_square += rows * sums[1]
+                    by_product += rows * sums[2]
+        for k in range(ROWS):
+            y = at.y + k
+            if y < at.height:
+                g = wp.float32(0.0)
+                if at.compared == 1:
+                    value = at.gain * planes[channel, y, x] + at.offset
+                    target = targets[at.view, channel, y, x]
+                    sign = wp.where(value > target, 1.0, wp.where(value < target, -1.0, 0.0))
+                    spread = by_mean[k] + 2.0 * value * by_square[k] + target * by_product[k]
+                    g = at.gain * at.share * (L1_PART * sign - SSIM_PART * spread)
+                g_planes[channel, y, x] = g
+
+
+class PictureLoss:
+    """The pictures of a frame on a device, and the loss of a rendering against one of them.
+
+    Args:
+        device: of Warp, as "cpu" or "cuda:0". image_weight, mask_weight: of the two terms.
+
+    Attributes:
+        columns, rows: pixels of the largest picture so far.
+        cameras: [views] of type ``Camera``. exposures: [views, 4] of vec2, gain and offset of each channel.
+    """
+
+    def __init__(self, device: str, image_weight: float, mask_weight: float) -> None:
+        self._device = device
+        self._weights = [image_weight / 3] * 3 + [mask_weight]
+        self._taken: list[Array | None] = []
+        self._sent: wp.Event | None = None
+        self._window = 2 * REACH + 1, wp.array(PADDED_TAPS, dtype=wp.float32, device=device)
+        self.columns = self.rows = 0
+
+    def load(self, views: Sequence[TrainingView]) -> bool:
+        """Takes the pictures, cameras and exposures of a frame; pictures that it has are not sent again.
+
+        Returns:
+            Whether buffers were replaced: a graph that was captured before has to be captured anew.
+        """
+        columns = max(self.columns, *(view.camera.width for view in views))
+        rows = max(self.rows, *(view.camera.height for view in views))
+        replaced = columns > self.columns or rows > self.rows or len(views) > len(self._taken)
+        if replaced:
+            self._allocate(max(len(views), len(self._taken)), columns, rows)
+        elif self._sent is not None:  # what is on its way must not be overwritten
+            wp.synchronize_event(self._sent)
+        fresh = []
+        for index, view in enumerate(views):
+            channels, height, width = view.target.shape
+            self._host_channels[index] = channels
+            self._host_exposures[index, :channels] = view.exposure
+            if self._taken[index] is not view.target:
+                self._taken[index] = view.target
+                self._host_targets[index, :channels, :height, :width] = view.target
+                fresh.append(index)
+        cameras = [camera_of(view.camera) for view in views]
+        wp.copy(self.cameras, wp.array(cameras, dtype=Camera, device="cpu"), count=len(views))
+        for there, here in ((self.channels, self._channels), (self.exposures, self._exposures)):
+            wp.copy(there, here)
+        size = self.targets.size // len(self._taken)
+        for index in fresh:
+            wp.copy(self.targets, self._targets, size * index, size * index, size)
+        if fresh:
+            moments = [self.targets, self.target_means, self.target_squares]
+            wp.launch(target_moments, self.targets.shape, [self.cameras, *self._window, *moments], device=self._device)
+            wp.launch(find_blank, self._blank.shape, [self.cameras, self.targets, self._blank], device=self._device)
+        if wp.get_device(self._device).is_cuda:
+            self._sent = wp.get_stream(self._device).record_event(self._sent)
+        return replaced
+
+    def measure(
+        self, view: wp.array, record: wp.array, drawn: Rasterizer, background: wp.array, log: wp.array
+    ) -> None:  # fmt: skip
+        """Adds the loss of a view's rendering to a row of the log; see ``picture_loss``.
+
+        Args:
+            drawn: rasterizer that drew it. background: [1] of vec4, behind everything.
+        """
+        given = [self.cameras, self.channels, view, record, *self._window, self.exposures, wp.vec4(*self._weights)]
+        targets = [drawn.planes, self.targets, self.target_means, self.target_squares]
+        kept = [drawn.tiles_x, drawn.starts, background, self._blank, self._by_window, log]
+        wp.launch(picture_loss, self._threads, given + targets + kept, device=self._device)
+
+    def carry_back(self, view: wp.array, drawn: Rasterizer, weight: float) -> None:
+        """Fills ``drawn.g_planes`` with the gradient of what was measured last, times a weight."""
+        weights = wp.vec4(*(weight * each for each in self._weights))
+        given = [self.cameras, self.channels, view, *self._window, self.exposures, weights]
+        kept = [drawn.planes, self.targets, drawn.tiles_x, drawn.starts, self._by_window, drawn.g_planes]
+        wp.launch(picture_gradient, self._threads, given + kept, device=self._device)
+
+    def _allocate(self, views: int, columns: int, rows: int) -> None:
+        """Makes the buffers of so many views, whose pictures are to be sent."""
+        device, shape = self._device, (views, CHANNELS, rows, columns)
+        pinned = wp.get_device(device).is_cuda
+        self.columns, self.rows, self._taken = columns, rows, [None] * views
+        # Whole blocks within each channel.
+        bands = -(-rows // ROWS)
+        self._threads = (CHANNELS, -(-bands // 8) * 8, -(-columns // 32) * 32)
+        self.cameras = wp.zeros(views, dtype=Camera, device=device)
+        self.channels = wp.zeros(views, dtype=wp.int32, device=device)
+        self.exposures = wp.zeros((views, CHANNELS), dtype=wp.vec2, device=device)
+        self.targets = wp.zeros(shape, dtype=wp.float32, device=device)
+        self.target_means, self.target_squares = (wp.zeros_like(self.targets) for _ in range(2))
+        self._blank = wp.zeros((views, -(-rows // TILE), -(-columns // TILE)), dtype=wp.int32, device=device)
+        self._by_window = wp.zeros(shape[1:], dtype=wp.vec3, device=device)
+        self._channels = wp.zeros(views, dtype=wp.int32, device="cpu", pinned=pinned)
+        self._exposures = wp.zeros((views, CHANNELS), dtype=wp.vec2, device="cpu", pinned=pinned)
+        self._targets = wp.zeros(shape, dtype=wp.float32, device="cpu", pinned=pinned)
+        # Views of the same memory.
+        self._host_channels, self._host_exposures = self._channels.numpy(), self._exposures.numpy()
+        self._host_targets = self._targets.numpy()
+        self._host_exposures[:] = [1, 0]

@@ -1,0 +1,151 @@
+"""The rasterizer: the buffers of one picture, and the launches that draw it and carry its gradient to the splats.
+
+Nothing here waits for the device or allocates, so all can be captured in a CUDA graph, but ``resize`` and ``grow``.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from scas4d_core.engines.limits import DEFAULT, Limits
+from scas4d_core.engines.renderer import CHANNELS
+from scas4d_core.engines.warp import blend, projection, tiles
+from scas4d_core.engines.warp.lanes import lanes_of
+from scas4d_core.engines.warp.layout import PIXELS, SEGMENT, TILE, raster_of
+
+LEAST_CAPACITY = 1 << 16
+"""Entries of all tile lists for which there is room at first, at least."""
+TILES_EACH = 8
+"""The same for each Gaussian: on average they meet two to four tiles."""
+WARPS_EACH = 24
+"""Warps of a GPU's multiprocessor that draw segments: as many as have registers."""
+
+
+class Rasterizer:
+    """Draws pictures of a number of Gaussians.
+
+    Args:
+        device: of Warp, as "cpu" or "cuda:0". count: Gaussians. limits: constants of the rasterizer.
+
+    Attributes:
+        count: see above.
+        planes: [5, rows, columns] of the last picture: four features, background included, and transmittance left.
+        g_planes: [4, rows, columns] gradient that ``carry_back`` reads.
+        splats, records: [2 N] and [4 N] of vec4, see ``projection``.
+        starts, items: [tiles + 1] and [capacity] the tile lists of the last picture. tiles_x: tiles of a row.
+        overflow: [1] set to 1 on the device when the lists of a picture had more entries than there is room for; that
+            picture is drawn empty.
+        acted: [3] number of times that the guards ``projection.ACTED`` acted.
+        capacity: entries for which there is room.
+    """
+
+    def __init__(self, device: str, count: int, limits: Limits = DEFAULT) -> None:
+        self._device, self.count, self._limits = device, count, limits
+        self._lanes = lanes_of(device)
+        self._warps = max(1, WARPS_EACH * wp.get_device(device).sm_count)
+        self._columns = self._rows = 0
+        self.capacity = max(LEAST_CAPACITY, TILES_EACH * count)
+        self.splats = wp.zeros(2 * count, dtype=wp.vec4, device=device)
+        self.records = wp.zeros(projection.RECORD * count, dtype=wp.vec4, device=device)
+        self._boxes = wp.zeros(count, dtype=wp.vec4i, device=device)
+        self.acted = wp.zeros(len(projection.ACTED), dtype=wp.int32, device=device)
+        self.overflow = wp.zeros(1, dtype=wp.int32, device=device)
+
+    def resize(self, columns: int, rows: int) -> None:
+        """Makes room for pictures of a size, and for ``capacity`` entries."""
+        device = self._device
+        self._columns, self._rows = columns, rows
+        self._raster = raster_of(self._limits, self.count, columns, rows, self.capacity)
+        self.tiles_x = -(-columns // TILE)
+        self._tiles = self.tiles_x * -(-rows // TILE)
+        segments = self.capacity // SEGMENT + self._tiles
+        self.planes = wp.zeros((CHANNELS + 1, rows, columns), dtype=wp.float32, device=device)
+        self.g_planes = wp.zeros((CHANNELS, rows, columns), dtype=wp.float32, device=device)
+        self._begun = wp.zeros((rows, columns), dtype=wp.int32, device=device)
+        self._tile_counts = wp.zeros(self._tiles, dtype=wp.int32, device=device)
+        self.starts = wp.zeros(self._tiles + 1, dtype=wp.int32, device=device)
+        self._segment_starts = wp.zeros(self._tiles + 1, dtype=wp.int32, device=device)
+        self._segment_tiles = wp.zeros(segments, dtype=wp.int32, device=device)
+        self._segment_light = wp.zeros(segments * PIXELS, dtype=wp.float32, device=device)
+        self._segment_features = wp.zeros(segments * PIXELS, dtype=wp.vec4, device=device)
+        self._keys = wp.zeros(self.capacity, dtype=wp.uint64, device=device)
+        self.items = wp.zeros(self.capacity, dtype=wp.int32, device=device)
+
+    def holds(self, columns: int, rows: int) -> bool:
+        """Whether pictures of a size have room."""
+        return columns <= self._columns and rows <= self._rows
+
+    def grow(self) -> bool:
+        """Makes room for twice as many entries where there was too little; waits for the device.
+
+        Returns:
+            Whether buffers were replaced: a graph that was captured before has to be captured anew.
+        """
+        if self.overflow.numpy()[0] == 0:
+            return False
+        self.overflow.zero_()
+        self.capacity *= 2
+        self.resize(self._columns, self._rows)
+        return True
+
+    def project(
+        self, cameras: wp.array, view: wp.array, means: wp.array, factors: wp.array, opacities: wp.array,
+        features: wp.array, record: wp.array, log: wp.array,
+    ) -> None:  # fmt: skip
+        """Projects the Gaussians and makes the tile lists.
+
+        Args:
+            cameras: of type ``Camera``. view: [1] index of the camera.
+            means, factors, opacities, features: [N] of vec3, mat33, float32 and vec4.
+            record, log: [1] and [records, 8]: this row of the log is set to 0, its last but one number to the entries
+                of the lists.
+        """
+        device, view_of = self._device, [cameras, view]
+        count = -(-self.count // self._lanes) * self._lanes
+        given = [means, factors, opacities, features]
+        out = [self.splats, self._boxes, self.records, self.acted, self._tile_counts, self.starts, self._keys]
+        wp.launch(projection.project, count, [self._raster, *view_of, *given, *out], device=device)
+        threads = tiles.SCAN_BLOCK if self._lanes > 1 else 1
+        lists = [self.starts, self._segment_starts, self.overflow, record, log]
+        wp.launch(
+            tiles.place_lists, threads, [threads, self._raster, self._tile_counts, *lists], device=device,
+            block_dim=tiles.SCAN_BLOCK,
+        )  # fmt: skip
+        splats = [self.splats, self._boxes, self.starts, self._tile_counts, self._keys]
+        wp.launch(tiles.fill_lists, count, [self._raster, *view_of, *splats], device=device)
+        threads = tiles.SORT_BLOCK if self._lanes > 1 else 1
+        lists = [self.starts, self._segment_starts, self._tile_counts, self._keys, self.items, self._segment_tiles]
+        wp.launch(tiles.sort_lists, self._tiles * threads, [threads, *lists], device=device, block_dim=tiles.SORT_BLOCK)
+
+    def draw(self, cameras: wp.array, view: wp.array, features: wp.array, background: wp.array) -> None:
+        """Draws what was projected.
+
+        Args:
+            cameras, view: as projected. features: [N] of vec4. background: [1] of vec4, behind everything.
+        """
+        given = [self._raster, cameras, view, self.splats, features, self.items, self.starts, self._segment_starts]
+        state = [self._segment_light, self._segment_features]
+        inputs = [*given, self._segment_tiles, self._warps, *state]
+        wp.launch(blend.blend_segments, self._warps * self._lanes, inputs, device=self._device, block_dim=PIXELS)
+        inputs = [*given, background, *state, self._begun, self.planes]
+        wp.launch(blend.join_segments, self._tiles * PIXELS, inputs, device=self._device, block_dim=PIXELS)
+
+    def carry_back(self, cameras: wp.array, view: wp.array, features: wp.array) -> None:
+        """Carries ``g_planes`` to ``records``; the inputs are those that were drawn."""
+        given = [self._raster, cameras, view, self.splats, features, self.items, self.starts, self._segment_starts]
+        state = [self._segment_light, self._segment_features, self._begun, self.planes, self.g_planes, self.records]
+        inputs = [*given, self._segment_tiles, self._warps, *state]
+        wp.launch(blend.blend_backward, self._warps * self._lanes, inputs, device=self._device, block_dim=PIXELS)
+
+    def carry_to_world(
+        self, cameras: wp.array, view: wp.array, means: wp.array, factors: wp.array, g_means: wp.array,
+        g_factors: wp.array, g_features: wp.array,
+    ) -> None:  # fmt: skip
+        """Adds the gradients of the Gaussians, from ``records``, to [N] of vec3, mat33 and vec4."""
+        given = [self._raster, cameras, view, means, factors, self.splats, self.records, self.acted]
+        inputs = [*given, g_means, g_factors, g_features]
+        wp.launch(projection.project_backward, self.count, inputs, device=self._device)
+
+    def mark(self, cameras: wp.array, side: int, marks: wp.array) -> None:
+        """Marks the blocks, of so many pixels a side, that what was projected meets; see ``tiles.mark_blocks``."""
+        wp.launch(tiles.mark_blocks, self.count, [side, cameras, self.splats, self._boxes, marks], device=self._device)

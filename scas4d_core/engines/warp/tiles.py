@@ -1,0 +1,241 @@
+"""Tile lists: which Gaussians each tile draws, nearest first, ties by row.
+
+Projection has counted the entries of each list; here their places are found (``place_lists``), they are written
+(``fill_lists``) and each list is sorted by itself (``sort_lists``). Lists are divided into segments of ``SEGMENT``
+entries, which blending draws side by side.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from scas4d_core.engines.warp.lanes import load
+from scas4d_core.engines.warp.layout import COLUMNS, PAIRS, SEGMENT, TILE, Camera, Raster
+from scas4d_core.engines.warp.supports import enter_lists, least_form
+
+wp.set_module_options({"enable_backward": False})
+
+SCAN_BLOCK = 1024
+"""Threads of the one block that places the lists."""
+SORT_BLOCK = 512
+"""Threads of a block that sorts a list."""
+
+
+@wp.func_native("""
+const int tiles = counts.shape[0];
+#if defined(__CUDA_ARCH__)
+__shared__ long long entries[1024];
+__shared__ int parts[1024];
+const int share = (tiles + blockDim.x - 1) / blockDim.x;
+const int first = min((int)thread * share, tiles), last = min(first + share, tiles);
+#else
+const int first = 0, last = tiles;
+#endif
+long long entry = 0;
+int part = 0;
+for (int tile = first; tile < last; ++tile) {
+    entry += counts.data[tile];
+    part += (counts.data[tile] + length - 1) / length;
+}
+#if defined(__CUDA_ARCH__)
+const long long own_entries = entry;
+const int own_parts = part;
+entries[thread] = entry;
+parts[thread] = part;
+__syncthreads();
+for (int step = 1; step < blockDim.x; step <<= 1) {
+    const long long entries_before = thread >= step ? entries[thread - step] : 0;
+    const int parts_before = thread >= step ? parts[thread - step] : 0;
+    __syncthreads();
+    entries[thread] += entries_before;
+    parts[thread] += parts_before;
+    __syncthreads();
+}
+const bool fits = entries[blockDim.x - 1] <= capacity;
+entry = entries[thread] - own_entries;
+part = parts[thread] - own_parts;
+const bool ends = thread == blockDim.x - 1;
+#else
+const bool fits = entry <= capacity, ends = true;
+entry = part = 0;
+#endif
+for (int tile = first; tile < last; ++tile) {
+    const int count = counts.data[tile];
+    starts.data[tile] = fits ? (int)entry : 0;
+    segment_starts.data[tile] = fits ? part : 0;
+    entry += count;
+    part += (count + length - 1) / length;
+    counts.data[tile] = 0;
+}
+if (ends) {
+    starts.data[tiles] = fits ? (int)entry : 0;
+    segment_starts.data[tiles] = fits ? part : 0;
+    if (!fits) overflow.data[0] = 1;
+}
+""")
+def scan_lists(
+    thread: wp.int32, capacity: wp.int32, length: wp.int32, counts: wp.array[wp.int32], starts: wp.array[wp.int32],
+    segment_starts: wp.array[wp.int32], overflow: wp.array[wp.int32],
+) -> None:  # fmt: skip
+    """See ``place_lists``; called by all threads of one block."""
+    ...
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def place_lists(
+    threads: wp.int32,
+    raster: Raster,
+    tile_counts: wp.array[wp.int32],
+    starts: wp.array[wp.int32],
+    segment_starts: wp.array[wp.int32],
+    overflow: wp.array[wp.int32],
+    record: wp.array[wp.int32],
+    log: wp.array2d[wp.float32],
+) -> None:
+    """Finds the first entry and the first segment of each list; one block.
+
+    Args:
+        threads: of the block, 1 on the CPU device. tile_counts: [tiles] entries of each list; left 0.
+        starts, segment_starts: out [tiles + 1]; all 0 if the lists have more entries than there is room for.
+        overflow: [1], set to 1 in that case.
+        record: [1] row of the log that is begun. log: [records, ``COLUMNS``].
+    """
+    scan_lists(wp.tid(), raster.capacity, SEGMENT, tile_counts, starts, segment_starts, overflow)
+    if wp.tid() == threads - 1:
+        for column in range(COLUMNS):
+            log[record[0], column] = 0.0
+        log[record[0], PAIRS] = wp.float32(starts[raster.tiles_x * raster.tiles_y])
+
+
+@wp.kernel
+def fill_lists(
+    raster: Raster,
+    cameras: wp.array[Camera],
+    view: wp.array[wp.int32],
+    splats: wp.array[wp.vec4],
+    boxes: wp.array[wp.vec4i],
+    starts: wp.array[wp.int32],
+    tile_counts: wp.array[wp.int32],
+    keys: wp.array[wp.uint64],
+) -> None:
+    """Writes the lists, each in any order; a thread for each Gaussian, whole warps.
+
+    Args:
+        splats, boxes: from projection. starts: from ``place_lists``.
+        tile_counts: [tiles] 0; left with the entries of each list.
+        keys: out [capacity] depth and row of each entry: they sort nearest first, ties by row.
+    """
+    i = wp.tid()
+    drawn = wp.int32(0)
+    if i < raster.count and starts[raster.tiles_x * raster.tiles_y] > 0:
+        drawn = wp.where(load(splats, 2 * i + 1)[2] > 0.0, 1, 0)
+    enter_lists(raster, cameras[view[0]], i, drawn, splats, boxes, starts, tile_counts, keys, 1)
+
+
+# Bitonic, with every comparison in the same direction: what would lie beyond the end never moves.
+@wp.func_native("""
+unsigned long long* list = reinterpret_cast<unsigned long long*>(keys.data) + first;
+#if defined(__CUDA_ARCH__)
+__shared__ unsigned long long shared[4096];
+const int threads = blockDim.x;
+unsigned long long* a = list;
+if (count <= 4096) {
+    a = shared;
+    for (int i = thread; i < count; i += threads) shared[i] = list[i];
+    __syncthreads();
+}
+int whole = 1;
+while (whole < count) whole <<= 1;
+for (int run = 2; run <= whole; run <<= 1)
+    for (int step = run >> 1; step > 0; step >>= 1) {
+        const int mirror = step == (run >> 1) ? run - 1 : step;
+        for (int i = thread; i < (whole >> 1); i += threads) {
+            const int x = ((i & ~(step - 1)) << 1) | (i & (step - 1)), y = x ^ mirror;
+            if (y < count) {
+                const unsigned long long p = a[x], q = a[y];
+                if (p > q) {
+                    a[x] = q;
+                    a[y] = p;
+                }
+            }
+        }
+        __syncthreads();
+    }
+for (int i = thread; i < count; i += threads) items.data[first + i] = (int)(a[i] & 0xffffffffull);
+#else
+for (int gap = count / 2; gap > 0; gap = gap == 2 ? 1 : gap * 5 / 11)
+    for (int i = gap; i < count; ++i) {
+        const unsigned long long key = list[i];
+        int place = i;
+        for (; place >= gap && list[place - gap] > key; place -= gap) list[place] = list[place - gap];
+        list[place] = key;
+    }
+for (int i = 0; i < count; ++i) items.data[first + i] = (int)(list[i] & 0xffffffffull);
+#endif
+""")
+def sort_list(
+    thread: wp.int32, first: wp.int32, count: wp.int32, keys: wp.array[wp.uint64], items: wp.array[wp.int32]
+) -> None:
+    """Sorts a list; called by all threads of a block, on the CPU device by one."""
+    ...
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def sort_lists(
+    threads: wp.int32,
+    starts: wp.array[wp.int32],
+    segment_starts: wp.array[wp.int32],
+    tile_counts: wp.array[wp.int32],
+    keys: wp.array[wp.uint64],
+    items: wp.array[wp.int32],
+    segment_tiles: wp.array[wp.int32],
+) -> None:
+    """Sorts each list, a block for each tile.
+
+    Args:
+        threads: of a block, 1 on the CPU device. starts, segment_starts: from ``place_lists``.
+        tile_counts: [tiles], left 0. keys: from ``fill_lists``; left in any order.
+        items: out [capacity] rows of the Gaussians of each list.
+        segment_tiles: out [segments] the tile that each segment belongs to.
+    """
+    tile = wp.tid() // threads
+    thread = wp.tid() - tile * threads
+    first = starts[tile]
+    count = starts[tile + 1] - first
+    if thread == 0:
+        tile_counts[tile] = 0
+    for segment in range(segment_starts[tile] + thread, segment_starts[tile + 1], threads):
+        segment_tiles[segment] = tile
+    if count > 0:
+        sort_list(thread, first, count, keys, items)
+
+
+@wp.kernel
+def mark_blocks(
+    side: wp.int32,
+    cameras: wp.array[Camera],
+    splats: wp.array[wp.vec4],
+    boxes: wp.array[wp.vec4i],
+    marks: wp.array2d[wp.int32],
+) -> None:
+    """Marks the blocks of pixels that the supports of Gaussians meet; a thread for each Gaussian.
+
+    Args:
+        side: pixels of a block's side, of which a tile's is a multiple. cameras: [1]. splats, boxes: from projection.
+        marks: [rows, columns] of blocks, set to 1 or left.
+    """
+    i = wp.tid()
+    first = load(splats, 2 * i)
+    second = load(splats, 2 * i + 1)
+    if second[2] > 0.0:
+        camera = cameras[0]
+        box = boxes[i]
+        blocks = TILE // side
+        for y in range(box[1] * blocks, wp.min(box[3] * blocks, (camera.height + side - 1) // side)):
+            top = wp.float32(y * side) + 0.5 - first[1]
+            bottom = top + wp.float32(wp.min(side, camera.height - y * side) - 1)
+            for x in range(box[0] * blocks, wp.min(box[2] * blocks, (camera.width + side - 1) // side)):
+                left = wp.float32(x * side) + 0.5 - first[0]
+                right = left + wp.float32(wp.min(side, camera.width - x * side) - 1)
+                if least_form(first[2], first[3], second[0], left, right, top, bottom) <= second[2]:
+                    marks[y, x] = 1
