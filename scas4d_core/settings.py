@@ -38,19 +38,23 @@ class SceneSettings(SettingsModel):
 
     metres_per_unit: Positive | Literal["auto"] = Field(
         1.0,
-        description="Metres in one unit of the calibration; 'auto' takes the rig's radius for 3 m. A single "
-        "camera determines no size: give a number such that what it sees is about 3 m away.",
+        description="Metres per unit of the calibration. 'auto' scales the rig's radius to 3 m. A single camera does "
+        "not determine a size: give a number that puts the subject about 3 m away.",
     )
     image_scale: float = Field(1.0, gt=0, le=1, description="Pictures are resized by this before anything else.")
     background: tuple[Unit, Unit, Unit] | Literal["auto"] = Field(
-        "auto", description="RGB in 0…1 behind all. 'auto': of a plain backdrop, else the mean of frame 0's pictures."
+        "auto",
+        description="RGB in 0…1 behind the scene. 'auto': the colour of a plain backdrop, else the mean of frame 0's "
+        "pictures.",
     )
     near: Positive | Literal["auto"] = Field(
         default="auto",
-        description="Metres; nothing nearer to a camera is drawn, a stray Gaussian hides all. 'auto': radius / 10.",
+        description="Near plane in metres: nothing closer to a camera is drawn. 'auto': a tenth of the rig's radius.",
     )
     floor: tuple[float, float, float, float] | None = Field(
-        None, description="Plane (a, b, c, d), user's world: a·x + b·y + c·z + d > 0 lies below. None: no floor term."
+        None,
+        description="Plane (a, b, c, d) in the user's world: a·x + b·y + c·z + d > 0 lies below the floor. None: no "
+        "floor term.",
     )
 
     @property
@@ -76,29 +80,33 @@ class StaticSettings(SettingsModel):
     iterations: int = Field(3000, ge=1, le=1_000_000, description="Iterations of frame 0, one training view each.")
     seconds: Annotated[float, Field(gt=0, le=1_000_000)] | None = Field(
         110.0,
-        description="Seconds that frame 0 may take, points and fit; where they are too few, points are looked for less "
-        "finely, the fit has fewer iterations (500 at least), and the result depends on the machine. None: no limit.",
+        description="Seconds that frame 0 may take, for points and fit. With too few, points are searched coarsely "
+        "and the fit has fewer iterations (at least 500), so the result depends on the machine. None: no "
+        "limit.",
     )
     stop_gain: Share = Field(
         0.0,
-        description="Stop rule: frame 0 ends before its iterations are through, once none are added any more and five "
-        "rounds over all views lower the mean training loss by less than this share. 0: never; 0.01 saves a simple "
-        "scene a part of its wait.",
+        description="Frame 0 stops early when no Gaussians are added any more and five rounds over all views lower the "
+        "mean training loss by less than this share. 0: never; 0.01 saves a simple scene part of its wait.",
     )
     max_gaussians: Annotated[int, Field(ge=1, le=10_000_000)] | None = Field(
         None,
-        description="Budget of Gaussians; densification stops there. None: 0.34 for each pixel of a training picture "
-        "and 0.27 more for each that is not background, at most 100,000: 25,000 for an object at 256x256.",
+        description="Budget of Gaussians; densification stops there. None: 0.34 per pixel of a training picture and "
+        "0.27 more per foreground pixel, at most 100,000 (25,000 for an object at 256x256).",
     )
-    detail: float = Field(1.0, gt=0, le=1, description="Share of that number of Gaussians where the budget is None.")
+    detail: float = Field(
+        1.0, gt=0, le=1, description="Factor on that number of Gaussians where max_gaussians is None."
+    )
     exposure: bool | Literal["auto"] = Field(
         default="auto",
-        description="Learn a colour gain and offset per training camera (held-out cameras are scored raw). 'auto': "
-        "give it up after 30 % of the iterations where the cameras turn out alike: then it only fits noise.",
+        description="Learn a colour gain and offset per training camera; held-out cameras are scored without. 'auto': "
+        "stop learning them after 30 % of the iterations where the cameras agree, because then they only "
+        "fit noise.",
     )
     refine_calibration: bool = Field(
         default=False,
-        description="Refine the cameras' poses on features of frame 0, where those held out are met better.",
+        description="Refine the cameras' poses on features of frame 0. The result is used only where it lowers the "
+        "error of held-out features.",
     )
     seed: int = Field(0, ge=0, description="Seed of the order of views and of the split of Gaussians.")
 
@@ -115,17 +123,17 @@ class Weights(SettingsModel):
 
     mask: NotNegative = Field(
         1.0,
-        description="The same form on the rendered label, where masks are given and at least a tenth of the Gaussians "
-        "is static: it separates moving from static Gaussians.",
+        description="Weight of the same loss on the rendered label, where masks are given and at least a tenth of the "
+        "Gaussians is static. It separates moving from static Gaussians.",
     )
     mask_alone: NotNegative = Field(
         0.3,
-        description="The same where all but a few move: the picture has the silhouette already, and the masks' hard "
+        description="The same where nearly all Gaussians move: the pictures show the silhouette already, and hard mask "
         "edges pull it off.",
     )
     rigidity: NotNegative = Field(4.0, description="Dynamic3DGaussians; with image 1, the paper's 0.19 to 0.05.")
     isometry: NotNegative = Field(
-        6.0, description="Three times the authors': it ties distances and lets bend, and only helps."
+        6.0, description="Three times the authors' weight: it ties distances, allows bending, and only helps."
     )
     rotation: NotNegative = Field(4.0, description="Likewise.")
     scale: NotNegative = Field(10.0, description="Likewise, the paper's 0.48 to 0.05.")
@@ -138,54 +146,54 @@ class UpdateSettings(SettingsModel):
     (64, 320, 1280)
     """
 
-    iterations: int = Field(100, ge=1, le=100_000, description="Iterations a frame, each a step down the gradient.")
+    iterations: int = Field(100, ge=1, le=100_000, description="Iterations per frame.")
     views: int = Field(
         1,
         ge=1,
         le=8,
-        description="Training views that an iteration renders forward and backward; losses and gradients are their "
-        "mean. The paper does not say how many; its code base, Dynamic3DGaussians, takes one.",
+        description="Training views per iteration; losses and gradients are their mean. The paper does not give a "
+        "number; its code base, Dynamic3DGaussians, uses one.",
     )
     budget_ms: Annotated[float, Field(gt=0, le=3_600_000)] | None = Field(
         None,
-        description="Milliseconds that a frame may take, decoding and commit included; then there are as many "
-        "iterations as fit, whatever `iterations` says. None: no limit.",
+        description="Milliseconds that a frame may take, with decoding and commit. The number of iterations follows "
+        "from it, whatever `iterations` says. None: no limit.",
     )
     stop_gain: Share = Field(
         0.0,
-        description="An update cools down and ends once ten iterations lower its error on four training views by less "
-        "than this share, after all layers have begun. 0: never.",
+        description="An update decays its rates and ends once ten iterations lower its error on probe views by less "
+        "than this share, after all layers have started. 0: never.",
     )
     skip_tolerance: float = Field(
         0.0,
         ge=-1,
-        description="A frame needs no iteration where the state before shows it, on some training views, small and "
-        "whole, with at most 1 + this times the error that the last update ended with. -1: every frame is updated.",
+        description="Skip the update when the previous state's error on probe views is at most (1 + skip_tolerance) "
+        "times the error after the last update. -1: never skip.",
     )
     reject_outliers: bool = Field(
         True,
-        description="Leave out cameras and hold frames that do not fit what was before, commit no state that is worse "
-        "than not moving, and say so in the frame's report.",
+        description="Exclude outlying cameras, reject frames that do not fit, and never commit a state that is worse "
+        "than not moving. The frame's report gives the reasons.",
     )
     max_rejected_frames: int = Field(
         10,
         ge=1,
         le=1_000_000,
-        description="Frames in a row that are held because they cannot be met, before the scene is another; dark ones "
-        "do not count. A light that stays for so many is the scene's own.",
+        description="After this many consecutive rejected frames, accept the next one as a new scene. Dark frames do "
+        "not count. A light that lasts this long is learnt as the scene's own.",
     )
     clusters: tuple[Count, ...] = Field(
         (64, 320, 1280),
         max_length=16,
-        description="Clusters per layer, coarse to fine (the paper's); empty: each Gaussian alone.",
+        description="Clusters per layer, coarse to fine (the paper's). Empty: each Gaussian moves alone.",
     )
     cluster_map: Literal["centred", "published"] = Field(
         "centred", description="Scaling about the pivot (translation-equivariant) or about the world origin (paper)."
     )
     covariance: Literal["entangled", "separate"] = Field(
         "entangled",
-        description="A Gaussian's covariance follows the Jacobian of the map that moves it (paper), or is learnt apart "
-        "from the positions, by its own ΔR and Δs alone (the paper's ablation).",
+        description="A Gaussian's covariance follows the Jacobian of its map (paper), or is learnt separately by its "
+        "own ΔR and Δs (the paper's ablation).",
     )
     layer_rates: tuple[LayerRates, ...] = Field(
         (
@@ -198,29 +206,36 @@ class UpdateSettings(SettingsModel):
     )
     deltas_start: Share = Field(
         0.4,
-        description="Share of the iterations after which each Gaussian's own Δp, ΔR and Δs begin to learn; the layers "
-        "of clusters begin one after the other before.",
+        description="Share of the iterations after which each Gaussian's own Δp, ΔR and Δs start to learn. The cluster "
+        "layers start one after the other before.",
     )
     cold_start_iterations: Positive = Field(
-        3.0, description="Factor on the iterations where there is no motion to start from."
+        3.0, description="Factor on the iterations of an update without a previous motion."
     )
     cold_start_rates: float = Field(
-        2.0, ge=1, description="Factor on the layers' rates where there is no motion to start from: further to go."
+        2.0, ge=1, description="Factor on the layers' rates in an update without a previous motion."
     )
     rate_position: Positive = Field(1.6e-4, description="Δp, per metre of scene radius.")
     rate_rotation: Positive = Field(0.002, description="ΔR, in units of tan(angle/2).")
     rate_scale: NotNegative = Field(0.001, description="Δs, log.")
-    rate_colour: NotNegative = Field(0.0025, description="RGB of the Gaussians that move.")
+    rate_colour: NotNegative = Field(0.0025, description="Learning rate of the RGB of moving Gaussians.")
     rate_static_colour: NotNegative = Field(
         0.01,
-        description="RGB of the Gaussians that stand, where static_colour is on; with 0 they keep their colours.",
+        description="Learning rate of the RGB of static Gaussians, where static_colour is on. 0: they keep their "
+        "colours.",
     )
     final_rate: float = Field(
-        0.05, gt=0, le=1, description="Rates decay to this fraction by a layer's rest or the end (cosine); 1: constant."
+        0.05,
+        gt=0,
+        le=1,
+        description="Each learning rate decays to this share on a half-cosine and ends when its layer is frozen. 1: "
+        "constant.",
     )
     beta1: float = Field(0.8, ge=0, lt=1, description="Adam's first decay.")
     beta2: Share = Field(0.95, description="Adam's second decay; 100 iterations are too few for the usual 0.999.")
-    momentum: Unit = Field(0.0, description="Share of what the layers leave of the motion before that Δp starts from.")
+    momentum: Unit = Field(
+        0.0, description="Share of the previous residual motion, beyond the layers', from which Δp starts."
+    )
     weights: Weights = Field(default_factory=Weights)
     use_masks: bool = Field(True, description="Use the frame's masks where it has any.")
     seed: int = Field(0, ge=0, description="Seed of the order of views and of the sampled neighbours.")

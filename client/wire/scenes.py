@@ -195,7 +195,7 @@ class SceneStatus(Model):
         description="What the scene does; `paused` and `degraded` hold beside. "
         "awaiting_first_frame: nothing to do yet. initialising: frame 0 is being reconstructed. ready: "
         "idle, the last frame was committed whole. updating: a later frame is being reconstructed. paused: it takes "
-        "frames and reconstructs none. degraded: the scene goes on, but its last frame lost a camera, was held or "
+        "frames and reconstructs none. degraded: the scene goes on, but its last frame lost a camera, was rejected or "
         "failed, or its worker is being restarted; `error` says why. failed: it takes no more frames until its "
         "reconstruction is begun anew (PUT …/reconstructions/{n})."
     )
@@ -219,9 +219,9 @@ class SceneStatus(Model):
     )
     archived: bool = Field(description="It takes no frames until that is taken back; all it has can be looked at.")
     degraded: bool = Field(
-        description="Whatever `state` says: the last frame lost a camera, was held or met only by half, or was set "
-        "aside; the worker is being restarted, the disk is full, or something on it was found damaged and is being "
-        "mended. `error` says which.",
+        description="Whatever `state` says: the last frame lost a camera, was rejected, was fitted only in part or "
+        "failed; the worker is being restarted, the disk is full, or damage on it was found and is being "
+        "repaired. `error` says which.",
     )
     open_frames: list[int] = Field(description="Frames not closed yet, whose cameras send one by one.")
     failed: int = Field(description="Frames that were taken and could not be reconstructed.")
