@@ -52,7 +52,7 @@ if TYPE_CHECKING:
 
 PROGRESS_EVERY_S = 0.2
 NICE = 5
-"""Added to the worker's niceness: requests and views go ahead of updates (docs/live-views.md: what that is worth)."""
+"""Added to the worker's niceness: requests and views go ahead of updates (docs/viewer.md has what that is worth)."""
 STALL_S, LONGEST_STALL_S = 1.0, 30.0
 
 log = logging.getLogger("scas4d.worker")

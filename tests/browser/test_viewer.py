@@ -69,7 +69,7 @@ def test_the_effects_are_listed_with_what_switched_them(page, service):
         sdk.wait(id, 0)
         opened(page, service, id)
         page.locator("#effects li").wait_for()
-        assert page.locator("#effects li").all_inner_texts() == ["Standing colour: pinned off"]
+        assert page.locator("#effects li").all_inner_texts() == ["Static colour: pinned off"]
         usual, idle = page.locator("#effects-words").inner_text().split("Not called for: ")
         assert usual.startswith("In every update: ")
         assert "rigidity" in usual

@@ -108,7 +108,7 @@ def test_a_light_that_flickers_is_not_taken_on() -> None:
 def test_the_light_is_part_of_what_is_carried_on() -> None:
     past = with_light(with_light(Past(), 1.4), 1.41)
     again = Past.of_arrays(past.arrays())
-    assert (again.light, again.lit) == (1.41, 2)
+    assert (again.light, again.light_frames) == (1.41, 2)
 
 
 def test_frames_that_were_held_or_stood_are_told_as_they_are() -> None:
