@@ -196,7 +196,7 @@ def test_a_scene_from_its_first_frame_to_its_deletion(page, service, finished):
         push(sdk, id, 1)
         shown(page, frame="1")  # followed live
         push(sdk, id, 2, red=250)  # the fake raises: the frame is set aside
-        until(page, "document.getElementById('trouble').innerText.includes('Frame 2 was set aside')")
+        until(page, "document.getElementById('trouble').innerText.includes('Frame 2 failed')")
         assert page.locator("#state").inner_text() == "Degraded"
         assert page.locator("#psnr .fault").count() == 1
         sdk.delete_scene(id)
