@@ -59,7 +59,7 @@ def test_sizes_are_measured_once_and_told(tmp_path: Path, monkeypatch: pytest.Mo
     assert again["frames"] == {name: {"2": 100, "4": 101} for name in scale.KEPT}
     monkeypatch.setattr(scale, "SWEEPS", {"cameras": [TINY, Size(cameras=6)]})
     costs = [{"update": 1.0, "view": 0.01, "frame_0": 2.0, "memory": 100.0}] * 2
-    text = scale.told({"sweeps": {"cameras": costs}, "frames": {"a folder": {"2": 100}, "the process": {"2": 99}}})
+    text = scale.summarize({"sweeps": {"cameras": costs}, "frames": {"a folder": {"2": 100}, "the process": {"2": 99}}})
     assert "| 3 | 1.00 | 10 | 2.00 | 100 |" in text
     assert "| **exponent** | **0.00** |" in text
     assert "| 2 | 100 | 99 |" in text
