@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.captures.frame import Frame
-from scas4d_core.effects.switches import Switches, switches_of, switches_record
+from scas4d_core.effects.switches import Switches, decode_switches, encode_switches
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.errors import message_of
 from scas4d_core.frame_outcome import FrameOutcome
@@ -124,7 +124,7 @@ class Checkpoints:
         if carry_over.labels is not None:
             arrays["labels"] = carry_over.labels
         if carry_over.switches:
-            arrays["switches"] = np.array(json.dumps(switches_record(carry_over.switches)), np.str_)
+            arrays["switches"] = np.array(json.dumps(encode_switches(carry_over.switches)), np.str_)
         for name, given in carry_over.effects.items():
             arrays |= {f"effect.{name}.{key}": array for key, array in given.items()}
         for view in carry_over.seen:
@@ -155,7 +155,7 @@ class Checkpoints:
             motion = _unpacked(arrays) if "motion.seconds" in arrays else None
             past = Past.of_arrays({name[5:]: array for name, array in arrays.items() if name.startswith("past.")})
             shown = dict(zip(arrays["shown.names"].tolist(), arrays["shown.prints"].tolist(), strict=True))
-            switches = switches_of(json.loads(str(arrays["switches"]))) if "switches" in arrays else {}
+            switches = decode_switches(json.loads(str(arrays["switches"]))) if "switches" in arrays else {}
             labels, structure = arrays.get("labels"), int(arrays["structure"])
             return CarryOver(motion, labels, seen, structure, past, shown, switches, _by_effect(arrays))
         except FileNotFoundError:
@@ -233,7 +233,7 @@ def cold_start(history: History, index: int, masked: bool) -> CarryOver:
     effects = {name: {**first.get(name, {}), **newest.get(name, {})} for name in (*first, *newest)}
     return CarryOver(
         labels=None if masked or moving.all() else moving,
-        switches=switches_of(history.report(index).get("effects", {})),
+        switches=decode_switches(history.report(index).get("effects", {})),
         effects=effects,
     )
 

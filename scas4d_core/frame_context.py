@@ -9,7 +9,7 @@ from typing import Any
 from scas4d_core.captures.frame import Frame
 from scas4d_core.effects.evidence import FitTime
 from scas4d_core.engines.views import TrainingView
-from scas4d_core.preparation import Prepared
+from scas4d_core.preparation import PreparedUpdate
 from scas4d_core.robust.outliers import Past
 from scas4d_core.robust.update_input import UpdateInput
 from scas4d_core.update.result import Stopwatch, UpdateResult
@@ -56,19 +56,19 @@ class FrameContext:
     Attributes:
         frame: with its pictures decoded. watch: times the stages. dropped: cameras that the caller has left out, with
             the reason. notes: further facts to commit, as JSON.
-        observed: by "observe". prepared, given: the updater and its input, by "prepare".
-        result, past: of the update, by "solve". judging: seconds that checks took beside it.
-        fits: time for Gaussians that are born, by "populate".
+        frame_input: by "observe". prepared, update_input: the updater and its input, by "prepare".
+        result, past: of the update, by "solve". check_seconds: seconds that checks took beside it.
+        birth_fit_time: time for Gaussians that are born, by "populate".
     """
 
     frame: Frame
     watch: Stopwatch
     dropped: Mapping[str, str] | None
     notes: Mapping[str, Any]
-    observed: FrameInput = field(init=False)
-    prepared: Prepared = field(init=False)
-    given: UpdateInput = field(init=False)
+    frame_input: FrameInput = field(init=False)
+    prepared: PreparedUpdate = field(init=False)
+    update_input: UpdateInput = field(init=False)
     result: UpdateResult = field(init=False)
     past: Past = field(init=False)
-    judging: float = 0.0
-    fits: FitTime = field(default_factory=FitTime)
+    check_seconds: float = 0.0
+    birth_fit_time: FitTime = field(default_factory=FitTime)

@@ -62,7 +62,7 @@ class FrameReport:
         loss: each iteration's weighted sum; of frame 0 at most ``REPORTED_LOSSES`` means.
         psnr: dB, over the training views of the last iterations, each as it was rendered then; NaN where not measured.
         moving, gaussians: how many Gaussians move, and are there. born, retired, revived: how many were, in this frame.
-        put_off: what the budget left no time for, in words; the next frame has some for it.
+        postponed: what the budget left no time for, in words; the next frame has some for it.
         alarms: what a person should look at (``robust/alarms.py``).
         timing: by camera, frames after the others at which its pictures seem to be taken, by all frames so far; only
             of cameras for which the motion determines it well enough (``robust/timing.py``).
@@ -107,7 +107,7 @@ class FrameReport:
     born: int = 0
     retired: int = 0
     revived: int = 0
-    put_off: list[str] = field(default_factory=list)
+    postponed: list[str] = field(default_factory=list)
     alarms: list[Alarm] = field(default_factory=list)
     timing: dict[str, CameraTiming] = field(default_factory=dict)
     cloud: FirstCloud | None = None
@@ -184,7 +184,7 @@ def report_of_update(
     names: Sequence[str],
     watch: Stopwatch,
     dropped: Mapping[str, str] | None,
-    put_off: Sequence[str] = (),
+    postponed: Sequence[str] = (),
 ) -> FrameReport:
     """The report of an update.
 
@@ -192,7 +192,7 @@ def report_of_update(
         result: that is committed. before: the state committed before.
         left_out: cameras whose pictures were not believed at first sight, with the reason.
         names: of the rig's cameras. watch: with the stages "decode", "judge" and "update", and "presence" if it was.
-        dropped: cameras that the caller has left out, with the reason. put_off: see ``FrameReport``.
+        dropped: cameras that the caller has left out, with the reason. postponed: see ``FrameReport``.
     """
     trace, gaussians = result.trace, result.gaussians
     began = perf_counter()
@@ -225,13 +225,13 @@ def report_of_update(
         frozen=result.frozen,
         guards={**trace.guards, "axis_bounds": result.bounded},
         planned=trace.planned,
-        curve=curve(trace.losses, trace.moments),
+        curve=curve(trace.losses, trace.iteration_ends),
         errors={candidate: mean_error(errors, list(errors)) for candidate, errors in trace.errors.items()},
         kept=trace.kept,
         born=len(gaussians) - len(before),
         retired=int((gaussians.retired[: len(before)] & before.present).sum()),
         revived=int((gaussians.present[: len(before)] & before.retired).sum()),
-        put_off=list(put_off),
+        postponed=list(postponed),
         alarms=[*left_out_alarms(names, frame.images, missing), *result.alarms],
         timing=dict(result.timing),
     )

@@ -49,7 +49,7 @@ class Gaussians:
     >>> gone = state.retire([0])
     >>> gone.opacities, gone.present, gone.revive([0]).opacities
     (array([0. , 0.9], dtype=float32), array([False,  True]), array([0.9, 0.9], dtype=float32))
-    >>> state.joined(Gaussians.of_points([[0, 1, 2]], radius=0.1)).ids
+    >>> state.concatenate(Gaussians.of_points([[0, 1, 2]], radius=0.1)).ids
     array([ 0,  1, -1])
     """
 
@@ -134,7 +134,7 @@ class Gaussians:
             gloss = np.concatenate([gloss, np.zeros((len(self) - len(gloss), 3), np.float32)])[chosen]
         return replace(self, gloss=gloss, **{name: array[chosen] for name, array in self._by_row().items()})
 
-    def joined(self, born: Gaussians) -> Gaussians:
+    def concatenate(self, born: Gaussians) -> Gaussians:
         """The state with new Gaussians after its own, in new rows; they get their ids when the frame is committed."""
         others = {**born._by_row(), "ids": np.full(len(born), UNBORN, np.int64)}
         return replace(self, **{name: np.concatenate([own, others[name]]) for name, own in self._by_row().items()})

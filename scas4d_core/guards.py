@@ -248,9 +248,9 @@ class GuardCounts(Mapping[str, int]):
             raise ValueError(f"guards {sorted(unknown)} are unknown; the table in scas4d_core/guards.py names all")
         self._counts = dict.fromkeys(names, 0)
 
-    def add(self, names: Sequence[str], acted: NDArray[np.int64]) -> None:
+    def add(self, names: Sequence[str], guard_counts: NDArray[np.int64]) -> None:
         """Adds the counts of a kernel's tasks, [tasks, names] or [names], under these names."""
-        counts = acted.reshape(-1, len(names)).sum(axis=0)
+        counts = guard_counts.reshape(-1, len(names)).sum(axis=0)
         for name, count in zip(names, counts.tolist(), strict=True):
             self._counts[name] += count
 

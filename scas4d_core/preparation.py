@@ -17,22 +17,22 @@ from numpy.typing import NDArray
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.captures.frame import Frame
 from scas4d_core.checkpoint import CarryOver
-from scas4d_core.effects.appearance.camera_gain import known_gains
-from scas4d_core.effects.cameras.pose_drift import posed
+from scas4d_core.effects.appearance.camera_gain import current_exposures
+from scas4d_core.effects.cameras.pose_drift import rig_with_drift
 from scas4d_core.effects.coherence.floor import floor_inside
 from scas4d_core.effects.effect import Effect, effect
 from scas4d_core.effects.evidence import FrameObservation
-from scas4d_core.effects.presence.motion_mask import labelled, labels_learnt
+from scas4d_core.effects.presence.motion_mask import learn_labels_from_motion, with_labels
 from scas4d_core.effects.switches import (
     Switch,
     Switches,
-    began,
-    decided,
+    decide_switches,
+    first_frame_arrays,
     first_switches,
     names_on,
     record_arrays,
     register_effects,
-    switched_by,
+    switches_after_first_frame,
 )
 from scas4d_core.engines.choose import engine_of
 from scas4d_core.engines.plan import UpdatePlan
@@ -58,12 +58,12 @@ NEIGHBOURS = 20
 NEIGHBOUR_FALLOFF = 2000.0
 """1/m²: the weight of a neighbour at a distance d is exp(−falloff d²) (Dynamic3DGaussians)."""
 
-MOST_BORN = 0.5
+MAX_BORN_SHARE = 0.5
 """Of the Gaussians of frame 0, that may be born in a scene: memory is bounded."""
 
 
 @dataclass(frozen=True, eq=False)
-class Prepared:
+class PreparedUpdate:
     """All that the next update starts from, beside Θ_{t−1}. It is replaced as a whole, or not at all.
 
     Attributes:
@@ -80,7 +80,7 @@ class Prepared:
         """The plan of its updates."""
         return self.updater.plan
 
-    def carry(self, **changes: Any) -> Prepared:
+    def with_carry_over(self, **changes: Any) -> PreparedUpdate:
         """The same with changes of what is carried over."""
         return replace(self, carried=replace(self.carried, **changes))
 
@@ -95,7 +95,7 @@ class Preparation:
     def __init__(self, factory: ViewFactory, settings: Settings, world: WorldFrame, renderer: Renderer) -> None:
         self._factory, self._settings, self._renderer = factory, settings, renderer
         self._scene = settings.scene
-        self._made_of: tuple[NDArray[np.float32], NDArray[np.bool_]] | None = None
+        self._hierarchy_inputs: tuple[NDArray[np.float32], NDArray[np.bool_]] | None = None
         self._hierarchy: Hierarchy
         self._neighbours: Neighbours | None = None
         if self._scene.floor is not None:
@@ -111,10 +111,12 @@ class Preparation:
         views = self._factory.views(frame, result.exposures, use_masks=False)
         unmoved = UpdateResult(result.gaussians, None, UpdateTrace())
         seen = FrameObservation(frame.index, result.gaussians, unmoved, self._factory.rig, views, self._renderer)
-        arrays = began(switches, self._settings, seen)
-        return switched_by(arrays, switches, seen), arrays
+        arrays = first_frame_arrays(switches, self._settings, seen)
+        return switches_after_first_frame(arrays, switches, seen), arrays
 
-    def views(self, frame: Frame, fixed: dict[str, NDArray[np.float32]], prepared: Prepared) -> list[TrainingView]:
+    def views(
+        self, frame: Frame, fixed: dict[str, NDArray[np.float32]], prepared: PreparedUpdate
+    ) -> list[TrainingView]:
         """The views of a frame, with the poses and exposures of the cameras as they are known by now.
 
         Without masks where no term asks for them: they are not even read.
@@ -126,11 +128,11 @@ class Preparation:
             ValueError: see ``ViewFactory.views``.
         """
         effects = prepared.carried.effects
-        self._factory.posed = posed(self._factory.rig, effects)
-        exposures = known_gains(fixed, effects, self._factory.rig.names)
+        self._factory.posed = rig_with_drift(self._factory.rig, effects)
+        exposures = current_exposures(fixed, effects, self._factory.rig.names)
         return self._factory.views(self._factory.scaled(frame), exposures, prepared.plan.mask > 0)
 
-    def rebuild(self, roots: Gaussians, carried: CarryOver) -> Prepared:
+    def rebuild(self, roots: Gaussians, carried: CarryOver) -> PreparedUpdate:
         """Prepares the next update anew; a motion that belongs to other clusters is dropped from the carry-over.
 
         Args:
@@ -142,10 +144,10 @@ class Preparation:
             for name, switch in known.items()
         }
         carried = replace(carried, switches=switches)  # a replay may have other settings than the scene
-        updater, structure = self._updater(labelled(roots, carried.labels), switches)
+        updater, structure = self._updater(with_labels(roots, carried.labels), switches)
         if carried.structure != structure:
             carried = replace(carried, motion=None, structure=structure)
-        return Prepared(updater, carried, roots)
+        return PreparedUpdate(updater, carried, roots)
 
     def _updater(self, roots: Gaussians, switches: Switches) -> tuple[FrameUpdate, int]:
         """The updater on the engine of ``settings.device``, and the digest of its clusters and neighbours.
@@ -170,14 +172,16 @@ class Preparation:
 
     def _clusters(self, first: Gaussians) -> Hierarchy:
         """The hierarchy of what moves; that of the updater before where the same Gaussians do, with its neighbours."""
-        made = self._made_of
+        made = self._hierarchy_inputs
         if made is None or not all(map(np.array_equal, made, (first.means, first.moving))):
             update = self._settings.update
-            self._made_of, self._neighbours = (first.means, first.moving), None
-            self._hierarchy = build_hierarchy(*self._made_of, update.clusters, SMALLEST_CLUSTER, update.seed)
+            self._hierarchy_inputs, self._neighbours = (first.means, first.moving), None
+            self._hierarchy = build_hierarchy(*self._hierarchy_inputs, update.clusters, SMALLEST_CLUSTER, update.seed)
         return self._hierarchy
 
-    def learn_labels(self, prepared: Prepared, newest: Gaussians, believed: Sequence[TrainingView]) -> Prepared:
+    def learn_labels(
+        self, prepared: PreparedUpdate, newest: Gaussians, believed: Sequence[TrainingView]
+    ) -> PreparedUpdate:
         """Prepared anew with the Gaussians that the pictures show to move, for scenes without masks.
 
         A Gaussian that has moved once stays in the hierarchy. The labels become part of the state with the commit of
@@ -188,28 +192,30 @@ class Preparation:
             newest: Θ_{t−1}. believed: views of the frame.
         """
         carried = prepared.carried
-        labels = labels_learnt(newest, carried.labels, carried.seen, believed, self._renderer)
+        labels = learn_labels_from_motion(newest, carried.labels, carried.seen, believed, self._renderer)
         if labels is None:
             return prepared
         return self.rebuild(prepared.roots, replace(carried, labels=labels, motion=None))
 
-    def after_frame(self, prepared: Prepared, seen: FrameObservation, populates: bool) -> tuple[UpdateResult, Prepared]:
+    def after_frame(
+        self, prepared: PreparedUpdate, seen: FrameObservation, may_change_population: bool
+    ) -> tuple[UpdateResult, PreparedUpdate]:
         """The result of a frame that was learnt, and what the next update starts from.
 
         Args:
-            seen: the frame. populates: whether Gaussians may come and go.
+            seen: the frame. may_change_population: whether Gaussians may come and go.
         """
         on, seen = names_on(prepared.carried.switches), record_arrays(prepared.carried.switches, self._settings, seen)
-        switches = decided(prepared.carried.switches, self._settings, seen)
-        prepared = prepared.carry(effects=seen.result.carried, switches=switches)
-        result = self.add_and_retire_gaussians(on, seen) if populates else seen.result
+        switches = decide_switches(prepared.carried.switches, self._settings, seen)
+        prepared = prepared.with_carry_over(effects=seen.result.carried, switches=switches)
+        result = self.add_and_retire_gaussians(on, seen) if may_change_population else seen.result
         before, now = seen.result.gaussians, result.gaussians
         other_rows = len(now) != len(before) or not np.array_equal(now.retired, before.retired)
         if result is not seen.result:
-            prepared = _grown(prepared, before, result, other_rows)
+            prepared = _with_changed_rows(prepared, before, result, other_rows)
         if other_rows or names_on(switches) != on:
             prepared = self.rebuild(prepared.roots, prepared.carried)
-        if other_rows and prepared.carried.motion is None and self._goes_on(result):
+        if other_rows and prepared.carried.motion is None and self._is_motion(result):
             prepared = _with_motion(prepared, seen, result)
         return result, prepared
 
@@ -233,12 +239,14 @@ class Preparation:
                     seen = replace(seen, result=result, room=max(0, seen.room - born))
         return seen.result
 
-    def _goes_on(self, result: UpdateResult) -> bool:
+    def _is_motion(self, result: UpdateResult) -> bool:
         """Whether the difference of two states is a motion; a jump is none."""
         return self._settings.update.cluster_map == "centred" and result.outcome is not FrameOutcome.RELOCATED
 
 
-def _grown(prepared: Prepared, before: Gaussians, result: UpdateResult, other_rows: bool) -> Prepared:
+def _with_changed_rows(
+    prepared: PreparedUpdate, before: Gaussians, result: UpdateResult, other_rows: bool
+) -> PreparedUpdate:
     """With the roots, labels and arrays of effects of the Gaussians of a result.
 
     Args:
@@ -246,18 +254,18 @@ def _grown(prepared: Prepared, before: Gaussians, result: UpdateResult, other_ro
     """
     now, labels = result.gaussians, prepared.carried.labels
     effects = {
-        name: {key: _lengthened(array, len(before), result.parents) for key, array in arrays.items()}
+        name: {key: _extend_rows(array, len(before), result.parents) for key, array in arrays.items()}
         for name, arrays in result.carried.items()
     }
     if not other_rows:
-        return prepared.carry(effects=effects)
+        return prepared.with_carry_over(effects=effects)
     if labels is not None:
         labels = np.concatenate([labels, now.foreground[len(labels) :] > 0.5])
-    prepared = prepared.carry(effects=effects, labels=labels)
+    prepared = prepared.with_carry_over(effects=effects, labels=labels)
     return replace(prepared, roots=extend_roots(prepared.roots, now, result.parents))
 
 
-def _with_motion(prepared: Prepared, seen: FrameObservation, result: UpdateResult) -> Prepared:
+def _with_motion(prepared: PreparedUpdate, seen: FrameObservation, result: UpdateResult) -> PreparedUpdate:
     """With the motion between the two states, in the clusters of the updater."""
     if seen.result.motion is None:
         return prepared
@@ -265,7 +273,7 @@ def _with_motion(prepared: Prepared, seen: FrameObservation, result: UpdateResul
     known = np.zeros(len(now), np.bool_)
     known[: len(before)] = seen.before.moving & before.moving
     motion = motion_between(hierarchy, seen.before, now, known[hierarchy.rows], seen.result.motion.seconds)
-    return prepared.carry(motion=motion)
+    return prepared.with_carry_over(motion=motion)
 
 
 def _check_rows(name: str, before: UpdateResult, after: UpdateResult) -> None:
@@ -273,7 +281,9 @@ def _check_rows(name: str, before: UpdateResult, after: UpdateResult) -> None:
     count, born = len(before.gaussians), len(after.gaussians) - len(before.gaussians)
     kept = born >= 0 and np.array_equal(after.gaussians.ids[:count], before.gaussians.ids)
     if not kept or (after.gaussians.ids[count:] != UNBORN).any():
-        raise ValueError(f"effect {name}: rows were lost or moved; append with Gaussians.joined, retire the others")
+        raise ValueError(
+            f"effect {name}: rows were lost or moved; append with Gaussians.concatenate, retire the others"
+        )
     had = 0 if before.parents is None else len(before.parents)
     if (0 if after.parents is None else len(after.parents)) != had + born:
         raise ValueError(f"effect {name}: parents has not one parent for each of {had + born} that are born")
@@ -281,7 +291,7 @@ def _check_rows(name: str, before: UpdateResult, after: UpdateResult) -> None:
         raise ValueError(f"effect {name}: a parent is no row of the frame before")
 
 
-def _lengthened(array: NDArray[Any], count: int, parents: NDArray[np.int64] | None) -> NDArray[Any]:
+def _extend_rows(array: NDArray[Any], count: int, parents: NDArray[np.int64] | None) -> NDArray[Any]:
     """An array of an effect with rows for the born, where it has one for each Gaussian."""
     if parents is None or not array.ndim or len(array) != count:
         return array
@@ -299,7 +309,7 @@ def room_for_births(first: int, now: int) -> int:
     >>> room_for_births(1000, 1400), room_for_births(1000, 1600)
     (100, 0)
     """
-    return max(0, int((1 + MOST_BORN) * first) - now)
+    return max(0, int((1 + MAX_BORN_SHARE) * first) - now)
 
 
 def digest(hierarchy: Hierarchy, neighbours: Neighbours | None) -> int:

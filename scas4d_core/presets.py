@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from scas4d_core.effect_names import Mode
-from scas4d_core.effects.switches import contradictions
+from scas4d_core.effects.switches import find_contradictions
 from scas4d_core.errors import InputError
 from scas4d_core.settings import Settings, StaticSettings, UpdateSettings, Weights
 
@@ -146,7 +146,7 @@ def changed(settings: Settings, *changes: Mapping[str, Any]) -> Settings:
         settings = Settings.model_validate(values)
     except ValidationError as error:
         raise _setting_error(error) from None
-    for name, mode, fault, remedy in contradictions(settings):
+    for name, mode, fault, remedy in find_contradictions(settings):
         raise SettingError(f"effects.{name}", mode, fault, remedy)
     return settings
 

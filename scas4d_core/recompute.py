@@ -49,7 +49,7 @@ def recompute(
         StepError: the frame does not follow ``base``, or does not fit it.
     """
     scratch = Reconstruction.fork(rig, settings, history, base)
-    scratch.populates = False  # what came and went in it is known, and states after it have it
+    scratch.may_change_population = False  # what came and went in it is known, and states after it have it
     scratch.set_budget(**budget)
     made = scratch.step(frame, dropped=dropped, notes={**(notes or {}), RECOMPUTED: True})
     if made.outcome.rejected:  # nothing was learnt from the pictures

@@ -19,8 +19,8 @@ from scas4d_core.cameras import Rig, rig_inside
 from scas4d_core.captures.frame import Frame, InitialPoints
 from scas4d_core.checkpoint import CarryOver, Checkpoints, ResumeError, ResumePoint, cold_start, find_commit
 from scas4d_core.effects.evidence import FitTime, FrameObservation
-from scas4d_core.effects.presence.motion_mask import first_labels, labelled
-from scas4d_core.effects.switches import kept_of, switches_record
+from scas4d_core.effects.presence.motion_mask import first_labels, with_labels
+from scas4d_core.effects.switches import committed_arrays, encode_switches
 from scas4d_core.engines.choose import renderer_of
 from scas4d_core.engines.engine import REPORT
 from scas4d_core.engines.limits import rig_limits
@@ -38,18 +38,18 @@ from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.frame_context import FrameContext, FrameInput
 from scas4d_core.frame_report import FrameReport, report_of_first, report_of_update
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.preparation import Preparation, Prepared, room_for_births
+from scas4d_core.preparation import Preparation, PreparedUpdate, room_for_births
 from scas4d_core.progress import Progress
 from scas4d_core.query.committed import CommittedScene
 from scas4d_core.rig_checks import check_rig
-from scas4d_core.robust.alarms import first_watched, sharpness
+from scas4d_core.robust.alarms import sharpness, with_first_figures
 from scas4d_core.robust.checks import (
     axis_lengths,
     brightness,
     check_brightness,
     fingerprints,
     light_continues,
-    noted,
+    record_brightness,
     with_light,
 )
 from scas4d_core.robust.outliers import Past
@@ -67,13 +67,13 @@ __all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "ResumePo
 class Reconstruction(CommittedScene):
     """One scene, from frame 0 on. Made by ``start`` or, from the files of another process, by ``resume``.
 
-    A process should call ``warm_up.warm_up_elsewhere`` before: else the kernels may be compiled here.
+    A process should call ``warm_up.compile_in_processes`` before: else the kernels may be compiled here.
 
     Attributes:
         calibrated: the training cameras as given, or as frame 0 refined them. rig: the same inside, image-scaled.
         world: user's world to inside, by the cameras as given. history: the committed states. report: of the last frame
         committed by this object. resumed: where it was taken up again, or None.
-        populates: whether effects may add, retire and revive Gaussians.
+        may_change_population: whether effects may add, retire and revive Gaussians.
 
     >>> from scas4d_core.captures import open_capture
     >>> capture = open_capture("samples/robot")
@@ -103,8 +103,8 @@ class Reconstruction(CommittedScene):
         self.report: FrameReport | None = None
         self.resumed: ResumePoint | None = None
         self._fixed: FirstFrame
-        self._prepared: Prepared
-        self.populates = True
+        self._prepared: PreparedUpdate
+        self.may_change_population = True
         self._checkpoints = None if history.directory is None else Checkpoints(history.directory)
         self._budget = TimeBudget(settings.update.budget_ms)
 
@@ -164,8 +164,10 @@ class Reconstruction(CommittedScene):
         rows = len(self._prepared.updater.hierarchy.rows)
         report = report_of_first(frame, result, self.rig.names, rows, {**load, **stages}, dropped, calibration)
         psnr, shown = {name: fit["psnr"] for name, fit in result.cameras.items()}, fingerprints(frame.images)
-        past = replace(first_watched(Past.of_first(psnr, brightness(frame.images)), frame.images), fitted=frame.time)
-        prepared = self._prepared.carry(seen=seen, past=past, shown=shown, effects=effects)
+        past = replace(
+            with_first_figures(Past.of_first(psnr, brightness(frame.images)), frame.images), fitted=frame.time
+        )
+        prepared = self._prepared.with_carry_over(seen=seen, past=past, shown=shown, effects=effects)
         self._commit(report, result.gaussians, prepared, {**self._fixed.record(), **(notes or {})})
         return self
 
@@ -195,7 +197,9 @@ class Reconstruction(CommittedScene):
         except (HistoryError, KeyError) as error:
             raise ResumeError(f"the first frame, which every update needs, cannot be read ({error})") from error
         index, left, faults = find_commit(history, self._checkpoints, self._factory, held)
-        same = self._go_on(index, cold_start(history, index, self._fixed.masked) if left is None else left)
+        same = self._prepare_from_commit(
+            index, cold_start(history, index, self._fixed.masked) if left is None else left
+        )
         if left is not None and not same:
             faults.append("clusters came out otherwise than before: the next update starts without a motion")
         self.resumed = ResumePoint(index, history.truncate(index), faults, cold=left is None or not same)
@@ -225,10 +229,10 @@ class Reconstruction(CommittedScene):
         copy = history.copy_frames((history.indices[0], index))
         self = cls(rig, with_recorded_background(settings, copy), copy)
         self._fixed = FirstFrame.of(copy)
-        self._go_on(index, cold_start(copy, index, self._fixed.masked))
+        self._prepare_from_commit(index, cold_start(copy, index, self._fixed.masked))
         return self
 
-    def _go_on(self, index: int, carried: CarryOver) -> bool:
+    def _prepare_from_commit(self, index: int, carried: CarryOver) -> bool:
         """Prepare the updates after a committed one; False: the motion that it left does not fit today's clusters."""
         roots = self.history.roots(index)
         self._fixed = replace(self._fixed, lengths=axis_lengths(roots))
@@ -273,48 +277,48 @@ class Reconstruction(CommittedScene):
         judged = bright if self.settings.update.reject_outliers else {}  # then no picture is doubted
         exposure, left_out, unusable = check_brightness(past, judged)
         changes = exposure != 1.0 and light_continues(past, judged)
-        past = noted(with_light(past, exposure), bright)
-        context.observed = FrameInput(seconds, views, bright, shown, exposure, left_out, unusable, changes, past)
+        past = record_brightness(with_light(past, exposure), bright)
+        context.frame_input = FrameInput(seconds, views, bright, shown, exposure, left_out, unusable, changes, past)
         watch.lap("judge")
 
     def _prepare(self, context: FrameContext) -> None:
         """Finds the moving Gaussians where no masks name them, and gathers the input of the update."""
-        observed, frame, prepared, newest = context.observed, context.frame, self._prepared, self.history.newest
+        observed, frame, prepared, newest = context.frame_input, context.frame, self._prepared, self.history.newest
         believed, learns = observed.believed, observed.steady and self._learns_labels
         if learns and prepared.carried.seen:
             prepared = self._preparation.learn_labels(prepared, newest, believed)
         carried, past, shown = prepared.carried, observed.past, observed.fingerprints
         context.prepared = prepared
-        context.given = UpdateInput(
-            state=labelled(newest, carried.labels),
+        context.update_input = UpdateInput(
+            state=with_labels(newest, carried.labels),
             motion=carried.motion,
             seconds=frame.time - past.fitted if isfinite(past.fitted) else observed.seconds,
             step=observed.seconds,
             views=believed,
-            suspects=[view for view in observed.views if past.is_out(view.name)],
+            suspects=[view for view in observed.views if past.is_left_out(view.name)],
             brightness=observed.bright,
             seed=frame.index,
             past=past,
             lengths=self._fixed.lengths,
             exposure=observed.exposure,
             light_moves=observed.light_changes,
-            rests=learns and carried.labels is None and len(self.history.indices) <= RESTING,
+            may_be_static=learns and carried.labels is None and len(self.history.indices) <= RESTING,
             same=[name for name in shown if shown[name] == carried.shown.get(name)],
             sharp=sharpness(frame.images),
             left_out=observed.left_out,
             unusable=observed.unusable,
             carried=carried.effects,
             end=self._budget.end(context.watch.began),
-            each=self._budget.each,
+            iteration_seconds=self._budget.iteration_seconds,
         )
 
     def _solve(self, context: FrameContext) -> None:
         """Updates Θ_{t−1} to the frame; a frame that is rejected changes nothing."""
         solver = FrameSolver(context.prepared.updater, self._factory, self._renderer, self._update)
-        result, context.past = solver.run(context.given)
-        context.judging = solver.judging
+        result, context.past = solver.run(context.update_input)
+        context.check_seconds = solver.check_seconds
         context.watch.lap("update")
-        context.watch.move("update", "judge", solver.judging)
+        context.watch.move("update", "judge", solver.check_seconds)
         if result.outcome.rejected:  # motion seen in pictures that are rejected is rejected with them
             carried = self._prepared.carried
             context.prepared = self._prepared
@@ -323,39 +327,39 @@ class Reconstruction(CommittedScene):
 
     def _populate(self, context: FrameContext) -> None:
         """Takes the effects' evidence, lets Gaussians come and go, and prepares the next update."""
-        observed, result, believed = context.observed, context.result, context.observed.believed
+        observed, result, believed = context.frame_input, context.result, context.frame_input.believed
         learnt_from = believed if self._learns_labels else None
         carried = context.prepared.carried.after(
             result, context.past, context.frame.time, learnt_from, observed.fingerprints
         )
         learn_labels = context.prepared.updater is not self._prepared.updater
-        context.notes = {"cold": context.given.motion is None, "learn_labels": learn_labels, **context.notes}
+        context.notes = {"cold": context.update_input.motion is None, "learn_labels": learn_labels, **context.notes}
         context.prepared = replace(context.prepared, carried=carried)
-        context.fits = FitTime(self._budget.end_of_births(context.watch.began))
+        context.birth_fit_time = FitTime(self._budget.end_of_births(context.watch.began))
         if not result.outcome.learnt or result.exposure != 1.0:  # where a change of light was taken out, much looks new
             return
         learnt = [view for view in result.views or believed if view.name not in result.trace.left_out]
         names = {view.name for view in learnt}
         seen = FrameObservation(
             index=context.frame.index,
-            before=context.given.state,
+            before=context.update_input.state,
             result=result,
             rig=self._factory.posed,
             views=learnt,
             renderer=self._renderer,
             room=room_for_births(len(self.history.first), len(result.gaussians)),
-            time=context.fits,
+            time=context.birth_fit_time,
             suspects=[view for view in observed.views if view.name not in names],
         )
-        populates = self.populates and observed.exposure == 1.0
-        context.result, context.prepared = self._preparation.after_frame(context.prepared, seen, populates)
-        self._budget.saw_births(context.fits.spent, context.fits.put_off)
+        may_change_population = self.may_change_population and observed.exposure == 1.0
+        context.result, context.prepared = self._preparation.after_frame(context.prepared, seen, may_change_population)
+        self._budget.record_birth_fits(context.birth_fit_time.spent, context.birth_fit_time.postponed)
         context.watch.lap("presence")
 
     def _report(self, context: FrameContext) -> FrameReport:
         return report_of_update(
-            context.frame, context.result, self.history.newest, context.observed.left_out, self.rig.names,
-            context.watch, context.dropped, context.fits.put_off,
+            context.frame, context.result, self.history.newest, context.frame_input.left_out, self.rig.names,
+            context.watch, context.dropped, context.birth_fit_time.postponed,
         )  # fmt: skip
 
     def _commit_update(self, context: FrameContext, report: FrameReport) -> None:
@@ -364,9 +368,9 @@ class Reconstruction(CommittedScene):
         grown = prepared.roots is not self._prepared.roots
         birth = {"roots": prepared.roots, "parents": result.parents} if grown else {}
         self._commit(report, result.gaussians, prepared, context.notes, **birth)
-        after = context.judging + watch.seconds.get("presence", 0.0) - context.fits.spent
+        after = context.check_seconds + watch.seconds.get("presence", 0.0) - context.birth_fit_time.spent
         after += perf_counter() - watch.began - watch.total
-        self._budget.learn(result.trace.moments, result.trace.seconds, after)
+        self._budget.record_frame(result.trace.iteration_ends, result.trace.seconds, after)
 
     @property
     def _learns_labels(self) -> bool:
@@ -410,7 +414,7 @@ class Reconstruction(CommittedScene):
         self._budget.milliseconds = self._update.budget_ms
 
     def _commit(
-        self, report: FrameReport, gaussians: Gaussians, prepared: Prepared, more: Mapping[str, Any], **birth: Any
+        self, report: FrameReport, gaussians: Gaussians, prepared: PreparedUpdate, more: Mapping[str, Any], **birth: Any
     ) -> None:
         """The checkpoint first, then state and report in one rename; ``birth``: see ``History.append``."""
         carried = prepared.carried
@@ -418,12 +422,12 @@ class Reconstruction(CommittedScene):
             self._checkpoints.save(report.index, carried)
         began = perf_counter()
         resumed = None if self.resumed is None or self.report is not None else asdict(self.resumed)
-        effects = switches_record(carried.switches)
+        effects = encode_switches(carried.switches)
         record = {**report.record(), "effects": effects, "threads": get_num_threads(), "resumed": resumed, **more}
         seconds = report.seconds  # a record cannot time its own writing: it has that of the one before
         seconds[REPORT] = seconds.get(REPORT, 0.0) + self.history.record_seconds + perf_counter() - began
         record["seconds"] = dict(seconds)
-        kept = kept_of(carried.effects) if self.history.indices else carried.effects
+        kept = committed_arrays(carried.effects) if self.history.indices else carried.effects
         self.history.append(report.index, report.time, gaussians, record, effects=kept, **birth)
         if birth:
             prepared = replace(prepared, roots=self.history.roots())

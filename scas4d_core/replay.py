@@ -26,7 +26,7 @@ Decode = Callable[[], tuple[Frame, Mapping[str, str]]]
 
 
 @dataclass(frozen=True)
-class Replayed:
+class ReplayResult:
     """Cost and error of a frame with so many iterations.
 
     Attributes:
@@ -51,7 +51,7 @@ def replay(
     frames: Sequence[Decode],
     iterations: int,
     over: Callable[[], None] = lambda: None,
-) -> Replayed:
+) -> ReplayResult:
     """Update frames again with another number of iterations.
 
     Args:
@@ -79,11 +79,11 @@ def replay(
     return summary(iterations, reports[1:])
 
 
-def summary(iterations: int, reports: Sequence[FrameReport]) -> Replayed:
+def summary(iterations: int, reports: Sequence[FrameReport]) -> ReplayResult:
     """Frames that were tried more than once or are not met say nothing of the budget: they count where all are so."""
     clean = [report for report in reports if report.degraded is None and len(report.attempts) <= 1] or reports
     errors = [report.errors[report.kept] for report in clean if report.kept in report.errors]
-    return Replayed(
+    return ReplayResult(
         iterations,
         1000 * float(np.median([sum(report.seconds.values()) for report in clean])),
         _mean(errors),

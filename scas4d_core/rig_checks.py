@@ -23,7 +23,7 @@ fly's rig has 17."""
 RADII = (1e-6, 1e9)
 """Metres inside: beyond, a unit was mistaken, and float32 holds too little of a scene."""
 
-FEW_SEE, MOST_SEE = 0.25, 0.9
+FEW_SEE, MAX_SEE = 0.25, 0.9
 """Shares of the cameras in whose pictures their common point lies: poses are suspected where as given few see it, and
 nearly all would the other way round."""
 POINTS_SEEN = 0.2
@@ -35,7 +35,7 @@ NOT_PARALLEL = 1e-3
 """Smallest mean squared sine between the axes and any direction: below, they are parallel and have no common point."""
 LEAST_DEPTH = 0.05
 """Of the rig's extent: a common point that is nearer to a camera is where the cameras themselves are."""
-MOST_POINTS = 2000
+MAX_POINTS = 2000
 """Points of a cloud that are looked at, evenly out of all."""
 SEEN_AT_ALL = 0.1
 """Share of a cloud that the cameras together have to have in view."""
@@ -274,7 +274,7 @@ def pose_warnings(rig: Rig, positions: Float | None = None) -> list[str]:
             return []
         turned = [_inverted(camera) for camera in rig.cameras]
         given, other = _come_together(rig.cameras, behind=True), _come_together(turned, behind=False)
-        if given > FEW_SEE or other < MOST_SEE:
+        if given > FEW_SEE or other < MAX_SEE:
             return []
         evidence = f"the viewing axes of {given:.0%} of the cameras come together, inverted those of {other:.0%}"
     return [
@@ -333,4 +333,4 @@ def _come_together(cameras: Sequence[Camera], *, behind: bool) -> float:
 
 
 def _some(positions: Float) -> Float:
-    return np.asarray(positions, np.float64)[:: max(1, len(positions) // MOST_POINTS)]
+    return np.asarray(positions, np.float64)[:: max(1, len(positions) // MAX_POINTS)]

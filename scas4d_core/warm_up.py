@@ -1,6 +1,7 @@
 """Has the kernels that a scene needs compiled before they are called, in other processes than the one that computes.
 
-Compiling takes tens of seconds and hundreds of megabytes that a process would keep. A process calls `warm_up_elsewhere`
+Compiling takes tens of seconds and hundreds of megabytes that a process would keep. A process calls
+`compile_in_processes`
 before its first ``Reconstruction``; without, kernels are compiled where they are first called.
 """
 
@@ -17,7 +18,7 @@ _settled: set[KernelGroup] = set()
 """The groups that this process has asked for."""
 
 
-def warm_up_elsewhere(
+def compile_in_processes(
     wanted: Iterable[KernelGroup] = EVERY, *, then: Iterable[KernelGroup] = (), on_progress: OnProgress | None = None
 ) -> None:
     """Waits until the cache has the kernels of the groups ``wanted``; a process asks for each group once.
@@ -43,9 +44,9 @@ def update_groups(covariance: str) -> tuple[KernelGroup, ...]:
 
 def warm_up(on_progress: OnProgress) -> None:
     """Waits until the cache has the kernels of a first frame; those of updates are compiled after them."""
-    warm_up_elsewhere((KernelGroup.FIRST_FRAME,), then=groups_of_update("entangled"), on_progress=on_progress)
+    compile_in_processes((KernelGroup.FIRST_FRAME,), then=groups_of_update("entangled"), on_progress=on_progress)
 
 
-def warm_up_more() -> None:
+def warm_up_updates() -> None:
     """Waits until the cache has the kernels of updates."""
-    warm_up_elsewhere(groups_of_update("entangled"))
+    compile_in_processes(groups_of_update("entangled"))

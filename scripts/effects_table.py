@@ -17,7 +17,7 @@ def table() -> str:
     lines = ["| effect | group | models | on by default |", "|---|---|---|---|"]
     for one in map(effect, EFFECTS):
         on = "by evidence" if one.auto else "yes"
-        lines.append(f"| `{one.name}` | {one.group.value} | {one.says} | {on} |")
+        lines.append(f"| `{one.name}` | {one.group.value} | {one.description} | {on} |")
     return "\n".join(lines) + "\n"
 
 

@@ -221,7 +221,7 @@ class ReplayUpdated:
 
 @dataclass(frozen=True)
 class ReplayPoint:
-    """Cost and accuracy of one number of iterations (`scas4d_core.replay.Replayed`)."""
+    """Cost and accuracy of one number of iterations (`scas4d_core.replay.ReplayResult`)."""
 
     iterations: int
     milliseconds: float

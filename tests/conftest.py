@@ -33,9 +33,9 @@ LONGEST = (
 def kernels(request: pytest.FixtureRequest) -> None:
     """Kernels are compiled once, in a process beside: of the tests' processes one asks for it, the others wait."""
     if not path_of(request.node).startswith(WITHOUT_KERNELS):
-        from scas4d_core.warm_up import warm_up_elsewhere
+        from scas4d_core.warm_up import compile_in_processes
 
-        warm_up_elsewhere()
+        compile_in_processes()
 
 
 SERVICE_FIXTURES = {"service", "app"}

@@ -52,7 +52,7 @@ PUBLIC: dict[str, tuple[str, ...]] = {
     "scas4d_core.engines.choose": ("engine_of",),
     "scas4d_core.engines.cpu.rasterizer": ("CpuRasterizer",),
     "scas4d_core.engines.engine": ("EngineError",),
-    "scas4d_core.engines.exposure": ("exposure_of",),
+    "scas4d_core.engines.exposure": ("gain_to_exposure",),
     "scas4d_core.engines.limits": ("scene_limits",),
     "scas4d_core.engines.torch.rasterizer": ("render",),
     "scas4d_core.frame_outcome": ("FrameOutcome", "degraded_text"),

@@ -192,7 +192,7 @@ def remarks_on(report: FrameReport | None) -> str:
 
 def compile_kernels() -> None:
     """Compiles the kernels in a process beside, unless the cache has them."""
-    from scas4d_core.warm_up import EVERY, warm_up_elsewhere
+    from scas4d_core.warm_up import EVERY, compile_in_processes
 
     with Bars() as bars:
-        warm_up_elsewhere(EVERY, on_progress=lambda done, total: bars("compiling the kernels", done, total))
+        compile_in_processes(EVERY, on_progress=lambda done, total: bars("compiling the kernels", done, total))

@@ -254,7 +254,7 @@ class FrameReportModel(Model):
     calibration: CalibrationModel | None = Field(
         default=None, description="Of frame 0, the calibration against its pictures."
     )
-    put_off: list[str] = Field(
+    postponed: list[str] = Field(
         default_factory=list, description="Births for which the budget left no time; the next frame has some for them."
     )
 

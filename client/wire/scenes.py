@@ -183,7 +183,7 @@ class EffectStatus(EffectModel):
     """The switch of one effect in a scene's status, with the words that describe the effect."""
 
     group: str = Field(description="motion, coherence, appearance, cameras or presence.")
-    says: str = Field(description="A sentence that says what it does.")
+    description: str = Field(description="A sentence that says what it does.")
 
 
 class SceneStatus(Model):

@@ -81,7 +81,7 @@ KERNELS = (
         KernelGroup.ENTANGLED,
         "kernels.deform.deform_backward i i1 i2 i2 i2 i2 f2 f2 f2 f none f4 f2 f f2 f2 f3 f2 f3 f2 f2 f1",
         "kernels.deform.deform i f2 i1 i2 i2 i2 i2 f2 f2 f2 f none f4 f3 f2 f2 f3 f2 i2",
-        "kernels.deform.settle i f2 i1 i2 i2 f2 f2 f none f4 f3 f2",
+        "kernels.deform.freeze_layer i f2 i1 i2 i2 f2 f2 f none f4 f3 f2",
     ),
     *_of(
         KernelGroup.UPDATE,
@@ -89,15 +89,15 @@ KERNELS = (
         "kernels.deform.block_sums f4 f2 f3",
         "kernels.tiles.mark_blocks f2 s2 y1 i w1",
         "kernels.tiles.put_rows i1 i1 f2 f2",
-        "kernels.tiles.take_blocks f3 f3 w1 i i*4 f3 d1",
+        "kernels.tiles.compose_box f3 f3 w1 i i*4 f3 d1",
         "kernels.tiles.find_meeting f2 s2 i w1 b1",
-        "kernels.tiles.put_blocks f3 w1 i i*4 f3",
+        "kernels.tiles.write_blocks f3 w1 i i*4 f3",
     ),
     *_of(
         KernelGroup.SEPARATE,
         "kernels.deform.deform_backward i i1 i2 i2 i2 i2 f2 f2 f2 f b f4 f2 f f2 f2 f3 f2 f3 f2 f2 f1",
         "kernels.deform.deform i f2 i1 i2 i2 i2 i2 f2 f2 f2 f b f4 f3 f2 f2 f3 f2 i2",
-        "kernels.deform.settle i f2 i1 i2 i2 f2 f2 f b f4 f3 f2",
+        "kernels.deform.freeze_layer i f2 i1 i2 i2 f2 f2 f b f4 f3 f2",
     ),
     *_of(
         KernelGroup.STEREO,

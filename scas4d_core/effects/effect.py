@@ -37,31 +37,33 @@ class Effect:
 
     Attributes:
         name: as in ``effect_names.EFFECTS``. group: of the effects that it stands beside.
-        says: a sentence for users. gauge: that which fixes it against the effects that could explain the same pixels.
+        description: a sentence for users. disambiguation: that which fixes it against the effects that could explain
+            the same pixels.
         cost: of an update with it, against one without.
         auto: whether it waits for evidence; else it is on wherever it is not refused.
         on_above, off_below: share of ``Evidence`` from which it is switched on, and below which it is switched off.
         without_masks: whether it is anything in a scene whose first frame has no masks.
-        kept: names of its arrays in ``Attempt.carried`` that are committed with each frame: a cold start, without a
-            checkpoint, has these, and those of ``began``. They are small.
+        committed_arrays: names of its arrays in ``Attempt.carried`` that are committed with each frame: a cold start,
+            without a
+            checkpoint, has these, and those of ``first_frame_arrays``. They are small.
     """
 
     name: str
     group: EffectGroup
-    says: str
-    gauge: str
+    description: str
+    disambiguation: str
     cost: str
     auto: bool = False
     on_above: float = 0.0
     off_below: float = 0.0
     without_masks: bool = True
-    kept: tuple[str, ...] = ()
+    committed_arrays: tuple[str, ...] = ()
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
         """Fault and remedy where it cannot be on under these settings; None: it can."""
         return None
 
-    def began(self, seen: FrameObservation) -> Arrays | None:
+    def first_frame_arrays(self, seen: FrameObservation) -> Arrays | None:
         """Arrays of frame 0 that evidence or part look back to; None: none. Not asked where it is pinned off."""
         return None
 
@@ -92,13 +94,13 @@ class Effect:
 
         Called where it is on, after each frame that was learnt and before its commit; nowhere else may rows change.
         Rows stay where they are: ``replace(seen.result, gaussians=..., parents=..., carried=...)``, the Gaussians made
-        by ``Gaussians.joined``, ``retire`` and ``revive``. ``parents`` has those of effects before, too. Arrays in
+        by ``Gaussians.concatenate``, ``retire`` and ``revive``. ``parents`` has those of effects before, too. Arrays in
         ``carried`` with a row for each Gaussian are lengthened afterwards: the born have the rows of their parents,
         or zeros.
         """
         return seen.result
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Puts its part into the updates of a scene; called only where it is on."""
         raise NotImplementedError
 

@@ -33,13 +33,13 @@ class FitTime:
 
     Attributes:
         end: ``perf_counter`` by which fits have to be over; None: there is no limit.
-        spent: seconds that they took. put_off: what there was no time for, in words; it is found again in the next
+        spent: seconds that they took. postponed: what there was no time for, in words; it is found again in the next
             frame.
     """
 
     end: float | None = None
     spent: float = 0.0
-    put_off: list[str] = field(default_factory=list)
+    postponed: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,11 +43,11 @@ class Switch:
 
 
 Switches = Mapping[str, Switch]
-NONE_FOUND: Mapping[str, Evidence] = MappingProxyType({})
+NO_EVIDENCE: Mapping[str, Evidence] = MappingProxyType({})
 """No evidence."""
 
 
-def contradictions(settings: Settings) -> Iterator[tuple[str, Mode, str, str]]:
+def find_contradictions(settings: Settings) -> Iterator[tuple[str, Mode, str, str]]:
     """Name, mode, fault and remedy of each effect whose pin the settings contradict."""
     for name, mode in settings.effects.items():
         if mode == "on" and (refusal := effect(name).refusal(settings)) is not None:
@@ -57,7 +57,7 @@ def contradictions(settings: Settings) -> Iterator[tuple[str, Mode, str, str]]:
 
 
 def first_switches(
-    settings: Settings, index: int, found: Mapping[str, Evidence] = NONE_FOUND, masked: bool = True
+    settings: Settings, index: int, found: Mapping[str, Evidence] = NO_EVIDENCE, masked: bool = True
 ) -> dict[str, Switch]:
     """The switches before any update: what is pinned, on in every scene whose settings allow it, or found in frame 0.
 
@@ -72,7 +72,7 @@ def first_switches(
     >>> switches["rigidity"].on, switches["isometry"].on, switches["floor"].on  # no floor is named
     (False, True, False)
     """
-    for _, _, fault, remedy in contradictions(settings):
+    for _, _, fault, remedy in find_contradictions(settings):
         raise InputError(fault, remedy)
     switches = {}
     for name in EFFECTS:
@@ -90,30 +90,30 @@ def first_switches(
     return switches
 
 
-def switches_record(switches: Switches) -> dict[str, dict[str, Any]]:
+def encode_switches(switches: Switches) -> dict[str, dict[str, Any]]:
     """The switches as JSON, for reports and checkpoints."""
     return {name: asdict(switch) for name, switch in switches.items()}
 
 
-def switches_of(record: Mapping[str, Mapping[str, Any]]) -> dict[str, Switch]:
+def decode_switches(record: Mapping[str, Mapping[str, Any]]) -> dict[str, Switch]:
     """The switches of a record.
 
-    >>> switches_of(switches_record({"floor": Switch(on=True, since=3)}))["floor"].since
+    >>> decode_switches(encode_switches({"floor": Switch(on=True, since=3)}))["floor"].since
     3
     """
     return {name: Switch(**values) for name, values in record.items()}
 
 
-def decided(switches: Switches, settings: Settings, seen: FrameObservation) -> dict[str, Switch]:
+def decide_switches(switches: Switches, settings: Settings, seen: FrameObservation) -> dict[str, Switch]:
     """The switches for the frame after one that was committed.
 
     Args:
         switches: with which it was updated. settings: of the scene. seen: the frame.
     """
-    return {name: _decided(name, switch, settings, seen) for name, switch in switches.items()}
+    return {name: _decide_switch(name, switch, settings, seen) for name, switch in switches.items()}
 
 
-def _decided(name: str, switch: Switch, settings: Settings, seen: FrameObservation) -> Switch:
+def _decide_switch(name: str, switch: Switch, settings: Settings, seen: FrameObservation) -> Switch:
     one = effect(name)
     if switch.pinned or not one.auto or one.refusal(settings) is not None:
         return switch
@@ -127,13 +127,13 @@ def _decided(name: str, switch: Switch, settings: Settings, seen: FrameObservati
     return replace(switch, on=False, since=seen.index, idle=0) if idle >= IDLE else replace(switch, idle=idle)
 
 
-def began(switches: Switches, settings: Settings, seen: FrameObservation) -> dict[str, Arrays]:
+def first_frame_arrays(switches: Switches, settings: Settings, seen: FrameObservation) -> dict[str, Arrays]:
     """Arrays that the effects keep of the first frame, by effect."""
     by_effect = {}
     for name, switch in switches.items():
         one = effect(name)
         if (switch.on or not switch.pinned) and effect(name).refusal(settings) is None:
-            arrays = one.began(seen)
+            arrays = one.first_frame_arrays(seen)
             if arrays is not None:
                 by_effect[name] = arrays
     return by_effect
@@ -158,17 +158,21 @@ def record_arrays(switches: Switches, settings: Settings, seen: FrameObservation
     return replace(seen, result=replace(seen.result, carried={**seen.result.carried, **by_effect}))
 
 
-def kept_of(carried: Mapping[str, Arrays]) -> dict[str, Arrays]:
+def committed_arrays(carried: Mapping[str, Arrays]) -> dict[str, Arrays]:
     """The arrays that are committed with a frame after the first, of those that the effects leave, by effect."""
-    kept = {name: {key: own[key] for key in effect(name).kept if key in own} for name, own in carried.items()}
+    kept = {
+        name: {key: own[key] for key in effect(name).committed_arrays if key in own} for name, own in carried.items()
+    }
     return {name: own for name, own in kept.items() if own}
 
 
-def switched_by(found: Mapping[str, Arrays], switches: Switches, seen: FrameObservation) -> dict[str, Switch]:
+def switches_after_first_frame(
+    found: Mapping[str, Arrays], switches: Switches, seen: FrameObservation
+) -> dict[str, Switch]:
     """The switches after the first frame.
 
     Args:
-        found: from ``began``. seen: the first frame.
+        found: from ``first_frame_arrays``. seen: the first frame.
     """
     return {
         name: replace(switch, on=True) if name in found and effect(name).on_at_first(seen) else switch
@@ -190,5 +194,5 @@ def register_effects(builder: PlanBuilder, effects: Sequence[str] | None = None)
     if effects is None:
         effects = names_on(first_switches(Settings(scene=builder.scene, update=builder.update), 0))
     for name in effects:
-        effect(name).join(builder)
+        effect(name).register(builder)
     return builder

@@ -76,7 +76,7 @@ class Tables:
     deltas: Array
 
     @classmethod
-    def still(cls, hierarchy: Hierarchy) -> Tables:
+    def identity(cls, hierarchy: Hierarchy) -> Tables:
         """No motion."""
         clusters = [np.zeros((count, 10), np.float32) for count in hierarchy.sizes]
         return cls(clusters, np.zeros((len(hierarchy.rows), 9), np.float32))
@@ -120,7 +120,7 @@ class StepScalars:
     """What changes from iteration to iteration: a few numbers.
 
     Attributes:
-        resting: number of layers, from the coarsest, that do not learn any more.
+        frozen: number of layers, from the coarsest, that do not learn any more.
         layers: factor on the rates of each layer in this iteration; 0: it is not stepped.
         own: factor on the rates of Δp, ΔR, Δs. colour: factor on those of the colours. gloss: on those of the gloss.
         smooth_gloss: whether the changes of the gloss are averaged over neighbours after this step.
@@ -129,7 +129,7 @@ class StepScalars:
         keep_pictures: whether the log keeps the rendering of this iteration.
     """
 
-    resting: int
+    frozen: int
     layers: tuple[float, ...]
     own: float
     colour: float
@@ -151,10 +151,10 @@ class Thinned(NamedTuple):
     planes: Array
 
     @classmethod
-    def of(cls, features: Array, rest: Array) -> Thinned:
+    def of(cls, features: Array, transmittance: Array) -> Thinned:
         """Of a rendering: features [4, H, W] and transmittance left [H, W]."""
-        every = max(1, min(rest.shape) // KEPT_ROWS)
-        return cls(every, np.concatenate([features[:, ::every, ::every], rest[None, ::every, ::every]]))
+        every = max(1, min(transmittance.shape) // KEPT_ROWS)
+        return cls(every, np.concatenate([features[:, ::every, ::every], transmittance[None, ::every, ::every]]))
 
 
 class ViewRecord(NamedTuple):

@@ -35,16 +35,16 @@ ENOUGH = 0.5
 """Share of the rig's cameras from which a frame teaches gains: between a few, each one's faults pass for gains."""
 
 
-def exposure_of(gain: Array) -> Array:
+def gain_to_exposure(gain: Array) -> Array:
     """[3, 2] gain and offset of a picture's values, for the a of each channel [3].
 
-    >>> exposure_of(np.ones(3, np.float32))[0]
+    >>> gain_to_exposure(np.ones(3, np.float32))[0]
     array([1., 0.], dtype=float32)
     """
     return np.stack([gain, FOOT * (gain - 1)], axis=1).astype(np.float32)
 
 
-def gain_of(exposure: Array) -> Array:
+def exposure_to_gain(exposure: Array) -> Array:
     """[3] the a that does to the middle value what a gain and an offset [3 or more, 2] do."""
     gain: Array = (exposure[:3, 0] * MIDDLE + exposure[:3, 1] + FOOT) / (MIDDLE + FOOT)
     return gain
@@ -62,7 +62,7 @@ def measured_gain(picture: Array, shown: Array) -> Array:
     return gain
 
 
-def settled_gains(gains: Array, measured: dict[int, Array], cameras: int) -> Array | None:
+def update_gains(gains: Array, measured: dict[int, Array], cameras: int) -> Array | None:
     """The gains after a round over the cameras; None: the round teaches nothing.
 
     They take ``SHARE`` of the way. Their mean logarithm stays: what all cameras share is light.

@@ -35,11 +35,12 @@ class RenderingStatistics:
     """Sums over the renderings since the last change of rows, for each Gaussian; density control reads them.
 
     Attributes:
-        pull: [N] sum of the lengths of the screen gradients, per half picture. rendered: [N] times it was in a picture.
+        screen_gradients: [N] sum of the lengths of the screen gradients, per half picture. rendered: [N] times it was
+            in a picture.
         factors: [N, 3, 3] as the last iteration rendered them, before its step.
     """
 
-    pull: NDArray[np.float64]
+    screen_gradients: NDArray[np.float64]
     rendered: NDArray[np.int64]
     factors: Array
 
@@ -59,7 +60,7 @@ class FitGloss(Protocol):
     gloss: Array
     environment: Array
 
-    def taken(self, rows: NDArray[np.int64], parents: NDArray[np.int64]) -> Self:
+    def select_rows(self, rows: NDArray[np.int64], parents: NDArray[np.int64]) -> Self:
         """The same for some rows, with their moments, and for further ones like their parents, without."""
 
 

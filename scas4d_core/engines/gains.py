@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from scas4d_core.engines.exposure import exposure_of, measured_gain, settled_gains
+from scas4d_core.engines.exposure import gain_to_exposure, measured_gain, update_gains
 from scas4d_core.engines.views import TrainingView
 
 Array = NDArray[np.float32]
@@ -30,7 +30,7 @@ class GainEstimator:
         """These views take no part any more; their exposures stay."""
         self._views = [view for view in self._views if view not in views]
 
-    def saw(self, view: TrainingView, shown: Array) -> None:
+    def record_rendering(self, view: TrainingView, shown: Array) -> None:
         """Measure a camera's gain in its rendering; a camera's second rendering begins a new round.
 
         Args:
@@ -38,12 +38,12 @@ class GainEstimator:
         """
         row = self._rows[view.name]
         if row in self._measured:
-            self.settle()
+            self.finish_round()
         self._measured[row] = measured_gain(view.target, shown)
 
-    def settle(self) -> None:
+    def finish_round(self) -> None:
         """End a round: gains and exposures follow what it measured."""
-        settled = settled_gains(self.gains, self._measured, len(self._views))
+        settled = update_gains(self.gains, self._measured, len(self._views))
         if settled is not None:
             self.gains = settled
             self._expose()
@@ -51,4 +51,4 @@ class GainEstimator:
 
     def _expose(self) -> None:
         for view in self._views:
-            view.exposure[:3] = exposure_of(self.gains[self._rows[view.name]])
+            view.exposure[:3] = gain_to_exposure(self.gains[self._rows[view.name]])

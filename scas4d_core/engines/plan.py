@@ -27,12 +27,12 @@ class ColourPlan:
     """The colours that an update learns.
 
     Attributes:
-        moving: colours of the moving Gaussians are free. standing: those of the static ones are free.
+        moving: colours of the moving Gaussians are free. static: those of the static ones are free.
         changing_light: the light changes, so colours learn faster (``effects.appearance.light``).
     """
 
     moving: bool = False
-    standing: bool = False
+    static: bool = False
     changing_light: bool = False
 
 
@@ -57,8 +57,8 @@ class UpdatePlan:
         colours: the colours that are learnt; None: none.
         gloss: whether gloss and environment are learnt (``effects.appearance.direction``).
         camera_gains: whether gains of the cameras are followed (``effects.appearance.camera_gain``).
-        whole_pictures: whether every pixel can change; else only pixels that moving Gaussians reach.
-        always_updates: whether an effect learns from frames that Θ_{t−1} already shows well enough.
+        full_images: whether every pixel can change; else only pixels that moving Gaussians reach.
+        disables_skip: whether an effect learns from frames that Θ_{t−1} already shows well enough.
         learns_labels: whether moving Gaussians are found from motion where no masks are given.
     """
 
@@ -82,8 +82,8 @@ class UpdatePlan:
     colours: ColourPlan | None = None
     gloss: bool = False
     camera_gains: bool = False
-    whole_pictures: bool = False
-    always_updates: bool = False
+    full_images: bool = False
+    disables_skip: bool = False
     learns_labels: bool = False
 
     def learns_colours(self) -> ColourPlan:

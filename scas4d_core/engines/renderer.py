@@ -23,11 +23,11 @@ class Picture(NamedTuple):
     """A rendered picture; it may lie in a buffer of the renderer, valid until its next call.
 
     Attributes:
-        features: [C, H, W] float32, before the camera's exposure. rest: [H, W] float32, transmittance left.
+        features: [C, H, W] float32, before the camera's exposure. transmittance: [H, W] float32, transmittance left.
     """
 
     features: Array
-    rest: Array
+    transmittance: Array
 
 
 class Comparison(NamedTuple):

@@ -49,7 +49,7 @@ def surface_normals(state: Gaussians, views: Sequence[TrainingView], renderer: R
     for view in views:
         camera = view.camera
         picture = renderer.render(haze, camera, features, depth_channel=3)
-        alpha = 1 - picture.rest
+        alpha = 1 - picture.transmittance
         solid = alpha > SOLID
         depth = np.where(solid, picture.features[3] / np.maximum(alpha, SOLID), 0).astype(np.float64)
         normals, weights = _pixel_normals(depth, solid, camera.lens, reach)

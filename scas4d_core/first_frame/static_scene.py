@@ -183,7 +183,7 @@ class StaticTrainer:
         parameters, statistics = self.fit.table.parameters, self.fit.table.statistics
         assert statistics is not None
         opacity = 1 / (1 + np.exp(-parameters[:, OPACITY.start]))
-        score = statistics.pull / np.maximum(statistics.rendered, 1)
+        score = statistics.screen_gradients / np.maximum(statistics.rendered, 1)
         keep = opacity >= min(PRUNE_OPACITY, float(np.median(opacity)))  # never more than half at once
         room = max(0, min(target, self.budget) - int(keep.sum()))
         score = np.where(keep & (score >= DENSIFY_GRADIENT), score, 0)
@@ -231,7 +231,7 @@ class StaticTrainer:
 
     def result(self, losses: list[float]) -> StaticResult:
         """Of the iterations so far."""
-        exposures, planned, shortened = self.exposures.found(), self.schedule.record, self.schedule.shortened
+        exposures, planned, shortened = self.exposures.by_camera(), self.schedule.record, self.schedule.shortened
         return StaticResult(
             self.gaussians(),
             exposures,

@@ -57,6 +57,6 @@ class Exposures:
             for view in self._views:
                 view.exposure[:] = (1, 0)
 
-    def found(self) -> dict[str, Array]:
+    def by_camera(self) -> dict[str, Array]:
         """[3, 2] of each camera; none where they are not learnt."""
         return {view.name: view.exposure[:3].copy() for view in self._views} if self.on else {}

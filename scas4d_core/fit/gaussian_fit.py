@@ -161,7 +161,7 @@ class GaussianFit:
             added: [A, 15] parameters. parents: [A] rows that these come from, whose gloss they inherit.
         """
         table, fresh = self.table, np.zeros_like(added)
-        gloss = None if table.gloss is None else table.gloss.taken(rows, parents)
+        gloss = None if table.gloss is None else table.gloss.select_rows(rows, parents)
         parameters, first, second = (
             np.concatenate([old[rows], new])
             for old, new in ((table.parameters, added), (table.first, fresh), (table.second, fresh))

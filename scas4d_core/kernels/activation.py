@@ -24,7 +24,7 @@ COLUMNS = 15
 SHORTEST = np.float32(QUATERNION_FLOOR)
 LARGEST = np.float32(EXPONENT) / LOG2_E
 
-ACTED = ("quaternion_floor", "exponent")
+COUNTED_GUARDS = ("quaternion_floor", "exponent")
 """Guards that ``activate`` counts."""
 
 
@@ -38,11 +38,11 @@ def activate(
     """Fills means [N, 3], factors [N, 3, 3], opacities [N], features [N, 4] (RGB, label) from parameters [N, 15].
 
     Returns:
-        [2] Gaussians for which each guard in ``ACTED`` acted.
+        [2] Gaussians for which each guard in ``COUNTED_GUARDS`` acted.
     """
-    acted = np.zeros((-(-len(parameters) // CHUNK), len(ACTED)), np.int64)
-    activate_rows(parameters, means, factors, opacities, features, acted)
-    total: NDArray[np.int64] = acted.sum(axis=0)
+    guard_counts = np.zeros((-(-len(parameters) // CHUNK), len(COUNTED_GUARDS)), np.int64)
+    activate_rows(parameters, means, factors, opacities, features, guard_counts)
+    total: NDArray[np.int64] = guard_counts.sum(axis=0)
     return total
 
 
@@ -60,8 +60,8 @@ def direction(p):
 
 
 @parallel_kernel
-def activate_rows(parameters, means, factors, opacities, features, acted):
-    """Runs ``activate`` in tasks; ``acted`` [tasks, 2] is filled."""
+def activate_rows(parameters, means, factors, opacities, features, guard_counts):
+    """Runs ``activate`` in tasks; ``guard_counts`` [tasks, 2] is filled."""
     count = parameters.shape[0]
     for task in prange((count + CHUNK - 1) // CHUNK):
         aimless = clamped = 0
@@ -81,8 +81,8 @@ def activate_rows(parameters, means, factors, opacities, features, acted):
                 features[i, column] = p[11 + column]
             opacities[i] = ONE / (ONE + exp(-p[10]))
             features[i, 3] = ONE / (ONE + exp(-p[14]))
-        acted[task, 0] = aimless
-        acted[task, 1] = clamped
+        guard_counts[task, 0] = aimless
+        guard_counts[task, 1] = clamped
 
 
 @parallel_kernel

@@ -20,7 +20,7 @@ EPSILON = np.float32(ADAM_EPSILON)
 SMALLEST = np.float32(MOMENT_FLOOR)
 LARGEST = np.float32(GRADIENT_CEILING)
 
-ACTED = ("gradient_ceiling", "moment_floor")
+COUNTED_GUARDS = ("gradient_ceiling", "moment_floor")
 """Guards that ``adam`` counts."""
 
 EVERY_ROW = np.ones(1, np.float32)
@@ -49,17 +49,17 @@ def adam(
         beta1, beta2: decays (float32). step: 1 for the first update.
 
     Returns:
-        [2] numbers of the gradient on which each guard in ``ACTED`` acted.
+        [2] numbers of the gradient on which each guard in ``COUNTED_GUARDS`` acted.
     """
-    acted = np.zeros((-(-len(parameters) // ROWS), len(ACTED)), np.int64)
-    adam_rows(parameters, gradients, first, second, rates, by_row, beta1, beta2, step, acted)
-    total: NDArray[np.int64] = acted.sum(axis=0)
+    guard_counts = np.zeros((-(-len(parameters) // ROWS), len(COUNTED_GUARDS)), np.int64)
+    adam_rows(parameters, gradients, first, second, rates, by_row, beta1, beta2, step, guard_counts)
+    total: NDArray[np.int64] = guard_counts.sum(axis=0)
     return total
 
 
 @kernel
-def guard_gradients(gradients, first, last, acted):
-    """Clamps the numbers from flat index ``first`` to before ``last``; adds to ``acted`` [2]."""
+def guard_gradients(gradients, first, last, guard_counts):
+    """Clamps the numbers from flat index ``first`` to before ``last``; adds to ``guard_counts`` [2]."""
     # A sum shows at once whether any number needs a guard: NaN and infinity stay in it.
     total, least = lanes.fill(ZERO), lanes.fill(ONE)
     for place in range(first, last, lanes.COUNT):
@@ -81,18 +81,18 @@ def guard_gradients(gradients, first, last, acted):
         lanes.store_first(gradients, place, last - place, taken)
         held += lanes.choose(fits, lanes.fill(ZERO), one)
         flushed += lanes.choose(tiny, one, lanes.fill(ZERO))
-    acted[0] += np.int64(lanes.sum_of(held))
-    acted[1] += np.int64(lanes.sum_of(flushed))
+    guard_counts[0] += np.int64(lanes.sum_of(held))
+    guard_counts[1] += np.int64(lanes.sum_of(flushed))
 
 
 @parallel_kernel
-def adam_rows(parameters, gradients, first, second, rates, by_row, beta1, beta2, step, acted):
-    """Runs ``adam`` in tasks; ``acted`` [tasks, 2] is added to."""
+def adam_rows(parameters, gradients, first, second, rates, by_row, beta1, beta2, step, guard_counts):
+    """Runs ``adam`` in tasks; ``guard_counts`` [tasks, 2] is added to."""
     rows, columns = parameters.shape
     correction1 = ONE - np.float32(beta1**step)
     correction2 = ONE - np.float32(beta2**step)
     for task in prange((rows + ROWS - 1) // ROWS):
-        guard_gradients(gradients, task * ROWS * columns, min(rows, (task + 1) * ROWS) * columns, acted[task])
+        guard_gradients(gradients, task * ROWS * columns, min(rows, (task + 1) * ROWS) * columns, guard_counts[task])
     for task in prange((rows + ROWS - 1) // ROWS):
         for i in range(task * ROWS, min(rows, (task + 1) * ROWS)):
             row = by_row[i] if by_row.shape[0] > 1 else by_row[0]

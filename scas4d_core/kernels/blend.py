@@ -39,7 +39,7 @@ def record_columns(channels: int) -> int:
 
 
 @inline
-def opened(cover):
+def without_lowest_block(cover):
     """A cover without its lowest block."""
     return cover & (cover - np.uint64(1))
 
@@ -48,8 +48,8 @@ def opened(cover):
 def fetch_ahead(entry, end, items, splats, features):
     """Prefetches the numbers of an entry further on."""
     i = items[min(entry + AHEAD, end - 1)]
-    lanes.fetch(splats, i)
-    lanes.fetch(features, i)
+    lanes.prefetch_row(splats, i)
+    lanes.prefetch_row(features, i)
 
 
 @kernel
@@ -82,7 +82,7 @@ def blend_task(
     background,
     limits,
     image,
-    rest,
+    transmittance,
 ):
     """Blends the tiles of one task of ``blend``."""
     cap, stop = limits[1], limits[2]
@@ -114,7 +114,7 @@ def blend_task(
             top_y = lanes.block_rows() + (np.float32(y_first) + HALF - splat[MEAN_Y])
             while left != np.uint64(0):
                 block = lanes.lowest_bit(left)
-                left = opened(left)
+                left = without_lowest_block(left)
                 dx = left_x + BLOCK_X[block]
                 dy = top_y + BLOCK_Y[block]
                 power = log_opacity - (a * dx * dx + (b * dx + c * dy) * dy)
@@ -165,14 +165,27 @@ def blend_task(
             for channel in range(channels):
                 at = place + lanes.COUNT * (1 + channel)
                 lanes.store(state, at, lanes.load(state, at) + light * background[channel])
-        copy_blocks(rest, y_first, x_first, state, base, step, False)
+        copy_blocks(transmittance, y_first, x_first, state, base, step, False)
         for channel in range(channels):
             copy_blocks(image[channel], y_first, x_first, state, base + lanes.COUNT * (1 + channel), step, False)
 
 
 @parallel_kernel
 def blend(
-    splats, features, groups, starts, items, covers, wanted, tile_order, tasks, size, background, limits, image, rest
+    splats,
+    features,
+    groups,
+    starts,
+    items,
+    covers,
+    wanted,
+    tile_order,
+    tasks,
+    size,
+    background,
+    limits,
+    image,
+    transmittance,
 ):
     """Blends tiles front to back.
 
@@ -184,7 +197,8 @@ def blend(
         wanted: [tiles] uint64, the blocks of each tile that are drawn; the others come out as the background.
         tile_order: int64, the tiles to blend, dealt to ``tasks`` in this order; others are left as they are.
         size: (width, height) in pixels. background: [C]. limits: [6], the fields of ``Limits``.
-        image: out [C, rows, stride] float32, padded to whole tiles. rest: out [rows, stride] transmittance left.
+        image: out [C, rows, stride] float32, padded to whole tiles. transmittance: out [rows, stride] transmittance
+            left.
     """
     for task in prange(tasks):
         blend_task(
@@ -202,7 +216,7 @@ def blend(
             background,
             limits,
             image,
-            rest,
+            transmittance,
         )
 
 
@@ -222,7 +236,7 @@ def blend_backward_task(
     size,
     limits,
     image,
-    rest,
+    transmittance,
     g_image,
     g_alpha,
     records,
@@ -243,7 +257,7 @@ def blend_backward_task(
         y_first = (tile // tiles_x) * TILE
         x_first = (tile % tiles_x) * TILE
         copy_blocks(g_alpha, y_first, x_first, state, base, step, True)
-        copy_blocks(rest, y_first, x_first, state, base + lanes.COUNT, step, True)
+        copy_blocks(transmittance, y_first, x_first, state, base + lanes.COUNT, step, True)
         for block in range(BLOCKS):
             at = base + block * step + lanes.COUNT
             lanes.store(state, at, ZERO - lanes.load(state, at) * lanes.load(state, at - lanes.COUNT))
@@ -263,7 +277,7 @@ def blend_backward_task(
             cover = covers[entry]
             left = cover
             fetch_ahead(entry, end, items, splats, features)
-            lanes.fetch(records, slots[min(entry + AHEAD, end - 1)])
+            lanes.prefetch_row(records, slots[min(entry + AHEAD, end - 1)])
             i = items[entry]
             splat = splats[i]
             a, b, c = splat[CONIC_A] * HALF_LOG2_E, splat[CONIC_B] * (TWO * HALF_LOG2_E), splat[CONIC_C] * HALF_LOG2_E
@@ -273,7 +287,7 @@ def blend_backward_task(
             if learnt[i] == 0:
                 while left != np.uint64(0):
                     block = lanes.lowest_bit(left)
-                    left = opened(left)
+                    left = without_lowest_block(left)
                     dx = left_x + BLOCK_X[block]
                     dy = top_y + BLOCK_Y[block]
                     power = log_opacity - (a * dx * dx + (b * dx + c * dy) * dy)
@@ -300,7 +314,7 @@ def blend_backward_task(
             t0 = t1 = t2 = t3 = s
             while left != np.uint64(0):
                 block = lanes.lowest_bit(left)
-                left = opened(left)
+                left = without_lowest_block(left)
                 dx = left_x + BLOCK_X[block]
                 dy = top_y + BLOCK_Y[block]
                 power = log_opacity - (a * dx * dx + (b * dx + c * dy) * dy)
@@ -353,7 +367,7 @@ def blend_backward_task(
                 left = cover
                 while left != np.uint64(0):
                     block = lanes.lowest_bit(left)
-                    left = opened(left)
+                    left = without_lowest_block(left)
                     g0 = lanes.load(state, base + block * step + lanes.COUNT * (2 + channel))
                     total += lanes.load(weights, block * lanes.COUNT) * g0
                 records[slots[entry], FEATURES + channel] = lanes.sum_of(total)
@@ -374,7 +388,7 @@ def blend_backward(
     size,
     limits,
     image,
-    rest,
+    transmittance,
     g_image,
     g_alpha,
     records,
@@ -406,7 +420,7 @@ def blend_backward(
             size,
             limits,
             image,
-            rest,
+            transmittance,
             g_image,
             g_alpha,
             records,

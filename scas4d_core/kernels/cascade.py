@@ -33,8 +33,8 @@ LEAST = np.float32(HALF_TURN)
 FEWEST = int(EMPTY_CLUSTER)
 LARGEST = np.float32(EXPONENT) / LOG2_E
 
-ACTED = ("exponent", "half_turn", "folded")
-"""Guards that ``carry`` counts."""
+COUNTED_GUARDS = ("exponent", "half_turn", "folded")
+"""Guards that ``apply_cluster_map`` counts."""
 
 
 @inline
@@ -97,7 +97,7 @@ def cluster_table(parameters, sums, first, last, count, table):
 
 
 @inline
-def scaled(table, about_origin, x, y, z):
+def scaling_terms(table, about_origin, x, y, z):
     """f, y and u of points, u being the vector that f scales, R y or R y + p + t; and −2z."""
     r0, r1, r2, r3, r4, r5, r6, r7, r8 = (
         table[0], table[1], table[2], table[3], table[4], table[5], table[6], table[7], table[8]
@@ -112,9 +112,9 @@ def scaled(table, about_origin, x, y, z):
 
 
 @inline
-def moved(table, about_origin, x, y, z):
+def move_through_layer(table, about_origin, x, y, z):
     """Points after a layer."""
-    f, yx, yy, yz, ux, uy, uz, _ = scaled(table, about_origin, x, y, z)
+    f, yx, yy, yz, ux, uy, uz, _ = scaling_terms(table, about_origin, x, y, z)
     more = f - ONE
     return (
         x + (table[16] + (yx * table[23] + yy * table[1] + yz * table[2]) + more * ux),
@@ -152,7 +152,7 @@ def polar(table, about_origin, f, yx, yy, yz):
 
 
 @kernel
-def carry(table, about_origin, separate, points, place, v, present, lane, acted):
+def apply_cluster_map(table, about_origin, separate, points, place, v, present, lane, guard_counts):
     """Factors and turns of a block through a layer, in place.
 
     Args:
@@ -160,12 +160,13 @@ def carry(table, about_origin, separate, points, place, v, present, lane, acted)
         points: x, y, z of the block from flat index ``place`` on, as they enter.
         v: [13, 16] factors 0–8 and turns 9–12.
         present: flat; from ``lane`` on, 0 for a Gaussian that is not counted, else 1.
-        acted: [3 or more] int64, added to: Gaussians for which each guard in ``ACTED`` acted; None: not counted.
+        guard_counts: [3 or more] int64, added to: Gaussians for which each guard in ``COUNTED_GUARDS`` acted; None:
+            not counted.
     """
     x, y, z = (
         lanes.load(points, place), lanes.load(points, place + lanes.COUNT), lanes.load(points, place + 2 * lanes.COUNT)
     )  # fmt: skip
-    f, yx, yy, yz, ux, uy, uz, exponent = scaled(table, about_origin, x, y, z)
+    f, yx, yy, yz, ux, uy, uz, exponent = scaling_terms(table, about_origin, x, y, z)
     slope = f * (TWO - f)
     if separate is None:  # known as the kernel is compiled
         for column in range(3):
@@ -188,24 +189,24 @@ def carry(table, about_origin, separate, points, place, v, present, lane, acted)
     lanes.store(v, 10 * lanes.COUNT, ox)
     lanes.store(v, 11 * lanes.COUNT, oy)
     lanes.store(v, 12 * lanes.COUNT, oz)
-    if acted is not None:  # known as the kernel is compiled
+    if guard_counts is not None:  # known as the kernel is compiled
         clamped = lanes.magnitude(exponent) > LARGEST
         # det J = f³ (1 + (2 − f) e·c), and the cosine is 1 more than its second factor. Half turns are among the folds.
         folded = a[11] <= ONE
         if lanes.any_of(clamped):
-            acted[0] += lanes.count_of(clamped & (lanes.load(present, lane) > ZERO))
+            guard_counts[0] += lanes.count_of(clamped & (lanes.load(present, lane) > ZERO))
         if lanes.any_of(folded):
             counts = lanes.load(present, lane) > ZERO
-            acted[1] += lanes.count_of((a[17] < LEAST) & counts)
-            acted[2] += lanes.count_of(folded & counts)
+            guard_counts[1] += lanes.count_of((a[17] < LEAST) & counts)
+            guard_counts[2] += lanes.count_of(folded & counts)
 
 
 @kernel
-def carry_backward(table, about_origin, separate, points, place, v, entering, g, records, record):
+def apply_cluster_map_backward(table, about_origin, separate, points, place, v, entering, g, records, record):
     """Backward of a layer for a block.
 
     Args:
-        table, about_origin, separate, points, place: as for ``carry``.
+        table, about_origin, separate, points, place: as for ``apply_cluster_map``.
         v: factors and turns as they enter, from flat index ``entering`` on.
         g: [16, 16] gradients, in place: point 0–2, factor 3–11, turn 12–15; of the layer's outputs, then of its inputs.
         records: out from flat index ``record`` on, the block's share of its cluster's gradient.
@@ -216,7 +217,7 @@ def carry_backward(table, about_origin, separate, points, place, v, entering, g,
     )  # fmt: skip
     cx, cy, cz = table[19], table[20], table[21]
     x, y, z = lanes.load(points, place), lanes.load(points, place + n), lanes.load(points, place + 2 * n)
-    f, yx, yy, yz, ux, uy, uz, _ = scaled(table, about_origin, x, y, z)
+    f, yx, yy, yz, ux, uy, uz, _ = scaling_terms(table, about_origin, x, y, z)
     slope = f * (TWO - f)
     gx, gy, gz = lanes.load(g, 0), lanes.load(g, n), lanes.load(g, 2 * n)
     g_f = gx * ux + gy * uy + gz * uz

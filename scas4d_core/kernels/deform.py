@@ -12,8 +12,14 @@ import numpy as np
 from numba import prange
 
 from scas4d_core.kernels import lanes
-from scas4d_core.kernels.cascade import carry, carry_backward, cluster_gradient, cluster_table, moved
-from scas4d_core.kernels.deltas import apply_own, apply_own_backward
+from scas4d_core.kernels.cascade import (
+    apply_cluster_map,
+    apply_cluster_map_backward,
+    cluster_gradient,
+    cluster_table,
+    move_through_layer,
+)
+from scas4d_core.kernels.deltas import apply_gaussian_deltas, apply_gaussian_deltas_backward
 from scas4d_core.kernels.jit import inline, kernel, parallel_kernel
 
 BLOCKS = 16
@@ -28,15 +34,15 @@ def prefetch(block, rows, one, two):
     """Prefetches the rows of a block's Gaussians in two arrays: they lie anywhere in memory."""
     block = min(block, rows.shape[0] - 1)
     for lane in range(lanes.COUNT):
-        lanes.fetch(one, rows[block, lane])
-        lanes.fetch(two, rows[block, lane])
+        lanes.prefetch_row(one, rows[block, lane])
+        lanes.prefetch_row(two, rows[block, lane])
 
 
 @kernel
 def move_points(block, table, about_origin, points, layer, out, place):
     """Moves the points of a block through a layer, from ``points[layer]`` to flat index ``place`` of ``out`` on."""
     first = (layer * points.shape[1] + block) * 3 * lanes.COUNT
-    x, y, z = moved(
+    x, y, z = move_through_layer(
         table, about_origin, lanes.load(points, first), lanes.load(points, first + lanes.COUNT),
         lanes.load(points, first + 2 * lanes.COUNT),
     )  # fmt: skip
@@ -62,7 +68,7 @@ def block_sums(points, present, sums):
 
 
 @parallel_kernel
-def settle(
+def freeze_layer(
     layer, parameters, offsets, ranges, clusters, present, entering, about_origin, separate, points, sums, tables
 ):  # fmt: skip
     """Moves what enters a layer through it, for as long as it rests: ``entering`` then enters the layer below.
@@ -78,7 +84,9 @@ def settle(
         for block in range(np.int64(task * BLOCKS), min(blocks, np.int64((task + 1) * BLOCKS))):
             table, place = tables[clusters[block, layer]], 3 * lanes.COUNT * block
             here, below = place + layer * 3 * lanes.COUNT * blocks, place + (layer + 1) * 3 * lanes.COUNT * blocks
-            carry(table, about_origin, separate, points, here, entering[block], present, block * lanes.COUNT, None)
+            apply_cluster_map(
+                table, about_origin, separate, points, here, entering[block], present, block * lanes.COUNT, None
+            )
             move_points(block, table, about_origin, points, layer, points, below)
             sum_block(block, points, layer + 1, present, sums)
 
@@ -93,7 +101,7 @@ def copy_row(rows, row, out, place):
 @parallel_kernel
 def deform(
     first, parameters, offsets, ranges, clusters, entries, rows, present, entering, deltas, about_origin, separate,
-    points, sums, tables, means, factors, state, acted,
+    points, sums, tables, means, factors, state, guard_counts,
 ):  # fmt: skip
     """Moves M of N Gaussians, in B blocks, through L layers of K clusters together.
 
@@ -111,7 +119,8 @@ def deform(
         points: [max(L, 1), B, 3, 16] as they enter each layer; of ``first`` given, of those below filled.
         sums: [max(L, 1), B, 3] of them; likewise. tables: out [K, 26].
         means [N, 3], factors [N, 3, 3]: out at ``rows``. state: [M, 16], out its means and turns, see ``deltas``.
-        acted: out [tasks of ``BLOCKS`` blocks, 3] int64, how often the guards in ``cascade.ACTED`` acted.
+        guard_counts: out [tasks of ``BLOCKS`` blocks, 3] int64, how often the guards in ``cascade.COUNTED_GUARDS``
+            acted.
     """
     blocks, layers = clusters.shape
     tasks = (blocks + BLOCKS - 1) // BLOCKS
@@ -125,8 +134,8 @@ def deform(
                     move_points(block, tables[clusters[block, layer]], about_origin, points, layer, points, place)
                     sum_block(block, points, layer + 1, present, sums)
     for task in prange(tasks):
-        for k in range(acted.shape[1]):
-            acted[task, k] = 0
+        for k in range(guard_counts.shape[1]):
+            guard_counts[task, k] = 0
         v = np.empty(CARRIED, np.float32)
         moved_points = np.empty(3 * lanes.COUNT, np.float32)
         for block in range(np.int64(task * BLOCKS), min(blocks, np.int64((task + 1) * BLOCKS))):
@@ -134,9 +143,9 @@ def deform(
             copy_row(entering, block, v, 0)
             for layer in range(first, layers):
                 place = (layer * blocks + block) * 3 * lanes.COUNT
-                carry(
+                apply_cluster_map(
                     tables[clusters[block, layer]], about_origin, separate, points, place, v, present,
-                    block * lanes.COUNT, acted[task],
+                    block * lanes.COUNT, guard_counts[task],
                 )  # fmt: skip
             if layers > 0:
                 move_points(
@@ -146,8 +155,18 @@ def deform(
             else:
                 for k in range(3):
                     lanes.store(moved_points, lanes.COUNT * k, lanes.load(points, (3 * block + k) * lanes.COUNT))
-            apply_own(
-                deltas, entries, rows, block * lanes.COUNT, present, v, moved_points, means, factors, state, acted[task]
+            apply_gaussian_deltas(
+                deltas,
+                entries,
+                rows,
+                block * lanes.COUNT,
+                present,
+                v,
+                moved_points,
+                means,
+                factors,
+                state,
+                guard_counts[task],
             )
 
 
@@ -177,11 +196,11 @@ def deform_backward(
                 leaving = v[(layer + 1) * CARRIED : (layer + 2) * CARRIED]
                 copy_row(v, layer, leaving, 0)
                 place = (layer * blocks + block) * 3 * lanes.COUNT
-                carry(
+                apply_cluster_map(
                     tables[clusters[block, layer]], about_origin, separate, points, place, leaving, present,
                     block * lanes.COUNT, None,
                 )  # fmt: skip
-            losses[block] = apply_own_backward(
+            losses[block] = apply_gaussian_deltas_backward(
                 deltas, entries, rows, block * lanes.COUNT, present, v, layers * CARRIED, scale_weight, bounds,
                 g_means, g_factors, g_tied, g, g_deltas,
             )  # fmt: skip
@@ -189,7 +208,7 @@ def deform_backward(
                 layer = layers - 1 - back
                 place = (layer * blocks + block) * 3 * lanes.COUNT
                 record = (block * layers + layer) * records.shape[2]
-                carry_backward(
+                apply_cluster_map_backward(
                     tables[clusters[block, layer]], about_origin, separate, points, place, v, layer * CARRIED, g,
                     records, record,
                 )  # fmt: skip

@@ -27,17 +27,17 @@ TIED = 8
 
 
 @inline
-def own_quaternion(deltas, entries, place):
+def gaussian_delta_rotation(deltas, entries, place):
     """The unit quaternion (1, Δr)/|(1, Δr)|."""
-    a = lanes.pick(deltas, entries, place, COLUMNS, 3)
-    b = lanes.pick(deltas, entries, place, COLUMNS, 4)
-    c = lanes.pick(deltas, entries, place, COLUMNS, 5)
+    a = lanes.gather_column(deltas, entries, place, COLUMNS, 3)
+    b = lanes.gather_column(deltas, entries, place, COLUMNS, 4)
+    c = lanes.gather_column(deltas, entries, place, COLUMNS, 5)
     w = lanes.fill(ONE) / lanes.square_root(a * a + b * b + c * c + ONE)
     return w, a * w, b * w, c * w
 
 
 @kernel
-def apply_own(deltas, entries, rows, place, present, v, points, means, factors, state, acted):
+def apply_gaussian_deltas(deltas, entries, rows, place, present, v, points, means, factors, state, guard_counts):
     """Writes sixteen moved Gaussians.
 
     Args:
@@ -46,43 +46,43 @@ def apply_own(deltas, entries, rows, place, present, v, points, means, factors, 
         present: flat; from ``place`` on, 0 for a Gaussian that is not counted, else 1.
         v: [13, 16] factors 0–8 and turns 9–12 from the cascade. points: [3, 16] likewise.
         means [N, 3], factors [N, 3, 3]: out at those rows. state: [M, 16], out mean and turn.
-        acted: [1 or more] int64, added to: for how many Gaussians the exponent of a stretch was clamped.
+        guard_counts: [1 or more] int64, added to: for how many Gaussians the exponent of a stretch was clamped.
     """
     n = lanes.COUNT
     for k in range(3):
-        mean = lanes.load(points, n * k) + lanes.pick(deltas, entries, place, COLUMNS, k)
-        lanes.put(means, rows, place, 3, k, mean)
-        lanes.put(state, entries, place, STATE, MEAN + k, mean)
-    w, x, y, z = own_quaternion(deltas, entries, place)
+        mean = lanes.load(points, n * k) + lanes.gather_column(deltas, entries, place, COLUMNS, k)
+        lanes.scatter_column(means, rows, place, 3, k, mean)
+        lanes.scatter_column(state, entries, place, STATE, MEAN + k, mean)
+    w, x, y, z = gaussian_delta_rotation(deltas, entries, place)
     r0, r1, r2, r3, r4, r5, r6, r7, r8 = rotation_entries(w, x, y, z)
     largest = lanes.fill(ZERO)
     for column in range(3):
-        exponent = lanes.pick(deltas, entries, place, COLUMNS, 6 + column)
+        exponent = lanes.gather_column(deltas, entries, place, COLUMNS, 6 + column)
         largest = lanes.maximum(largest, lanes.magnitude(exponent))
         stretch = lanes.exp(exponent)
         e0 = stretch * lanes.load(v, n * column)
         e1 = stretch * lanes.load(v, n * (3 + column))
         e2 = stretch * lanes.load(v, n * (6 + column))
-        lanes.put(factors, rows, place, 9, column, r0 * e0 + r1 * e1 + r2 * e2)
-        lanes.put(factors, rows, place, 9, 3 + column, r3 * e0 + r4 * e1 + r5 * e2)
-        lanes.put(factors, rows, place, 9, 6 + column, r6 * e0 + r7 * e1 + r8 * e2)
+        lanes.scatter_column(factors, rows, place, 9, column, r0 * e0 + r1 * e1 + r2 * e2)
+        lanes.scatter_column(factors, rows, place, 9, 3 + column, r3 * e0 + r4 * e1 + r5 * e2)
+        lanes.scatter_column(factors, rows, place, 9, 6 + column, r6 * e0 + r7 * e1 + r8 * e2)
     if lanes.any_of(largest > LARGEST):
-        acted[0] += lanes.count_of((largest > LARGEST) & (lanes.load(present, place) > ZERO))
+        guard_counts[0] += lanes.count_of((largest > LARGEST) & (lanes.load(present, place) > ZERO))
     qw, qx, qy, qz = product(
         w, x, y, z, lanes.load(v, 9 * n), lanes.load(v, 10 * n), lanes.load(v, 11 * n), lanes.load(v, 12 * n)
     )
     sign = lanes.choose(qw >= ZERO, lanes.fill(ONE), lanes.fill(-ONE))
-    lanes.put(state, entries, place, STATE, TURN + 0, sign * qw)
-    lanes.put(state, entries, place, STATE, TURN + 1, sign * qx)
-    lanes.put(state, entries, place, STATE, TURN + 2, sign * qy)
-    lanes.put(state, entries, place, STATE, TURN + 3, sign * qz)
+    lanes.scatter_column(state, entries, place, STATE, TURN + 0, sign * qw)
+    lanes.scatter_column(state, entries, place, STATE, TURN + 1, sign * qx)
+    lanes.scatter_column(state, entries, place, STATE, TURN + 2, sign * qy)
+    lanes.scatter_column(state, entries, place, STATE, TURN + 3, sign * qz)
 
 
 @kernel
-def apply_own_backward(
+def apply_gaussian_deltas_backward(
     deltas, entries, rows, place, present, v, leaving, scale_weight, bounds, g_means, g_factors, g_tied, g, g_deltas
 ):
-    """Backward of ``apply_own``, with the gradient of the scale loss added.
+    """Backward of ``apply_gaussian_deltas``, with the gradient of the scale loss added.
 
     Args:
         present: flat; from ``place`` on, 1 for each of the sixteen Gaussians, 0 for one that is repeated.
@@ -99,22 +99,22 @@ def apply_own_backward(
     nothing = lanes.fill(ZERO)
     counts = lanes.load(present, place) > ZERO
     for k in range(3):
-        pull = lanes.pick(g_means, rows, place, 3, k) + lanes.pick(g_tied, entries, place, TIED, k)
-        lanes.put(g_deltas, entries, place, COLUMNS, k, pull)
+        pull = lanes.gather_column(g_means, rows, place, 3, k) + lanes.gather_column(g_tied, entries, place, TIED, k)
+        lanes.scatter_column(g_deltas, entries, place, COLUMNS, k, pull)
         lanes.store(g, n * k, lanes.choose(counts, pull, nothing))
-    w, x, y, z = own_quaternion(deltas, entries, place)
+    w, x, y, z = gaussian_delta_rotation(deltas, entries, place)
     r0, r1, r2, r3, r4, r5, r6, r7, r8 = rotation_entries(w, x, y, z)
     g0 = g1 = g2 = g3 = g4 = g5 = g6 = g7 = g8 = nothing
     excess = nothing
     for column in range(3):
-        exponent = lanes.pick(deltas, entries, place, COLUMNS, 6 + column)
+        exponent = lanes.gather_column(deltas, entries, place, COLUMNS, 6 + column)
         stretch = lanes.exp(exponent)
         e0 = stretch * lanes.load(v, leaving + n * column)
         e1 = stretch * lanes.load(v, leaving + n * (3 + column))
         e2 = stretch * lanes.load(v, leaving + n * (6 + column))
-        h0 = lanes.pick(g_factors, rows, place, 9, column)
-        h1 = lanes.pick(g_factors, rows, place, 9, 3 + column)
-        h2 = lanes.pick(g_factors, rows, place, 9, 6 + column)
+        h0 = lanes.gather_column(g_factors, rows, place, 9, column)
+        h1 = lanes.gather_column(g_factors, rows, place, 9, 3 + column)
+        h2 = lanes.gather_column(g_factors, rows, place, 9, 6 + column)
         g0 += h0 * e0
         g1 += h0 * e1
         g2 += h0 * e2
@@ -126,7 +126,7 @@ def apply_own_backward(
         g8 += h2 * e2
         # Scale loss on the length of the axis, which ΔR does not change.
         length = lanes.square_root(e0 * e0 + e1 * e1 + e2 * e2)
-        bound = lanes.pick(bounds, entries, place, 3, column)
+        bound = lanes.gather_column(bounds, entries, place, 3, column)
         over = length - bound
         pull = lanes.choose(over > ZERO, scale_weight / lanes.maximum(bound, length), nothing)
         excess += lanes.maximum(nothing, over)
@@ -135,7 +135,7 @@ def apply_own_backward(
         p2 = r2 * h0 + r5 * h1 + r8 * h2 + pull * e2
         g_exponent = p0 * e0 + p1 * e1 + p2 * e2
         free = lanes.magnitude(exponent) <= LARGEST
-        lanes.put(g_deltas, entries, place, COLUMNS, 6 + column, lanes.choose(free, g_exponent, nothing))
+        lanes.scatter_column(g_deltas, entries, place, COLUMNS, 6 + column, lanes.choose(free, g_exponent, nothing))
         lanes.store(g, n * (3 + column), lanes.choose(counts, stretch * p0, nothing))
         lanes.store(g, n * (6 + column), lanes.choose(counts, stretch * p1, nothing))
         lanes.store(g, n * (9 + column), lanes.choose(counts, stretch * p2, nothing))
@@ -145,10 +145,10 @@ def apply_own_backward(
     )  # fmt: skip
     qw, _, _, _ = product(w, x, y, z, bw, bx, by, bz)
     sign = lanes.choose(qw >= ZERO, lanes.fill(ONE), lanes.fill(-ONE))
-    tw = sign * lanes.pick(g_tied, entries, place, TIED, 3)
-    tx = sign * lanes.pick(g_tied, entries, place, TIED, 4)
-    ty = sign * lanes.pick(g_tied, entries, place, TIED, 5)
-    tz = sign * lanes.pick(g_tied, entries, place, TIED, 6)
+    tw = sign * lanes.gather_column(g_tied, entries, place, TIED, 3)
+    tx = sign * lanes.gather_column(g_tied, entries, place, TIED, 4)
+    ty = sign * lanes.gather_column(g_tied, entries, place, TIED, 5)
+    tz = sign * lanes.gather_column(g_tied, entries, place, TIED, 6)
     ow, ox, oy, oz = product(w, -x, -y, -z, tw, tx, ty, tz)
     lanes.store(g, 12 * n, lanes.choose(counts, ow, nothing))
     lanes.store(g, 13 * n, lanes.choose(counts, ox, nothing))
@@ -161,7 +161,7 @@ def apply_own_backward(
     gy += hy
     gz += hz
     along = w * gw + x * gx + y * gy + z * gz
-    lanes.put(g_deltas, entries, place, COLUMNS, 3, (gx - x * along) * w)
-    lanes.put(g_deltas, entries, place, COLUMNS, 4, (gy - y * along) * w)
-    lanes.put(g_deltas, entries, place, COLUMNS, 5, (gz - z * along) * w)
+    lanes.scatter_column(g_deltas, entries, place, COLUMNS, 3, (gx - x * along) * w)
+    lanes.scatter_column(g_deltas, entries, place, COLUMNS, 4, (gy - y * along) * w)
+    lanes.scatter_column(g_deltas, entries, place, COLUMNS, 5, (gz - z * along) * w)
     return lanes.sum_of(lanes.choose(counts, excess, nothing))

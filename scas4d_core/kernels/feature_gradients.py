@@ -22,7 +22,7 @@ from scas4d_core.kernels.blend import (
     GROUP,
     HALF_LOG2_E,
     copy_blocks,
-    opened,
+    without_lowest_block,
 )
 from scas4d_core.kernels.jit import HALF, ONE, TWO, ZERO, kernel, parallel_kernel
 from scas4d_core.kernels.projection import (
@@ -63,7 +63,7 @@ def blend_features_task(
             end -= 1
         for entry in range(starts[tile], end):
             left = covers[entry]
-            lanes.fetch(splats, items[min(entry + AHEAD, end - 1)])
+            lanes.prefetch_row(splats, items[min(entry + AHEAD, end - 1)])
             i = items[entry]
             splat = splats[i]
             a, b, c = splat[CONIC_A] * HALF_LOG2_E, splat[CONIC_B] * (TWO * HALF_LOG2_E), splat[CONIC_C] * HALF_LOG2_E
@@ -73,7 +73,7 @@ def blend_features_task(
             t0 = t1 = t2 = t3 = lanes.fill(ZERO)
             while left != np.uint64(0):
                 block = lanes.lowest_bit(left)
-                left = opened(left)
+                left = without_lowest_block(left)
                 dx = left_x + BLOCK_X[block]
                 dy = top_y + BLOCK_Y[block]
                 power = log_opacity - (a * dx * dx + (b * dx + c * dy) * dy)
@@ -113,17 +113,17 @@ def blend_features(splats, starts, items, slots, covers, learnt, tile_order, tas
 
 
 @parallel_kernel
-def sum_features(counts, firsts, records, g_features, acted):
+def sum_features(counts, firsts, records, g_features, guard_counts):
     """Sums each Gaussian's pairs, in the order of ``projection.project_backward``.
 
     Args:
         counts, firsts: [N], how many pairs each Gaussian has, and the first. records: of ``blend_features``.
         g_features: out [N, 4], 0 where there is no pair, and where the sums overflow.
-        acted: out [tasks of ``CHUNK``, 1] int64, for how many Gaussians they did.
+        guard_counts: out [tasks of ``CHUNK``, 1] int64, for how many Gaussians they did.
     """
     count = g_features.shape[0]
     for task in prange((count + CHUNK - 1) // CHUNK):
-        acted[task] = 0
+        guard_counts[task] = 0
         for i in range(task * CHUNK, min(count, (task + 1) * CHUNK)):
             total = lanes.fill(ZERO)
             for pair in range(firsts[i], firsts[i] + counts[i]):
@@ -131,4 +131,4 @@ def sum_features(counts, firsts, records, g_features, acted):
             lanes.store_first(g_features, GROUP * i, GROUP, total)
             if not lanes.sum_of(lanes.magnitude(total)) <= STEEPEST:
                 g_features[i] = ZERO
-                acted[task, 0] += 1
+                guard_counts[task, 0] += 1

@@ -79,7 +79,7 @@ def stride(width: int) -> int:
 
 
 @inline
-def along(row, place):
+def filter_along_row(row, place):
     """Sixteen numbers of a row filtered along itself, from flat index ``place`` on."""
     return (
         T0 * (lanes.load(row, place - 5) + lanes.load(row, place + 5))
@@ -92,7 +92,7 @@ def along(row, place):
 
 
 @inline
-def across(scratch, place, pitch):
+def filter_across_rows(scratch, place, pitch):
     """Sixteen numbers filtered across the eleven rows from flat index ``place`` on, ``pitch`` apart."""
     return (
         T0 * (lanes.load(scratch, place) + lanes.load(scratch, place + 10 * pitch))
@@ -105,13 +105,13 @@ def across(scratch, place, pitch):
 
 
 @inline
-def exposed(value, gain, offset):
+def apply_exposure(value, gain, offset):
     """The value that a camera records: gain times the rendered value, plus offset."""
     return gain * value + offset
 
 
 @inline
-def asked(what, wanted, y, x):
+def is_needed(what, wanted, y, x):
     """True where something is computed of the sixteen columns from x on."""
     return (wanted[0, 0] if wanted.shape[0] == 1 else wanted[y, x // lanes.COUNT]) & what != 0
 
@@ -131,8 +131,8 @@ def filter_rows(rows, quantities, scratch, kind, channel, y, span, cleared, what
         for x in range(cleared[0], min(span[0], cleared[1]), lanes.COUNT):
             lanes.store(scratch, place + x, lanes.fill(ZERO))
         for x in range(span[0], span[1], lanes.COUNT):
-            if asked(what, wanted, y, x):
-                lanes.store(scratch, place + x, along(rows, k * (pitch + 2 * PAD) + PAD + x))
+            if is_needed(what, wanted, y, x):
+                lanes.store(scratch, place + x, filter_along_row(rows, k * (pitch + 2 * PAD) + PAD + x))
         for x in range(max(span[1], cleared[0]), cleared[1], lanes.COUNT):
             lanes.store(scratch, place + x, lanes.fill(ZERO))
 
@@ -155,7 +155,7 @@ def span_of(image, gain, offset, target, channel, y, pitch, spans):
     here, there = start_of(image, channel, y), start_of(target, channel, y)
     first, last = pitch, 0
     for x in range(0, width, lanes.COUNT):
-        value = exposed(lanes.load_first(image, here + x, width - x), gain, offset)
+        value = apply_exposure(lanes.load_first(image, here + x, width - x), gain, offset)
         truth = lanes.load_first(target, there + x, width - x)
         if lanes.any_of(value != ZERO) or lanes.any_of(truth != ZERO):
             first, last = min(first, x), min(x + lanes.COUNT, width)
@@ -171,7 +171,7 @@ def span_of(image, gain, offset, target, channel, y, pitch, spans):
 
 
 @inline
-def hull(spans, which, y, reach):
+def union_of_spans(spans, which, y, reach):
     """Smallest range of columns that holds the spans of the rows around row y."""
     first, last = spans[y, which], spans[y, which + 1]
     for other in range(max(0, y - reach), min(spans.shape[0], y + reach + 1)):
@@ -204,7 +204,7 @@ def target_moments(target, scratch, means, squares):
         for k in range(2):
             place = ((k * channels + channel) * (height + 2 * REACH) + y) * pitch
             for x in range(0, pitch, lanes.COUNT):
-                lanes.store(row, k * pitch + x, across(scratch, place + x, pitch))
+                lanes.store(row, k * pitch + x, filter_across_rows(scratch, place + x, pitch))
         for x in range(width):
             means[channel, y, x] = row[0, x]
             squares[channel, y, x] = row[1, x]
@@ -219,11 +219,11 @@ def windows_of_row(image, exposure, target, scratch, spans, rows, channel, y, wa
     clear(rows)
     first, last = spans[channel, y, 0], spans[channel, y, 1]
     for x in range(first, last, lanes.COUNT):
-        value = lanes.only_first(exposed(lanes.load_first(image, here + x, width - x), gain, offset), width - x)
+        value = lanes.only_first(apply_exposure(lanes.load_first(image, here + x, width - x), gain, offset), width - x)
         lanes.store(rows, PAD + x, value)
         lanes.store(rows, pitch + 3 * PAD + x, value * value)
         lanes.store(rows, 2 * pitch + 5 * PAD + x, value * lanes.load_first(target, there + x, width - x))
-    cleared = hull(spans[channel], 0, y, 2 * REACH)
+    cleared = union_of_spans(spans[channel], 0, y, 2 * REACH)
     filter_rows(rows, 3, scratch, 0, channel, y, (first, last), cleared, WINDOWS, wanted)
 
 
@@ -243,18 +243,18 @@ def loss_of_row(
     channels, height, width = target.shape
     pitch = scratch.shape[3]
     gain, offset = exposure[channel, 0], exposure[channel, 1]
-    first, last = hull(spans[channel], 0, y, REACH)
+    first, last = union_of_spans(spans[channel], 0, y, REACH)
     here, there = start_of(image, channel, y), start_of(target, channel, y)
     clear(rows)
     loss = squared = lanes.fill(ZERO)
     place = (channel * (height + 2 * REACH) + y) * pitch
     kind = channels * (height + 2 * REACH) * pitch
     for x in range(first, last, lanes.COUNT):
-        if not asked(LOSS, wanted, y, x):
+        if not is_needed(LOSS, wanted, y, x):
             continue
-        m1 = across(scratch, place + x, pitch)
-        square = across(scratch, place + kind + x, pitch)
-        cross = across(scratch, place + 2 * kind + x, pitch)
+        m1 = filter_across_rows(scratch, place + x, pitch)
+        square = filter_across_rows(scratch, place + kind + x, pitch)
+        cross = filter_across_rows(scratch, place + 2 * kind + x, pitch)
         m2 = lanes.load_first(target_means, there + x, width - x)
         a1 = TWO * m1 * m2 + C1
         a2 = TWO * (cross - m1 * m2) + C2
@@ -262,20 +262,20 @@ def loss_of_row(
         b2 = square - m1 * m1 + lanes.load_first(target_squares, there + x, width - x) - m2 * m2 + C2
         inverse = lanes.fill(ONE) / (b1 * b2)
         ssim = a1 * a2 * inverse
-        if asked(SPREAD, wanted, y, x):
+        if is_needed(SPREAD, wanted, y, x):
             by_cross = TWO * a1 * inverse
             by_square = -ssim * b1 * inverse
             by_mean = TWO * (m2 * a2 * inverse - ssim * m1 * b2 * inverse - m1 * by_square) - m2 * by_cross
             lanes.store(rows, PAD + x, lanes.only_first(by_mean, width - x))
             lanes.store(rows, pitch + 3 * PAD + x, lanes.only_first(by_square, width - x))
             lanes.store(rows, 2 * pitch + 5 * PAD + x, lanes.only_first(by_cross, width - x))
-        difference = exposed(lanes.load_first(image, here + x, width - x), gain, offset)
+        difference = apply_exposure(lanes.load_first(image, here + x, width - x), gain, offset)
         difference = lanes.only_first(difference - lanes.load_first(target, there + x, width - x), width - x)
         squared += difference * difference
         loss += L1_SHARE * lanes.magnitude(difference) + SSIM_SHARE * lanes.only_first(ONE - ssim, width - x)
     losses[channel, y, 0] = lanes.sum_of(loss) * (weights[channel] / np.float32(pixels))
     losses[channel, y, 1] = lanes.sum_of(squared)
-    filtered, cleared = hull(spans[channel], 2, y, REACH), hull(spans[channel], 2, y, 3 * REACH)
+    filtered, cleared = union_of_spans(spans[channel], 2, y, REACH), union_of_spans(spans[channel], 2, y, 3 * REACH)
     filter_rows(rows, 3, scratch, 3, channel, y, filtered, cleared, SPREAD, wanted)
 
 
@@ -286,23 +286,23 @@ def gradient_of_row(image, exposure, target, weights, pixels, scratch, spans, g_
     pitch = scratch.shape[3]
     share = weights[channel] / np.float32(pixels)
     gain, offset = exposure[channel, 0], exposure[channel, 1]
-    first, last = hull(spans[channel], 2, y, 2 * REACH)
+    first, last = union_of_spans(spans[channel], 2, y, 2 * REACH)
     here, there, out = start_of(image, channel, y), start_of(target, channel, y), start_of(g_image, channel, y)
     kind = channels * (height + 2 * REACH) * pitch
     place = 3 * kind + (channel * (height + 2 * REACH) + y) * pitch
     nothing = lanes.fill(ZERO)
     g_gain = g_offset = nothing
     for x in range(0, min(first, width), lanes.COUNT):
-        if asked(GRADIENT, wanted, y, x):
+        if is_needed(GRADIENT, wanted, y, x):
             lanes.store_first(g_image, out + x, width - x, nothing)
     for x in range(first, last, lanes.COUNT):
-        if not asked(GRADIENT, wanted, y, x):
+        if not is_needed(GRADIENT, wanted, y, x):
             continue
-        by_mean = across(scratch, place + x, pitch)
-        by_square = across(scratch, place + kind + x, pitch)
-        by_cross = across(scratch, place + 2 * kind + x, pitch)
+        by_mean = filter_across_rows(scratch, place + x, pitch)
+        by_square = filter_across_rows(scratch, place + kind + x, pitch)
+        by_cross = filter_across_rows(scratch, place + 2 * kind + x, pitch)
         rendered = lanes.load_first(image, here + x, width - x)
-        value = exposed(rendered, gain, offset)
+        value = apply_exposure(rendered, gain, offset)
         truth = lanes.load_first(target, there + x, width - x)
         sign = lanes.choose(value > truth, lanes.fill(ONE), lanes.choose(value < truth, lanes.fill(-ONE), nothing))
         g = L1_SHARE * sign - SSIM_SHARE * (by_mean + TWO * value * by_square + truth * by_cross)
@@ -311,7 +311,7 @@ def gradient_of_row(image, exposure, target, weights, pixels, scratch, spans, g_
         g_offset += g
         lanes.store_first(g_image, out + x, width - x, g * gain)
     for x in range(max(min(first, width), last), width, lanes.COUNT):
-        if asked(GRADIENT, wanted, y, x):
+        if is_needed(GRADIENT, wanted, y, x):
             lanes.store_first(g_image, out + x, width - x, nothing)
     g_exposure[channel, y, 0] = lanes.sum_of(g_gain)
     g_exposure[channel, y, 1] = lanes.sum_of(g_offset)

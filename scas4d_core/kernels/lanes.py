@@ -366,7 +366,7 @@ def _places_of_rows(context: Any, builder: Any, types_of: Any, values: Any) -> l
 
 
 @emitted
-def pick(typing_context: Any, array: Any, rows: Any, place: Any, columns: Any, column: Any) -> Any:
+def gather_column(typing_context: Any, array: Any, rows: Any, place: Any, columns: Any, column: Any) -> Any:
     """A column of sixteen rows of a float32 array [n, columns]: those that ``rows`` (int64) names from ``place`` on."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -379,8 +379,12 @@ def pick(typing_context: Any, array: Any, rows: Any, place: Any, columns: Any, c
 
 
 @emitted
-def put(typing_context: Any, array: Any, rows: Any, place: Any, columns: Any, column: Any, value: Any) -> Any:
-    """Writes the lanes to a column of the rows that ``pick`` would read; of rows named twice, the last lane stays."""
+def scatter_column(
+    typing_context: Any, array: Any, rows: Any, place: Any, columns: Any, column: Any, value: Any
+) -> Any:
+    """Writes the lanes to a column of the rows that ``gather_column`` would read; of rows named twice, the last lane
+    stays.
+    """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         for lane, place in enumerate(_places_of_rows(context, builder, signature.args[:2], arguments[:5])):
@@ -391,7 +395,7 @@ def put(typing_context: Any, array: Any, rows: Any, place: Any, columns: Any, co
 
 
 @emitted
-def rows_at(typing_context: Any, array: Any, rows: Any, place: Any) -> Any:
+def gather_rows(typing_context: Any, array: Any, rows: Any, place: Any) -> Any:
     """Sixteen rows of a float32 array [n, 16], those that ``rows`` (int64) names from ``place`` on."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -442,7 +446,7 @@ def add_halves(typing_context: Any, array: Any, rows: Any, place: Any, columns: 
 
 
 @emitted
-def fetch(typing_context: Any, array: Any, row: Any) -> Any:
+def prefetch_row(typing_context: Any, array: Any, row: Any) -> Any:
     """Prefetches a row of a two-dimensional float32 array into the first-level cache; any row, inside or not."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

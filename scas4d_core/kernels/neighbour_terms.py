@@ -28,7 +28,7 @@ CHUNK = 4096
 @kernel
 def state_of(state, who):
     """Columns of the state of sixteen Gaussians."""
-    return lanes.transposed(lanes.rows_at(state, who, 0))
+    return lanes.transposed(lanes.gather_rows(state, who, 0))
 
 
 @kernel
@@ -55,7 +55,7 @@ def pairs_task(state, sample, neighbours, weights, distances, rigid, isometric, 
             for lane in range(lanes.COUNT):
                 other[lane] = neighbours[who[lane], k]
             there = state_of(state, other)
-            weight = lanes.load(present, 0) * lanes.pick(weights, who, 0, count, k)
+            weight = lanes.load(present, 0) * lanes.gather_column(weights, who, 0, count, k)
             counts = weight > ZERO
             ox, oy, oz = there[0] - mx, there[1] - my, there[2] - mz
             # Rigidity: the neighbour's offset, turned back, equals that of frame t−1.
@@ -80,7 +80,7 @@ def pairs_task(state, sample, neighbours, weights, distances, rigid, isometric, 
             g8 += oz * ez
             # Isometry: the distance equals that of frame 0.
             distance = lanes.square_root(ox * ox + oy * oy + oz * oz + UNDER_ROOT)
-            stretch = distance - lanes.pick(distances, who, 0, count, k)
+            stretch = distance - lanes.gather_column(distances, who, 0, count, k)
             length = lanes.square_root(weight * stretch * stretch + UNDER_ROOT)
             isometry += lanes.choose(counts, length, nothing)
             pull = isometric * weight * stretch / (length * distance)

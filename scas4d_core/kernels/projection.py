@@ -32,9 +32,9 @@ BRIGHTEST = np.float32(FEATURE_CEILING)
 WIDEST = np.float32(FOOTPRINT_CEILING)
 STEEPEST = np.float32(GRADIENT_NOT_FINITE)
 
-ACTED = ("not_finite", "footprint_ceiling")
+COUNTED_GUARDS = ("not_finite", "footprint_ceiling")
 """Guards that ``project`` counts."""
-ACTED_BACKWARD = ("gradient_not_finite",)
+COUNTED_GUARDS_BACKWARD = ("gradient_not_finite",)
 """Guards that ``project_backward`` counts."""
 
 # Columns of ``splats`` [N, 16], a Gaussian as later kernels read it. REACH is the support's squared Mahalanobis
@@ -60,7 +60,7 @@ def tangents(u, v, lens, margin):
 
 
 @inline
-def turned(pose, row, x, y, z):
+def rotate_coordinate(pose, row, x, y, z):
     """One coordinate of vectors turned into the camera's axes."""
     return x * pose[row, 0] + y * pose[row, 1] + z * pose[row, 2]
 
@@ -81,12 +81,12 @@ def sound_features(features, first):
 
 
 @kernel
-def project_group(first, means, factors, opacities, features, pose, lens, limits, splats, place, boxes, acted):
+def project_group(first, means, factors, opacities, features, pose, lens, limits, splats, place, boxes, guard_counts):
     """Projects sixteen Gaussians from row ``first`` on; see ``project``.
 
     Args:
         splats: out, from row ``place`` on. boxes: out [5 · 16]: tiles x0, y0, x1, y1 of each, and how many.
-        acted: [2], added to.
+        guard_counts: [2], added to.
     """
     alpha_floor, low_pass, near, margin = limits[0], limits[3], limits[4], limits[5]
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
@@ -96,9 +96,9 @@ def project_group(first, means, factors, opacities, features, pose, lens, limits
     zero = lanes.fill(ZERO)
     px, py = lanes.gather(means, 3 * first, 3), lanes.gather(means, 3 * first + 1, 3)
     pz = lanes.gather(means, 3 * first + 2, 3)
-    x = turned(pose, 0, px, py, pz) + pose[0, 3]
-    y = turned(pose, 1, px, py, pz) + pose[1, 3]
-    z = turned(pose, 2, px, py, pz) + pose[2, 3]
+    x = rotate_coordinate(pose, 0, px, py, pz) + pose[0, 3]
+    y = rotate_coordinate(pose, 1, px, py, pz) + pose[1, 3]
+    z = rotate_coordinate(pose, 2, px, py, pz) + pose[2, 3]
     inverse = lanes.fill(ONE) / z
     opacity = lanes.load(opacities, first)
     size = lanes.magnitude(px) + lanes.magnitude(py) + lanes.magnitude(pz) + lanes.magnitude(opacity)
@@ -111,9 +111,9 @@ def project_group(first, means, factors, opacities, features, pose, lens, limits
         f1 = lanes.gather(factors, 9 * first + 3 + k, 9)
         f2 = lanes.gather(factors, 9 * first + 6 + k, 9)
         size = size + (lanes.magnitude(f0) + lanes.magnitude(f1) + lanes.magnitude(f2))
-        a2 = turned(pose, 2, f0, f1, f2)
-        m0 = fx * inverse * (turned(pose, 0, f0, f1, f2) - u * a2)
-        m1 = fy * inverse * (turned(pose, 1, f0, f1, f2) - v * a2)
+        a2 = rotate_coordinate(pose, 2, f0, f1, f2)
+        m0 = fx * inverse * (rotate_coordinate(pose, 0, f0, f1, f2) - u * a2)
+        m1 = fy * inverse * (rotate_coordinate(pose, 1, f0, f1, f2) - v * a2)
         sxx = sxx + m0 * m0
         sxy = sxy + m0 * m1
         syy = syy + m1 * m1
@@ -126,12 +126,12 @@ def project_group(first, means, factors, opacities, features, pose, lens, limits
     determinant = n0 * n0 + n1 * n1 + n2 * n2 + low_pass * (sxx + syy - low_pass)
     sound = lanes.choose(size <= FARTHEST, sound_features(features, first), zero)
     if lanes.any_of(sound <= ZERO):
-        acted[0] += lanes.count_of(sound <= ZERO)
+        guard_counts[0] += lanes.count_of(sound <= ZERO)
     visible = (z >= near) & (opacity >= alpha_floor) & (sound > ZERO)
     drawable = (determinant > ZERO) & (determinant < WIDEST)
     lost = lanes.choose(drawable, zero, lanes.choose(visible, lanes.fill(ONE), zero))
     if lanes.any_of(lost > ZERO):
-        acted[1] += lanes.count_of(lost > ZERO)
+        guard_counts[1] += lanes.count_of(lost > ZERO)
     visible = visible & drawable
     mx = fx * x * inverse + cx
     my = fy * y * inverse + cy
@@ -199,11 +199,11 @@ def padded_3(rows, first):
 
 @kernel
 def project_task(
-    task, means, factors, opacities, features, pose, lens, limits, splats, rects, counts, acted
+    task, means, factors, opacities, features, pose, lens, limits, splats, rects, counts, guard_counts
 ):  # fmt: skip
     """Projects the Gaussians of one task of ``project``."""
     count = means.shape[0]
-    acted[task, 0] = acted[task, 1] = 0
+    guard_counts[task, 0] = guard_counts[task, 1] = 0
     boxes = np.empty(5 * lanes.COUNT, np.float32)
     for first in range(task * CHUNK, min(count, (task + 1) * CHUNK), lanes.COUNT):
         some = min(lanes.COUNT, count - first)
@@ -212,7 +212,7 @@ def project_task(
             place = 0
             m, f = padded_2(means, first), padded_3(factors, first)
             o, c = padded_1(opacities, first), padded_2(features, first)
-        project_group(place, m, f, o, c, pose, lens, limits, splats, first, boxes, acted[task])
+        project_group(place, m, f, o, c, pose, lens, limits, splats, first, boxes, guard_counts[task])
         for k in range(some):
             for side in range(4):
                 rects[first + k, side] = np.int32(boxes[side * lanes.COUNT + k])
@@ -220,7 +220,7 @@ def project_task(
 
 
 @parallel_kernel
-def project(means, factors, opacities, features, pose, lens, limits, splats, rects, counts, acted):
+def project(means, factors, opacities, features, pose, lens, limits, splats, rects, counts, guard_counts):
     """Projects N Gaussians, sixteen at a time.
 
     Args:
@@ -230,11 +230,11 @@ def project(means, factors, opacities, features, pose, lens, limits, splats, rec
         splats: out [N + 15 or more, 16] float32, columns above.
         rects: out [N, 4] int32, tiles x0, y0, x1, y1 (exclusive) of the support's box; empty where culled.
         counts: out [N] int32, tiles in the box.
-        acted: out [tasks of ``CHUNK``, 2] int64, for how many Gaussians the guards in ``ACTED`` acted.
+        guard_counts: out [tasks of ``CHUNK``, 2] int64, for how many Gaussians the guards in ``COUNTED_GUARDS`` acted.
     """
     for task in prange((means.shape[0] + CHUNK - 1) // CHUNK):
         project_task(
-            np.int64(task), means, factors, opacities, features, pose, lens, limits, splats, rects, counts, acted
+            np.int64(task), means, factors, opacities, features, pose, lens, limits, splats, rects, counts, guard_counts
         )
 
 
@@ -259,9 +259,9 @@ def project_backward_group(
     zero = lanes.fill(ZERO)
     px, py = lanes.gather(means, 3 * first, 3), lanes.gather(means, 3 * first + 1, 3)
     pz = lanes.gather(means, 3 * first + 2, 3)
-    x = turned(pose, 0, px, py, pz) + pose[0, 3]
-    y = turned(pose, 1, px, py, pz) + pose[1, 3]
-    z = turned(pose, 2, px, py, pz) + pose[2, 3]
+    x = rotate_coordinate(pose, 0, px, py, pz) + pose[0, 3]
+    y = rotate_coordinate(pose, 1, px, py, pz) + pose[1, 3]
+    z = rotate_coordinate(pose, 2, px, py, pz) + pose[2, 3]
     inverse = lanes.fill(ONE) / z
     u, v, free_u, free_v = tangents(x * inverse, y * inverse, lens, margin)
     row = SPLAT_COLUMNS * place
@@ -290,9 +290,9 @@ def project_backward_group(
         f0 = lanes.gather(factors, 9 * first + k, 9)
         f1 = lanes.gather(factors, 9 * first + 3 + k, 9)
         f2 = lanes.gather(factors, 9 * first + 6 + k, 9)
-        a2 = turned(pose, 2, f0, f1, f2)
-        m0 = fx * inverse * (turned(pose, 0, f0, f1, f2) - u * a2)
-        m1 = fy * inverse * (turned(pose, 1, f0, f1, f2) - v * a2)
+        a2 = rotate_coordinate(pose, 2, f0, f1, f2)
+        m0 = fx * inverse * (rotate_coordinate(pose, 0, f0, f1, f2) - u * a2)
+        m1 = fy * inverse * (rotate_coordinate(pose, 1, f0, f1, f2) - v * a2)
         gm0 = TWO * (s00 * m0 + s01 * m1)
         gm1 = TWO * (s01 * m0 + s11 * m1)
         ga0 = fx * inverse * gm0
@@ -336,7 +336,7 @@ def project_backward_group(
 
 
 @kernel
-def give_up_steep(sums, counts, first, some, used):
+def clear_steep_gradients(sums, counts, first, some, used):
     """Clears the sums and the mark of those of sixteen Gaussians whose pairs add up to more than ``STEEPEST``."""
     for k in range(some):
         steep = ZERO
@@ -350,14 +350,14 @@ def give_up_steep(sums, counts, first, some, used):
 @kernel
 def project_backward_task(
     task, means, factors, pose, lens, limits, splats, counts, firsts, records, depth_channel, g_means, g_factors,
-    g_opacities, g_features, g_screen, acted,
+    g_opacities, g_features, g_screen, guard_counts,
 ):  # fmt: skip
     """Carries the gradients of the Gaussians of one task of ``project_backward``."""
     channels = g_features.shape[1]
     columns = records.shape[1]
     count = means.shape[0]
     sums = np.empty((lanes.COUNT, columns + 1), np.float32)
-    acted[task, 0] = 0
+    guard_counts[task, 0] = 0
     for first in range(task * CHUNK, min(count, (task + 1) * CHUNK), lanes.COUNT):
         some = min(lanes.COUNT, count - first)
         for k in range(lanes.COUNT):
@@ -368,7 +368,7 @@ def project_backward_task(
             sums[k, columns] = ONE if counts[i] > 0 else ZERO
             ahead = min(i + AHEAD, count - 1)
             if counts[ahead] > 0:
-                lanes.fetch(records, firsts[ahead])
+                lanes.prefetch_row(records, firsts[ahead])
             for column in range(0, columns, lanes.COUNT):
                 total = lanes.fill(ZERO)
                 for pair in range(firsts[i], firsts[i] + counts[i]):
@@ -379,7 +379,7 @@ def project_backward_task(
                 g_features[i, channel] = sums[k, 6 + channel]
         steep = not lanes.sum_of(worst) <= STEEPEST
         if steep:
-            give_up_steep(sums, counts, first, some, 6 + channels)
+            clear_steep_gradients(sums, counts, first, some, 6 + channels)
         place, m, f, gm, gf, go, gs = first, means, factors, g_means, g_factors, g_opacities, g_screen
         if some < lanes.COUNT:
             place = 0
@@ -402,7 +402,7 @@ def project_backward_task(
                 if counts[first + k] > 0 and sums[k, columns] == ZERO:
                     for channel in range(channels):
                         g_features[first + k, channel] = ZERO
-                    acted[task, 0] += 1
+                    guard_counts[task, 0] += 1
 
 
 @parallel_kernel
@@ -422,7 +422,7 @@ def project_backward(
     g_opacities,
     g_features,
     g_screen,
-    acted,
+    guard_counts,
 ):
     """Sums each Gaussian's pairs (in a fixed order) and carries the gradients to the world, sixteen at a time.
 
@@ -432,10 +432,11 @@ def project_backward(
         depth_channel: the feature channel that holds the depth of the centre, or -1.
         g_means [N, 3], g_factors [N, 3, 3], g_opacities [N], g_features [N, C], g_screen [N, 2]: out, float32; 0 where
             culled. ``g_screen`` is dL/d(projected centre) per pixel, which density control reads.
-        acted: out [tasks of ``CHUNK``, 1] int64, for how many Gaussians the guard in ``ACTED_BACKWARD`` acted.
+        guard_counts: out [tasks of ``CHUNK``, 1] int64, for how many Gaussians the guard in
+            ``COUNTED_GUARDS_BACKWARD`` acted.
     """
     for task in prange((means.shape[0] + CHUNK - 1) // CHUNK):
         project_backward_task(
             np.int64(task), means, factors, pose, lens, limits, splats, counts, firsts, records, depth_channel,
-            g_means, g_factors, g_opacities, g_features, g_screen, acted,
+            g_means, g_factors, g_opacities, g_features, g_screen, guard_counts,
         )  # fmt: skip

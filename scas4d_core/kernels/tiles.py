@@ -139,8 +139,8 @@ def cover_tiles_task(
     for k in range(visible * task // tasks, visible * (task + 1) // tasks):
         i = order[k]
         ahead = order[min(k + AHEAD, visible - 1)]
-        lanes.fetch(splats, ahead)
-        lanes.fetch(rects, ahead)
+        lanes.prefetch_row(splats, ahead)
+        lanes.prefetch_row(rects, ahead)
         firsts[i] = pair
         for tile_y in range(rects[i, 1], rects[i, 3]):
             for tile_x in range(rects[i, 0], rects[i, 2]):
@@ -195,7 +195,7 @@ def cover_tiles(
 
 @kernel
 def mark_blocks(splats, rects, chosen, tiles_x, marks):
-    """CompiledMarkers the blocks that the supports of Gaussians meet.
+    """Marks the blocks that the supports of Gaussians meet.
 
     Args:
         splats, rects: of ``projection.project``. chosen: [N] uint8, 0 for Gaussians that mark nothing.
@@ -239,14 +239,14 @@ def put_rows(rows, places, part, whole):
 
 
 @inline
-def holds(blocks, tiles_x, y, x):
+def is_marked(blocks, tiles_x, y, x):
     """True where the block of a pixel is among the marked ones."""
     number = x % TILE // BLOCK * (TILE // BLOCK) + y % TILE // BLOCK
     return (blocks[y // TILE * tiles_x + x // TILE] >> np.uint64(number)) & np.uint64(1) != 0
 
 
 @kernel
-def take_blocks(planes, base, blocks, tiles_x, box, part, shifts):
+def compose_box(planes, base, blocks, tiles_x, box, part, shifts):
     """Composes a box of a picture: the blocks that were drawn, and what is known of all others.
 
     Args:
@@ -263,7 +263,7 @@ def take_blocks(planes, base, blocks, tiles_x, box, part, shifts):
                 part[channel, y - top, x - left] = base[channel, y, x]
             shift = 0.0
             for x in range(left // BLOCK * BLOCK, right, BLOCK):
-                if holds(blocks, tiles_x, y, x):
+                if is_marked(blocks, tiles_x, y, x):
                     for k in range(max(x, left), min(x + BLOCK, right)):
                         shift += np.float64(planes[channel, y, k] - base[channel, y, k])
                         part[channel, y - top, k - left] = planes[channel, y, k]
@@ -271,8 +271,8 @@ def take_blocks(planes, base, blocks, tiles_x, box, part, shifts):
 
 
 @kernel
-def put_blocks(part, blocks, tiles_x, box, planes):
-    """Copies the blocks that were drawn from a box to a picture, as ``take_blocks`` has them; others stay as they are.
+def write_blocks(part, blocks, tiles_x, box, planes):
+    """Copies the blocks that were drawn from a box to a picture, as ``compose_box`` has them; others stay as they are.
 
     Args:
         part: [C, h, w] float32. planes: out [C, rows, stride] float32.
@@ -281,7 +281,7 @@ def put_blocks(part, blocks, tiles_x, box, planes):
     for channel in range(part.shape[0]):
         for y in range(top, bottom):
             for x in range(left // BLOCK * BLOCK, right, BLOCK):
-                if holds(blocks, tiles_x, y, x):
+                if is_marked(blocks, tiles_x, y, x):
                     for k in range(max(x, left), min(x + BLOCK, right)):
                         planes[channel, y, k] = part[channel, y - top, k - left]
 

@@ -94,7 +94,7 @@ class ViewRenderer:
             background=np.array([*background, 0.0], np.float32),
         )
         colour = np.moveaxis(picture.features[:3], 0, -1).copy()
-        alpha = 1 - picture.rest
+        alpha = 1 - picture.transmittance
         with np.errstate(invalid="ignore", divide="ignore"):
             depth = picture.features[LABEL] / alpha / np.float32(self.world.metres_per_unit)
         depth[alpha < ALPHA_OF_A_SURFACE] = np.nan
@@ -117,5 +117,5 @@ class ViewRenderer:
             wins = best > most
             painted[wins] = (first + 1 + picture.features.argmax(axis=0))[wins]
             most[wins] = best[wins]
-        painted[picture.rest > 1 - ALPHA_OF_A_SURFACE] = 0
+        painted[picture.transmittance > 1 - ALPHA_OF_A_SURFACE] = 0
         return painted

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.frame_outcome import Alarm, AlarmKind, FrameOutcome, degraded_text
-from scas4d_core.robust.outliers import LAST_DB, MOST_OUT, Past, allowed, few, in_doubt
+from scas4d_core.robust.outliers import LAST_DB, MAX_OUT, Past, allowed, in_doubt, unless_most
 from scas4d_core.update.result import CameraFit
 
 TINT = (0.05, 0.1)
@@ -44,7 +44,7 @@ Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Watch:
+class CameraFigures:
     """Figures from which the alarms of one camera are derived.
 
     Attributes:
@@ -62,16 +62,16 @@ class Watch:
     same: int = 0
 
     @classmethod
-    def of(cls, past: Past, name: str) -> Watch:
+    def of(cls, past: Past, name: str) -> CameraFigures:
         """Of a camera, as ``row`` left it."""
-        row = past.watch.get(name)
+        row = past.camera_figures.get(name)
         if row is None:
             return cls()
         red, green, blue, sharp, *counts = row
         return cls((red, green, blue), sharp, *(int(count) for count in counts))
 
     def row(self) -> tuple[float, ...]:
-        """As ``Past.watch`` has it."""
+        """As ``Past.camera_figures`` has it."""
         return (*self.colours, self.sharp, self.misfit, self.tint, self.gain, self.blur, self.same)
 
 
@@ -97,18 +97,21 @@ def alarms_of(
             by bit. left_out: cameras that were not believed; that is their alarm.
     """
     count = len(sharp)
-    found = _of_frame(outcome, reason, exposure, same, count)
+    found = _frame_alarms(outcome, reason, exposure, same, count)
     if outcome.rejected or not offsets:
         return found, after  # nothing that a camera could be held against
-    watch, raised = dict(after.watch), dict[AlarmKind, dict[str, Alarm]]()
-    beside, watches = _beside(colours), {name: Watch.of(past, name) for name in sharp}
+    watch, raised = dict(after.camera_figures), dict[AlarmKind, dict[str, Alarm]]()
+    beside, watches = _minus_median(colours), {name: CameraFigures.of(past, name) for name in sharp}
     changes = {name: value - watches[name].sharp for name, value in sharp.items()}
     common = float(np.nanmedian(list(changes.values()))) if not np.isnan(list(changes.values())).all() else 0.0
-    few_same = len(same) <= MOST_OUT * count
+    few_same = len(same) <= MAX_OUT * count
     moved = {name: colour - _known(watches[name].colours, colour) for name, colour in beside.items() if name in watches}
-    spread = _half(tint_of(change) for change in moved.values()), _half(gain_of(change) for change in moved.values())
+    spread = (
+        _upper_median(odd_channel_change(change) for change in moved.values()),
+        _upper_median(common_change(change) for change in moved.values()),
+    )
     for name, before in watches.items():
-        now, alarms = _judged(
+        now, alarms = _check_camera(
             name, before, past, offsets.get(name), beside.get(name), sharp[name], changes[name] - common,
             few_same and name in same, spread,
         )  # fmt: skip
@@ -116,13 +119,13 @@ def alarms_of(
         if name not in left_out:
             for alarm in alarms:
                 raised.setdefault(alarm.what, {})[name] = alarm
-    found += [alarm for of_kind in raised.values() for alarm in few(of_kind, count).values()]
-    return found, replace(after, watch=watch)
+    found += [alarm for of_kind in raised.values() for alarm in unless_most(of_kind, count).values()]
+    return found, replace(after, camera_figures=watch)
 
 
-def _judged(
+def _check_camera(
     name: str,
-    before: Watch,
+    before: CameraFigures,
     past: Past,
     offset: float | None,
     colours: Numbers | None,
@@ -130,7 +133,7 @@ def _judged(
     sharper: float,
     same: bool,
     spread: tuple[float, float],
-) -> tuple[Watch, list[Alarm]]:
+) -> tuple[CameraFigures, list[Alarm]]:
     """A camera's figures for the next frame, and its alarms.
 
     Args:
@@ -150,7 +153,7 @@ def _judged(
     if colours is not None:
         usual = _known(before.colours, colours)
         change = colours - usual
-        tint, gain = tint_of(change), gain_of(change)
+        tint, gain = odd_channel_change(change), common_change(change)
         tints, gains = np.maximum(TINT, SPREAD * spread[0]), np.maximum(GAIN, SPREAD * spread[1])
         now = replace(now, tint=before.tint + 1 if tint > tints[0] else 0)
         now = replace(now, gain=before.gain + 1 if abs(gain) > gains[0] else 0)
@@ -178,12 +181,12 @@ def _judged(
     return now, alarms
 
 
-def tint_of(change: Numbers) -> float:
+def odd_channel_change(change: Numbers) -> float:
     """By how much one of three colours changed beside the two others."""
     return float(np.abs(change - np.median(change)).max())
 
 
-def gain_of(change: Numbers) -> float:
+def common_change(change: Numbers) -> float:
     """By how much three colours changed together."""
     return float(np.median(change))
 
@@ -194,7 +197,7 @@ def _known(usual: tuple[float, float, float], now: Numbers) -> Numbers:
     return known
 
 
-def _half(sizes: Iterable[float]) -> float:
+def _upper_median(sizes: Iterable[float]) -> float:
     """The size that half of them, rounded up, do not exceed; 0 of none."""
     ordered = sorted(abs(size) for size in sizes)
     return ordered[(len(ordered) - 1) // 2] if ordered else 0.0
@@ -249,12 +252,14 @@ def sharpness(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, float]:
     return {name: sharpness_of(picture) for name, picture in pictures.items()}
 
 
-def first_watched(past: Past, pictures: Mapping[str, NDArray[np.uint8]]) -> Past:
+def with_first_figures(past: Past, pictures: Mapping[str, NDArray[np.uint8]]) -> Past:
     """The past after frame 0, with the figures of its pictures for the alarms."""
-    return replace(past, watch={name: Watch(sharp=value).row() for name, value in sharpness(pictures).items()})
+    return replace(
+        past, camera_figures={name: CameraFigures(sharp=value).row() for name, value in sharpness(pictures).items()}
+    )
 
 
-def _beside(colours: Mapping[str, Numbers]) -> dict[str, Numbers]:
+def _minus_median(colours: Mapping[str, Numbers]) -> dict[str, Numbers]:
     """Colours less the median over the cameras: a light that all see is no camera's."""
     if not colours:
         return {}
@@ -262,7 +267,9 @@ def _beside(colours: Mapping[str, Numbers]) -> dict[str, Numbers]:
     return {name: colour - common for name, colour in colours.items()}
 
 
-def _of_frame(outcome: FrameOutcome, reason: str, exposure: float, same: Collection[str], count: int) -> list[Alarm]:
+def _frame_alarms(
+    outcome: FrameOutcome, reason: str, exposure: float, same: Collection[str], count: int
+) -> list[Alarm]:
     """Alarms of no camera."""
     text = degraded_text(outcome, reason)
     if text is not None:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scas4d_core.engines.renderer import Renderer
 from scas4d_core.engines.views import LABEL, TrainingView
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.robust.outliers import Past, few
+from scas4d_core.robust.outliers import Past, unless_most
 from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.view_factory import ViewFactory
 
@@ -77,19 +77,20 @@ def check_brightness(past: Past, bright: Mapping[str, float]) -> tuple[float, di
     """Compare the brightness of a frame's pictures with the usual one, before anything is rendered.
 
     Args:
-        past: of the scene; cameras that were left out before stay so (``outliers.settle``). bright: by camera.
+        past: of the scene; cameras that were left out before stay so (``outliers.past_after_update``). bright: by
+            camera.
 
     Returns:
         Times that the frame is brighter than usual (1 where it is not seen to differ); the cameras to leave out, with
         the reason; and the reason why nothing can be learnt from the frame, or None.
     """
     left_out = {
-        name: "it has not fitted the other cameras since it was left out" for name in bright if past.is_out(name)
+        name: "it has not fitted the other cameras since it was left out" for name in bright if past.is_left_out(name)
     }
     usual = {name: past.brightness.get(name, nan) for name in bright}
     ratios = {name: value / usual[name] for name, value in bright.items() if usual[name] > DARKEST}
     if not ratios:
-        return 1.0, few(left_out, len(bright)), None
+        return 1.0, unless_most(left_out, len(bright)), None
     common = float(np.median(list(ratios.values())))
     enough = len(ratios) >= ENOUGH
     if not 1 / UNUSABLE <= common <= UNUSABLE and (enough or common < BLIND or common > 1 / BLIND):
@@ -99,12 +100,16 @@ def check_brightness(past: Past, bright: Mapping[str, float]) -> tuple[float, di
             left_out[name] = f"it shows nothing: {ratio:.2g} times as bright as it was"
     if not enough or 1 / EXPOSURE <= common <= EXPOSURE:
         common = 1.0
-    return common, few(left_out, len(bright)), None
+    return common, unless_most(left_out, len(bright)), None
 
 
-def step_of(past: Past, bright: Mapping[str, float]) -> float:
+def measure_brightness_ratio(past: Past, bright: Mapping[str, float]) -> float:
     """Brightness over that of the frame before, median over the cameras; 1 where too few pixels are usable."""
-    ratios = [value / past.last[name] for name, value in bright.items() if past.last.get(name, 0.0) > DARKEST]
+    ratios = [
+        value / past.last_brightness[name]
+        for name, value in bright.items()
+        if past.last_brightness.get(name, 0.0) > DARKEST
+    ]
     return float(np.median(ratios)) if len(ratios) >= ENOUGH else 1.0
 
 
@@ -113,15 +118,19 @@ def light_continues(past: Past, bright: Mapping[str, float]) -> bool:
 
     The scene's own light does so, and is followed at once. A flicker comes back, and a jump has no step before it.
     """
-    step = step_of(past, bright)
-    if 1 / EXPOSURE <= step <= EXPOSURE or (step > 1) != (past.step > 1):
+    step = measure_brightness_ratio(past, bright)
+    if 1 / EXPOSURE <= step <= EXPOSURE or (step > 1) != (past.brightness_ratio > 1):
         return False
-    return 1 / ALIKE <= step / past.step <= ALIKE
+    return 1 / ALIKE <= step / past.brightness_ratio <= ALIKE
 
 
-def noted(past: Past, bright: Mapping[str, float]) -> Past:
+def record_brightness(past: Past, bright: Mapping[str, float]) -> Past:
     """The past with how bright the pictures of a frame are, and how much brighter than the frame before."""
-    return replace(past, last={**past.last, **bright}, step=step_of(past, bright))
+    return replace(
+        past,
+        last_brightness={**past.last_brightness, **bright},
+        brightness_ratio=measure_brightness_ratio(past, bright),
+    )
 
 
 def with_light(past: Past, light: float) -> Past:
@@ -157,12 +166,12 @@ def compensate_exposure(
     return gain, without[: len(views)], without[len(views) :]
 
 
-def gain_of(renderer: Renderer, state: Gaussians, views: Sequence[TrainingView]) -> float | None:
+def measure_light_gain(renderer: Renderer, state: Gaussians, views: Sequence[TrainingView]) -> float | None:
     """Times that a frame is brighter than Θ_{t−1} shows it; None where no camera can say."""
     return _gain(views, [_shown(renderer, state, view) for view in views])
 
 
-def relit(state: Gaussians, gain: float) -> Gaussians:
+def with_light_gain(state: Gaussians, gain: float) -> Gaussians:
     """The state in a light so many times as bright; colours beyond white are white."""
     colours = state.colours
     return state.replace(colours=np.minimum(np.float32(gain) * colours, np.maximum(colours, np.float32(1))))
@@ -216,7 +225,7 @@ def axis_lengths(gaussians: Gaussians) -> Array:
     return lengths
 
 
-def validated(
+def check_plausible(
     before: Gaussians, result: UpdateResult, rows: NDArray[np.int64], radius: float, first: Array | None = None
 ) -> tuple[UpdateResult, str | None]:
     """Hold what is not finite, bounded and plausible as it was before.

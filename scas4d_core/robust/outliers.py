@@ -39,7 +39,7 @@ RESTS_DB = 3.0
 """The same, up to which a scene in which nothing is seen to move may stand: noise that frame 0 fits costs 1 to 2 dB."""
 CATCH_UP = 3
 """Frames that are, at most."""
-MOST_OUT = 0.5
+MAX_OUT = 0.5
 """Share of the cameras that are left out at most; where more do not fit, it is the frame that changed."""
 
 CLEAN_DB = 40.0
@@ -53,8 +53,8 @@ OTHER_EFFORT = 1.5
 PLACE_RATE, LEVEL_RATE = 0.2, 0.3
 """How fast a camera's usual place and the usual level follow."""
 
-WATCHED, TIMED = 9, 6
-"""Figures of ``alarms.Watch`` and of ``timing.Looks`` by camera."""
+CAMERA_FIGURES, TIMING_FIGURES = 9, 6
+"""Figures of ``alarms.CameraFigures`` and of ``timing.CameraTimingSums`` by camera."""
 
 Fault = TypeVar("Fault")
 
@@ -64,37 +64,39 @@ class Past:
     """The usual figures of a scene and its cameras; carried from commit to commit.
 
     Attributes:
-        places: by camera, dB of its last rendering, less the level of its frame; NaN where not known.
+        camera_levels: by camera, dB of its last rendering, less the level of its frame; NaN where not known.
         brightness: by camera, mean of its picture, 0…1, in the exposure of frame 0; NaN where not known.
-        out: by camera, frames in a row that it has been left out, 0 when it is believed.
+        frames_left_out: by camera, frames in a row that it has been left out, 0 when it is believed.
         level: dB at the end of an update, see ``level_of``; NaN where not known.
         updates: that went into it. rejected: consecutive frames that were rejected with usable pictures.
-            fitted: seconds, time of the last frame that was learnt from. behind: frames since some were rejected or
+            fitted: seconds, time of the last frame that was learnt from. lagging_frames: frames since some were
+                rejected or
             skipped, 0 once the PSNR is as usual again.
         iterations: of the last update. error: usual at the end of an update, by probe view.
         light: times that the last frame was brighter, see ``checks.check_brightness``. light_frames: frames in a row
             that were brighter, or that were darker.
-        last: by camera, mean of its picture in the last frame, in whatever light. step: times that the last frame was
+        last_brightness: by camera, mean of its picture in the last frame, in whatever light. brightness_ratio: times
+            that the last frame was
             brighter than the one before it.
-        watch: by camera, what its alarms are derived from, see ``alarms.Watch``.
-        timing: by camera, the moments of its pictures, see ``timing.Looks``.
+        camera_figures: by camera, what its alarms are derived from, see ``alarms.CameraFigures``.
+        timing: by camera, the moments of its pictures, see ``timing.CameraTimingSums``.
     """
 
-    places: Mapping[str, float] = field(default_factory=dict)
+    camera_levels: Mapping[str, float] = field(default_factory=dict)
     brightness: Mapping[str, float] = field(default_factory=dict)
-    out: Mapping[str, int] = field(default_factory=dict)
+    frames_left_out: Mapping[str, int] = field(default_factory=dict)
     level: float = nan
     updates: int = 0
     rejected: int = 0
     fitted: float = nan
-    behind: int = 0
+    lagging_frames: int = 0
     iterations: int = 0
     error: Mapping[str, float] = field(default_factory=dict)
     light: float = 1.0
     light_frames: int = 0
-    last: Mapping[str, float] = field(default_factory=dict)
-    step: float = 1.0
-    watch: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    last_brightness: Mapping[str, float] = field(default_factory=dict)
+    brightness_ratio: float = 1.0
+    camera_figures: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     timing: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
     @classmethod
@@ -103,34 +105,36 @@ class Past:
         psnr = _capped(psnr)
         level = float(np.median(list(psnr.values()))) if psnr else nan
         places = {name: psnr.get(name, nan) - level for name in bright}
-        return cls(places, dict(bright), dict.fromkeys(bright, 0), level, last=dict(bright))
+        return cls(places, dict(bright), dict.fromkeys(bright, 0), level, last_brightness=dict(bright))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """As arrays, for a checkpoint."""
-        rows = [(place, self.brightness[name], self.out[name]) for name, place in self.places.items()]
+        rows = [
+            (place, self.brightness[name], self.frames_left_out[name]) for name, place in self.camera_levels.items()
+        ]
         scene = [
             self.level,
             self.updates,
             self.rejected,
             self.fitted,
-            self.behind,
+            self.lagging_frames,
             self.iterations,
             self.light,
             self.light_frames,
         ]
-        scene.append(self.step)
+        scene.append(self.brightness_ratio)
         return {
-            "names": np.array(list(self.places), np.str_),
+            "names": np.array(list(self.camera_levels), np.str_),
             "cameras": np.array(rows, np.float64).reshape(-1, 3),
             "scene": np.array(scene, np.float64),
-            "witnesses": np.array(list(self.error), np.str_),
+            "probe_views": np.array(list(self.error), np.str_),
             "error": np.array(list(self.error.values()), np.float64),
-            "shown": np.array(list(self.last), np.str_),
-            "last": np.array(list(self.last.values()), np.float64),
-            "watched": np.array(list(self.watch), np.str_),
-            "watch": np.array(list(self.watch.values()), np.float64).reshape(-1, WATCHED),
-            "timed": np.array(list(self.timing), np.str_),
-            "timing": np.array(list(self.timing.values()), np.float64).reshape(-1, TIMED),
+            "last_brightness.names": np.array(list(self.last_brightness), np.str_),
+            "last_brightness": np.array(list(self.last_brightness.values()), np.float64),
+            "camera_figures.names": np.array(list(self.camera_figures), np.str_),
+            "camera_figures": np.array(list(self.camera_figures.values()), np.float64).reshape(-1, CAMERA_FIGURES),
+            "timing.names": np.array(list(self.timing), np.str_),
+            "timing": np.array(list(self.timing.values()), np.float64).reshape(-1, TIMING_FIGURES),
         }
 
     @classmethod
@@ -145,22 +149,22 @@ class Past:
         bright = {name: value for name, (_, value, _) in rows}
         outs = {name: int(out) for name, (_, _, out) in rows}
         level, updates, rejected, fitted, behind, iterations, light, light_frames, step = arrays["scene"].tolist()
-        error = dict(zip(arrays["witnesses"].tolist(), arrays["error"].tolist(), strict=True))
-        last = dict(zip(arrays["shown"].tolist(), arrays["last"].tolist(), strict=True))
-        watch, timing = _rows(arrays, "watched", "watch"), _rows(arrays, "timed", "timing")
+        error = dict(zip(arrays["probe_views"].tolist(), arrays["error"].tolist(), strict=True))
+        last = dict(zip(arrays["last_brightness.names"].tolist(), arrays["last_brightness"].tolist(), strict=True))
+        watch, timing = _rows(arrays, "camera_figures.names", "camera_figures"), _rows(arrays, "timing.names", "timing")
         return cls(
             places, bright, outs, level,
             int(updates), int(rejected), fitted, int(behind), int(iterations), error, light, int(light_frames),
             last, step, watch, timing,
         )  # fmt: skip
 
-    def place(self, name: str) -> float:
+    def camera_level(self, name: str) -> float:
         """Usual place of a camera, dB; NaN where not known."""
-        return self.places.get(name, nan)
+        return self.camera_levels.get(name, nan)
 
-    def is_out(self, name: str) -> bool:
+    def is_left_out(self, name: str) -> bool:
         """True for a camera that is left out."""
-        return self.out.get(name, 0) > 0
+        return self.frames_left_out.get(name, 0) > 0
 
 
 def _rows(arrays: Mapping[str, NDArray[Any]], names: str, rows: str) -> dict[str, tuple[float, ...]]:
@@ -168,7 +172,7 @@ def _rows(arrays: Mapping[str, NDArray[Any]], names: str, rows: str) -> dict[str
     return {name: tuple(row) for name, row in zip(arrays[names].tolist(), arrays[rows].tolist(), strict=True)}
 
 
-def relit(past: Past, gain: float) -> Past:
+def past_in_light(past: Past, gain: float) -> Past:
     """The past once another light is the usual one: in a brighter light, errors are brighter, too."""
     brightness = {name: gain * value for name, value in past.brightness.items()}
     level = past.level - max(0.0, 20 * log10(gain))
@@ -177,12 +181,12 @@ def relit(past: Past, gain: float) -> Past:
 
 def offsets(past: Past, psnr: Mapping[str, float]) -> dict[str, float]:
     """DB by camera, above (+) or below its usual place among the cameras; of those whose place is known."""
-    known = {name: value for name, value in _capped(psnr).items() if past.place(name) == past.place(name)}
+    known = {name: value for name, value in _capped(psnr).items() if past.camera_level(name) == past.camera_level(name)}
     if not known:
         return {}
-    believed = [name for name in known if not past.is_out(name)] or list(known)
-    shift = float(np.median([known[name] - past.place(name) for name in believed]))
-    return {name: value - past.place(name) - shift for name, value in known.items()}
+    believed = [name for name in known if not past.is_left_out(name)] or list(known)
+    shift = float(np.median([known[name] - past.camera_level(name) for name in believed]))
+    return {name: value - past.camera_level(name) - shift for name, value in known.items()}
 
 
 def misfits(past: Past, psnr: Mapping[str, float], limit: float) -> dict[str, str]:
@@ -197,7 +201,7 @@ def misfits(past: Past, psnr: Mapping[str, float], limit: float) -> dict[str, st
         for name, off in offsets(past, psnr).items()
         if off < limit
     }
-    return few(outlying, len(psnr))
+    return unless_most(outlying, len(psnr))
 
 
 def allowed(past: Past) -> float:
@@ -210,7 +214,7 @@ def in_doubt(past: Past, offset: float) -> bool:
     return offset < NEAR_DB + allowed(past)
 
 
-def unmet(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | None:
+def misfit_reason(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | None:
     """Why an update has not met its frame, or None.
 
     Args:
@@ -226,9 +230,11 @@ def unmet(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | N
     return f"the pictures are met at {level:.1f} dB, {past.level - level:.1f} dB less than usual"
 
 
-def behind(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | None:
-    """Why an update after frames that were held or not moved should be sought longer, or None. See ``unmet``."""
-    if not (past.rejected or past.behind) or not psnr or past.level != past.level:
+def lag_reason(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | None:
+    """Why an update after frames that were held or not moved should be sought longer, or None. See
+    ``misfit_reason``.
+    """
+    if not (past.rejected or past.lagging_frames) or not psnr or past.level != past.level:
         return None
     off = past.level - level_of(past, psnr)
     return f"{off:.1f} dB less than before" if off > BEHIND_DB + _shorter(past, iterations) else None
@@ -241,7 +247,7 @@ def _shorter(past: Past, iterations: int) -> float:
 
 def level_of(past: Past, psnr: Mapping[str, float]) -> float:
     """DB, median over the cameras, each less its usual place: a short update renders a few of them; NaN of none."""
-    places = {name: past.place(name) for name in psnr}
+    places = {name: past.camera_level(name) for name in psnr}
     values = [value - (places[name] if isfinite(places[name]) else 0.0) for name, value in _capped(psnr).items()]
     return float(np.median(values)) if values else nan
 
@@ -251,7 +257,7 @@ def health(past: Past, off: float) -> float:
     return float(np.clip(1 - off / (LAST_DB + allowed(past)), 0, 1))
 
 
-def settle(
+def past_after_update(
     past: Past,
     psnr: Mapping[str, float],
     bright: Mapping[str, float],
@@ -269,9 +275,9 @@ def settle(
     psnr = _capped(psnr)
     off = offsets(past, psnr)
     out = misfits(past, psnr, LAST_DB)
-    believed = {n: v for n, v in psnr.items() if n not in out and not past.is_out(n)}
+    believed = {n: v for n, v in psnr.items() if n not in out and not past.is_left_out(n)}
     level = level_of(past, believed) if believed else past.level
-    places, brightness, outs = dict(past.places), dict(past.brightness), dict(past.out)
+    places, brightness, outs = dict(past.camera_levels), dict(past.brightness), dict(past.frames_left_out)
     for name, value in bright.items():
         # Of a camera that was not learnt from the figures stay: its picture is no sign of what is usual.
         before = outs.setdefault(name, 0)
@@ -290,19 +296,19 @@ def settle(
                 places[name] = place + PLACE_RATE * (here - place)
             brightness[name] = value / exposure
     known = past.updates > 0
-    later = past.behind + 1 if behind(past, believed, iterations) and past.behind < CATCH_UP else 0
+    later = past.lagging_frames + 1 if lag_reason(past, believed, iterations) and past.lagging_frames < CATCH_UP else 0
     follows = LEVEL_RATE if later == 0 else 0.0
     if later == 0 and iterations and not 1 / OTHER_EFFORT < iterations / max(1, past.iterations) < OTHER_EFFORT:
         follows = 1.0
     return replace(
         past,
-        places=places,
+        camera_levels=places,
         brightness=brightness,
-        out=outs,
+        frames_left_out=outs,
         level=past.level + follows * (level - past.level) if known else level,
         updates=past.updates + moved,
         rejected=0,
-        behind=later,
+        lagging_frames=later,
         iterations=iterations or past.iterations,
     )
 
@@ -320,6 +326,6 @@ def _capped(psnr: Mapping[str, float]) -> dict[str, float]:
     return {name: CLEAN_DB if value > CLEAN_DB else value for name, value in psnr.items()}
 
 
-def few(found: dict[str, Fault], count: int) -> dict[str, Fault]:
+def unless_most(found: dict[str, Fault], count: int) -> dict[str, Fault]:
     """The faults found of cameras, by name; none where most of ``count`` cameras have one."""
-    return found if len(found) <= MOST_OUT * count else {}
+    return found if len(found) <= MAX_OUT * count else {}

@@ -61,7 +61,7 @@ def find_jump(gaussians: Gaussians, views: Sequence[TrainingView], renderer: Ren
     return shift
 
 
-def shifted(gaussians: Gaussians, shift: Float) -> Gaussians:
+def shift_moving(gaussians: Gaussians, shift: Float) -> Gaussians:
     """The state with its moving Gaussians shifted by [3] metres."""
     means = gaussians.means.copy()
     means[gaussians.moving] += shift.astype(np.float32)

@@ -20,27 +20,33 @@ from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.robust import outliers, timing
 from scas4d_core.robust.alarms import alarms_of, colours_by_camera
-from scas4d_core.robust.checks import EXPOSURE, compensate_exposure, gain_of, relit, validated
+from scas4d_core.robust.checks import (
+    EXPOSURE,
+    check_plausible,
+    compensate_exposure,
+    measure_light_gain,
+    with_light_gain,
+)
 from scas4d_core.robust.first_motion import OrderResult, best_order
 from scas4d_core.robust.outliers import Past
-from scas4d_core.robust.relocation import find_jump, shifted
+from scas4d_core.robust.relocation import find_jump, shift_moving
 from scas4d_core.robust.update_input import UpdateInput
 from scas4d_core.settings import UpdateSettings
-from scas4d_core.update.best_state import by_size, committed_errors, slow, within
+from scas4d_core.update.best_state import committed_errors, is_slow_motion, label_by_size, mean_is_within
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.rates import all_begun
-from scas4d_core.update.result import AS_SET, AttemptOptions, UpdateResult, UpdateTrace
-from scas4d_core.update.schedule import MOST_TIMED, PROBE, Stopping
+from scas4d_core.update.rates import latest_start
+from scas4d_core.update.result import AS_CONFIGURED, AttemptOptions, UpdateResult, UpdateTrace
+from scas4d_core.update.schedule import MAX_TIMED, PROBE, Stopping
 from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import Motion
 
 LADDER = (
     AttemptOptions("smaller steps", rates=0.3, cold=True),
-    AttemptOptions("rigid layers only", rates=0.3, rigid=True, hold_colours=True, cold=True),
+    AttemptOptions("rigid layers only", rates=0.3, rigid=True, freeze_colours=True, cold=True),
 )
 """The attempts that follow one whose state is not plausible."""
 
-SEARCH = AttemptOptions("sought again", cold=True, longer=5.0)
+SEARCH = AttemptOptions("sought again", cold=True, iteration_factor=5.0)
 """From where the silhouettes say that the object is, or from where an update ended. Two of three frames of robot lost,
 the next is met at 33.5 dB with five times the iterations, at 32.1 dB with twice."""
 
@@ -58,7 +64,7 @@ class FrameSolver:
         updater: of the scene. factory: of its views. renderer: draws, with the settings' background and limits.
 
     Attributes:
-        judging: seconds that checks took beside the updates.
+        check_seconds: seconds that checks took beside the updates.
     """
 
     def __init__(
@@ -68,18 +74,20 @@ class FrameSolver:
         self._renderer = renderer
         self._factory, self._rig = factory, factory.posed
         self._settings = settings
-        self.judging = 0.0
+        self.check_seconds = 0.0
 
     def run(self, given: UpdateInput) -> Solved:
         """Solve a frame; where it is held, the state and the motion are those given."""
-        result, past = self._solved(given)
-        with self._timed():
-            return self._alarmed(given, result, past)
+        result, past = self._solve(given)
+        with self._time_checks():
+            return self._with_alarms(given, result, past)
 
-    def _alarmed(self, given: UpdateInput, result: UpdateResult, past: Past) -> Solved:
+    def _with_alarms(self, given: UpdateInput, result: UpdateResult, past: Past) -> Solved:
         """With the health of the cameras, the alarms, and when the pictures were taken."""
         if self._settings.reject_outliers:
-            past = timing.noted(past, given.state, result, self._renderer, given.seconds, given.step, given.seed)
+            past = timing.record_timing(
+                past, given.state, result, self._renderer, given.seconds, given.step, given.seed
+            )
         means = {view.name: view.mean for view in result.views or given.views}
         alarms, past = alarms_of(
             given.past, past, outcome=result.outcome, reason=result.reason, exposure=result.exposure, sharp=given.sharp,
@@ -90,20 +98,22 @@ class FrameSolver:
         alarms = alarms if self._settings.reject_outliers else []
         return replace(result, health=fits, alarms=alarms, timing=timing.timings(past)), past
 
-    def _solved(self, given: UpdateInput) -> Solved:
+    def _solve(self, given: UpdateInput) -> Solved:
         if (
             self._settings.skip_tolerance > -1
             and given.unusable is None
             and (why := self._scene_is_static(given)) is not None
         ):
-            return _standing(given, UpdateTrace(kept=Candidate.PREVIOUS), given.exposure, why)
+            return _skipped(given, UpdateTrace(kept=Candidate.PREVIOUS), given.exposure, why)
         stays = given.light_moves or given.past.light_frames >= self._settings.max_rejected_frames
         if stays and (solved := self._retry_with_light_gain(given)) is not None:
             return solved
         if given.unusable is not None:  # nothing is tried, and no patience is lost with it
-            past = replace(given.past, behind=max(1, given.past.behind))
+            past = replace(given.past, lagging_frames=max(1, given.past.lagging_frames))
             nothing = UpdateTrace(kept=Candidate.PREVIOUS)
-            return self._held(given, FrameOutcome.REJECTED_UNUSABLE, nothing, past, [], given.unusable, given.exposure)
+            return self._rejected(
+                given, FrameOutcome.REJECTED_UNUSABLE, nothing, past, [], given.unusable, given.exposure
+            )
         settings, attempts = self._settings, list[str]()
         exposure = 1.0
         if given.exposure != 1.0:
@@ -111,7 +121,7 @@ class FrameSolver:
                 self._factory, self._renderer, given.state, given.views, given.suspects
             )
             given = replace(given, views=views, suspects=suspects)
-        result, fault = self._attempt(given, AS_SET, attempts)
+        result, fault = self._attempt(given, AS_CONFIGURED, attempts)
         for options in LADDER:
             if fault is None:
                 break
@@ -119,13 +129,13 @@ class FrameSolver:
         lost = replace(given.past, rejected=given.past.rejected + 1)  # patience ends
         if fault is not None:
             outcome = FrameOutcome.REJECTED_IMPLAUSIBLE
-            return self._held(given, outcome, result.trace, lost, attempts, fault, exposure)
+            return self._rejected(given, outcome, result.trace, lost, attempts, fault, exposure)
         if not result.trace.losses:
-            return _standing(given, result.trace, exposure, "not moved")
+            return _skipped(given, result.trace, exposure, "not moved")
         outcome, reason = FrameOutcome.UPDATED, ""
         if len(attempts) > 1:
             outcome, reason = FrameOutcome.RETRIED, attempts[-2]
-        why = self._unmet(given, result)
+        why = self._misfit_reason(given, result)
         if why is not None:
             attempts[-1] += f": {why}"
             again = self._search(given, result, attempts)
@@ -133,25 +143,25 @@ class FrameSolver:
                 result, outcome, reason = again, FrameOutcome.RELOCATED, f"{why}; {attempts[-1]}"
             elif lost.rejected < settings.max_rejected_frames:
                 outcome = FrameOutcome.REJECTED_MISFIT
-                return self._held(given, outcome, result.trace, lost, attempts, why, exposure)
+                return self._rejected(given, outcome, result.trace, lost, attempts, why, exposure)
             else:
                 reason = f"{why}, for {settings.max_rejected_frames} frames: taken as it is from here on"
                 outcome = FrameOutcome.ACCEPTED
                 given = replace(given, past=replace(given.past, level=nan, updates=0))
-        elif outcome is FrameOutcome.UPDATED and (why := self._behind(given, result)) is not None:
+        elif outcome is FrameOutcome.UPDATED and (why := self._lag_reason(given, result)) is not None:
             attempts[-1] += f": {why}"
-            result = self._go_on(given, result, attempts)
+            result = self._continue_update(given, result, attempts)
         result = replace(result, outcome=outcome, reason=reason, attempts=attempts, exposure=exposure)
-        return self._committed(given, result)
+        return self._accepted(given, result)
 
     def _scene_is_static(self, given: UpdateInput) -> str | None:
         """Why nothing has to be updated, as the pictures alone say, or None."""
         if given.same and len(given.same) == len(given.brightness):
             return "the same pictures again"
-        if not given.rests or given.past.updates > 0:  # what was updated once is no frame 0 to rest at
+        if not given.may_be_static or given.past.updates > 0:  # what was updated once is no frame 0 to rest at
             return None
-        with self._timed():  # what most cameras do not agree on may still have moved
-            fits = self._measured(given.views, given.state)
+        with self._time_checks():  # what most cameras do not agree on may still have moved
+            fits = self._psnr_by_camera(given.views, given.state)
             level = outliers.level_of(given.past, fits)
         if outliers.misfits(given.past, fits, outliers.LAST_DB):  # an update shows what is wrong with a camera
             return None
@@ -162,142 +172,157 @@ class FrameSolver:
 
         Where the scene is shown as bright as it was, something new makes the pictures brighter: no reason to hold them.
         """
-        gain = gain_of(self._renderer, given.state, given.views)
+        gain = measure_light_gain(self._renderer, given.state, given.views)
         same = gain is not None and not given.light_moves and 1 / EXPOSURE <= gain <= EXPOSURE
         if gain is None or (same and given.unusable is None):
             return None
         gain, light = (1.0, "the same light") if same else (gain, f"{gain:.2g} times the light")
-        state, past = relit(given.state, gain), outliers.relit(given.past, gain)
+        state, past = with_light_gain(given.state, gain), outliers.past_in_light(given.past, gain)
         in_light = replace(given, state=state, past=past, exposure=1.0, light_moves=False, unusable=None)
-        result, past = self._solved(in_light)
+        result, past = self._solve(in_light)
         if not result.outcome.rejected:
             return replace(result, attempts=[f"{light}, for good", *result.attempts]), past
         lost = replace(given.past, rejected=given.past.rejected + 1)
         why = f"in {light} {result.reason}"
-        return self._held(given, result.outcome, result.trace, lost, result.attempts, why, given.exposure)
+        return self._rejected(given, result.outcome, result.trace, lost, result.attempts, why, given.exposure)
 
     def _attempt(self, given: UpdateInput, template: AttemptOptions, attempts: list[str]) -> Validated:
         name = template.name
-        if self._decides(given, template):
-            (result, fault, _), orders = best_order(lambda seed, faster: self._first(given, seed, faster), given.seed)
+        if self._is_first_motion(given, template):
+            (result, fault, _), orders = best_order(
+                lambda seed, layer_rate_factor: self._run_one_order(given, seed, layer_rate_factor), given.seed
+            )
             name = f"{name}, the best of {orders} orders" if orders > 1 else name
         else:
             motion = None if template.cold else given.motion
             result = self._run(given, given.state, motion, self._options(given, template))
-            result, fault = self._validated(given, given.state, result)
+            result, fault = self._check_plausible(given, given.state, result)
         attempts.append(name if fault is None else f"{name}: {fault}")
         return result, fault
 
-    def _decides(self, given: UpdateInput, template: AttemptOptions) -> bool:
+    def _is_first_motion(self, given: UpdateInput, template: AttemptOptions) -> bool:
         """True for the first motion of a scene, where it may take longer than others and as long as it needs.
 
         A scene that goes on without its carry-over knows no camera; what was held was sought for longer already.
         """
         first = (
-            given.motion is None and given.past.updates == 0 and len(given.past.places) > 0 and not given.past.rejected
+            given.motion is None
+            and given.past.updates == 0
+            and len(given.past.camera_levels) > 0
+            and not given.past.rejected
         )
-        return template is AS_SET and first and given.end is None and self._settings.cold_start_iterations > 1
+        return template is AS_CONFIGURED and first and given.end is None and self._settings.cold_start_iterations > 1
 
-    def _first(self, given: UpdateInput, seed: int, faster: float) -> OrderResult:
-        options = replace(self._options(given, AS_SET), several=True, faster=faster)
+    def _run_one_order(self, given: UpdateInput, seed: int, layer_rate_factor: float) -> OrderResult:
+        options = replace(self._options(given, AS_CONFIGURED), several_orders=True, layer_rate_factor=layer_rate_factor)
         result = self._run(replace(given, seed=seed), given.state, None, options)
-        result, fault = self._validated(given, given.state, result)
-        with self._timed():
+        result, fault = self._check_plausible(given, given.state, result)
+        with self._time_checks():
             views = [view for view in result.views or given.views if view.name not in result.trace.left_out]
-            return OrderResult(result, fault, self._measured(views, result.gaussians) if result.trace.losses else {})
+            return OrderResult(
+                result, fault, self._psnr_by_camera(views, result.gaussians) if result.trace.losses else {}
+            )
 
     def _run(self, given: UpdateInput, start: Gaussians, motion: Motion | None, how: AttemptOptions) -> UpdateResult:
         return self._updater.run(start, given.views, motion, given.seconds, given.seed, how, given.carried)
 
-    def _validated(self, given: UpdateInput, start: Gaussians, result: UpdateResult) -> Validated:
-        with self._timed():
-            return validated(start, result, self._updater.hierarchy.rows, self._factory.rig.radius, given.lengths)
+    def _check_plausible(self, given: UpdateInput, start: Gaussians, result: UpdateResult) -> Validated:
+        with self._time_checks():
+            return check_plausible(start, result, self._updater.hierarchy.rows, self._factory.rig.radius, given.lengths)
 
     @contextmanager
-    def _timed(self) -> Iterator[None]:
+    def _time_checks(self) -> Iterator[None]:
         began = perf_counter()
         yield
-        self.judging += perf_counter() - began
+        self.check_seconds += perf_counter() - began
 
     def _options(self, given: UpdateInput, template: AttemptOptions) -> AttemptOptions:
         """The options of an attempt at a frame, in the manner of a template."""
         settings, past = self._settings, given.past
-        longer = max(template.longer, settings.cold_start_iterations if given.motion is None else 1.0)
-        most, end = round(longer * settings.iterations), None
+        iteration_factor = max(
+            template.iteration_factor, settings.cold_start_iterations if given.motion is None else 1.0
+        )
+        most, end = round(iteration_factor * settings.iterations), None
         if given.end is not None:
-            most, end = MOST_TIMED, self._until(given, template, given.end)
-        stopping = Stopping(most, end=end, each=given.each, gain=settings.stop_gain, first=all_begun(settings))
-        enough = {name: (1 + settings.skip_tolerance) * error for name, error in past.error.items()}
+            most, end = MAX_TIMED, self._attempt_deadline(given, template, given.end)
+        stopping = Stopping(
+            most,
+            end=end,
+            iteration_seconds=given.iteration_seconds,
+            gain=settings.stop_gain,
+            first=latest_start(settings),
+        )
+        skip_below = {name: (1 + settings.skip_tolerance) * error for name, error in past.error.items()}
         return replace(
             template,
             stopping=stopping,
             gate=(lambda first: outliers.misfits(past, first, outliers.FIRST_DB)) if settings.reject_outliers else None,
             compare=settings.reject_outliers or settings.stop_gain > 0,
-            enough=enough if settings.skip_tolerance > -1 and template is AS_SET else None,
-            confirm=lambda: within(self._in_whole(given.views, given.state), enough),
-            usual=past.error,
+            skip_below=skip_below if settings.skip_tolerance > -1 and template is AS_CONFIGURED else None,
+            confirm_skip=lambda: mean_is_within(self._full_size_errors(given.views, given.state), skip_below),
+            reference_errors=past.error,
             step=given.step if given.step < given.seconds else None,
         )
 
-    def _until(self, given: UpdateInput, template: AttemptOptions, end: float) -> float:
+    def _attempt_deadline(self, given: UpdateInput, template: AttemptOptions, end: float) -> float:
         """The moment by which an attempt has to be over: after held frames half is kept for a search."""
         now = perf_counter()
-        return (now + end) / 2 if given.past.rejected and template is AS_SET and now < end else end
+        return (now + end) / 2 if given.past.rejected and template is AS_CONFIGURED and now < end else end
 
-    def _unmet(self, given: UpdateInput, result: UpdateResult) -> str | None:
+    def _misfit_reason(self, given: UpdateInput, result: UpdateResult) -> str | None:
         if not self._settings.reject_outliers:
             return None
-        with self._timed():
-            return outliers.unmet(given.past, result.trace.met, len(result.trace.losses))
+        with self._time_checks():
+            return outliers.misfit_reason(given.past, result.trace.met, len(result.trace.losses))
 
-    def _behind(self, given: UpdateInput, result: UpdateResult) -> str | None:
-        if not self._settings.reject_outliers or self._spent(given):
+    def _lag_reason(self, given: UpdateInput, result: UpdateResult) -> str | None:
+        if not self._settings.reject_outliers or self._budget_is_spent(given):
             return None
-        return outliers.behind(given.past, result.trace.met, len(result.trace.losses))
+        return outliers.lag_reason(given.past, result.trace.met, len(result.trace.losses))
 
-    def _spent(self, given: UpdateInput, more: int = 0) -> bool:
+    def _budget_is_spent(self, given: UpdateInput, more: int = 0) -> bool:
         """True where the budget has no time left for another attempt, with ``more`` iterations before it."""
-        return given.end is not None and perf_counter() + (PROBE + more) * (given.each or 0.0) > given.end
+        return given.end is not None and perf_counter() + (PROBE + more) * (given.iteration_seconds or 0.0) > given.end
 
     def _search(self, given: UpdateInput, tried: UpdateResult, attempts: list[str]) -> UpdateResult | None:
         """Longer attempts, from where the silhouettes say that the object is, and from where ``tried`` ended.
 
         That is the validated end: from a Gaussian that is not finite none comes back. None: all were in vain.
         """
-        if self._spent(given, len(given.views)):
+        if self._budget_is_spent(given, len(given.views)):
             attempts.append("not sought: the budget is spent")
             return None
-        ended = _as_coloured(tried.gaussians, given.state)
+        ended = _with_colours_of(tried.gaussians, given.state)
         starts = [("sought from where the update ended", ended)]
         jump = find_jump(given.state, given.views, self._renderer, self._rig)
         if jump is not None:
             length = float(np.linalg.norm(jump))
-            starts.insert(0, (f"sought {length:.2f} m away", shifted(given.state, jump)))
+            starts.insert(0, (f"sought {length:.2f} m away", shift_moving(given.state, jump)))
         for name, start in starts:
-            if self._spent(given):
+            if self._budget_is_spent(given):
                 attempts.append(f"not {name}: the budget is spent")
                 break
             options = self._options(given, replace(SEARCH, name=name))
             result = self._run(given, start, None, options)
-            result, fault = self._validated(given, start, result)
+            result, fault = self._check_plausible(given, start, result)
             # A few iterations more are no excuse for meeting it less well.
             both = len(tried.trace.losses) + len(result.trace.losses)
-            why = fault or outliers.unmet(given.past, result.trace.met, both)
+            why = fault or outliers.misfit_reason(given.past, result.trace.met, both)
             attempts.append(name if why is None else f"{name}: {why}")
             if why is None:
-                return (result if start is not ended else result.joined(tried)).retold(tried)
+                return (result if start is not ended else result.with_motion_after(tried)).with_errors_of(tried)
         return None
 
-    def _go_on(self, given: UpdateInput, tried: UpdateResult, attempts: list[str]) -> UpdateResult:
+    def _continue_update(self, given: UpdateInput, tried: UpdateResult, attempts: list[str]) -> UpdateResult:
         """On from where an update ended, for longer; the better of both."""
         options = self._options(given, replace(SEARCH, name="on from where the update ended"))
-        result = self._run(given, _as_coloured(tried.gaussians, given.state), None, options)
-        result, fault = self._validated(given, given.state, result)
+        result = self._run(given, _with_colours_of(tried.gaussians, given.state), None, options)
+        result, fault = self._check_plausible(given, given.state, result)
         after, before = (outliers.level_of(given.past, one.trace.met) for one in (result, tried))
         attempts.append(options.name if fault is None else f"{options.name}: {fault}")
-        return result.joined(tried).retold(tried) if fault is None and after > before else tried
+        return result.with_motion_after(tried).with_errors_of(tried) if fault is None and after > before else tried
 
-    def _held(
+    def _rejected(
         self,
         given: UpdateInput,
         outcome: FrameOutcome,
@@ -314,44 +339,44 @@ class FrameSolver:
         )  # fmt: skip
         return result, past
 
-    def _committed(self, given: UpdateInput, result: UpdateResult) -> Solved:
+    def _accepted(self, given: UpdateInput, result: UpdateResult) -> Solved:
         trace, psnr = result.trace, result.trace.fits
-        with self._timed():
+        with self._time_checks():
             # Short updates render a camera long before their end: one that does not fit is looked at once more.
             off = outliers.misfits(given.past, psnr, outliers.LAST_DB)
             again = [view for view in result.views or given.views if view.name in off]
-            psnr |= self._measured([*again, *given.suspects], result.gaussians)
+            psnr |= self._psnr_by_camera([*again, *given.suspects], result.gaussians)
         moved = trace.kept is not Candidate.PREVIOUS or given.past.updates > 0
-        past = outliers.settle(given.past, psnr, given.brightness, result.exposure, len(trace.losses), moved)
+        past = outliers.past_after_update(given.past, psnr, given.brightness, result.exposure, len(trace.losses), moved)
         if trace.errors.get(Candidate.END):
-            errors = by_size(trace.errors[trace.kept], trace.whole)
-            if self._settings.skip_tolerance > -1 and slow(trace.errors, trace.kept):
-                errors |= self._in_whole(result.views or given.views, result.gaussians)
+            errors = label_by_size(trace.errors[trace.kept], trace.whole)
+            if self._settings.skip_tolerance > -1 and is_slow_motion(trace.errors, trace.kept):
+                errors |= self._full_size_errors(result.views or given.views, result.gaussians)
             past = replace(past, error=outliers.usual_errors(given.past.error, errors))
         motion = result.motion if result.motion is not None and result.motion.finite else None
         return replace(result, motion=motion, offsets=outliers.offsets(given.past, psnr)), past
 
-    def _in_whole(self, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
-        with self._timed():
+    def _full_size_errors(self, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
+        with self._time_checks():
             return committed_errors(self._factory.rig, self._renderer, views, state)
 
-    def _measured(self, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
+    def _psnr_by_camera(self, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
         """DB of cameras as a state shows them; those that are left out come back so, once they fit."""
         return {view.name: self._renderer.compare(state, view).psnr for view in views}
 
 
-def _as_coloured(state: Gaussians, before: Gaussians) -> Gaussians:
+def _with_colours_of(state: Gaussians, before: Gaussians) -> Gaussians:
     """A state in the colours of one before: those that followed a motion which was not met lead astray."""
     return state.replace(colours=before.colours)
 
 
-def _standing(given: UpdateInput, trace: UpdateTrace, exposure: float, said: str) -> Solved:
+def _skipped(given: UpdateInput, trace: UpdateTrace, exposure: float, reason: str) -> Solved:
     """Θ_{t−1} shows the frame: nothing was rendered that says how any camera fits, so the usual figures stay."""
     past = replace(
-        given.past, rejected=0, behind=max(1, given.past.behind)
+        given.past, rejected=0, lagging_frames=max(1, given.past.lagging_frames)
     )  # it may go on from here, or from further away
     outcome = FrameOutcome.UNCHANGED
     result = UpdateResult(
-        given.state, given.motion, trace, outcome=outcome, attempts=[said], exposure=exposure, carried=given.carried
+        given.state, given.motion, trace, outcome=outcome, attempts=[reason], exposure=exposure, carried=given.carried
     )
     return result, past

@@ -62,7 +62,7 @@ Array = NDArray[np.float32]
 Row = tuple[float, ...]
 
 
-class Look(NamedTuple):
+class PictureTiming(NamedTuple):
     """Moment of one picture: ``offset`` of a frame's way after the state (+) or before it (−); its ``variance``."""
 
     offset: float
@@ -70,7 +70,7 @@ class Look(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Looks:
+class CameraTimingSums:
     """The looks at one camera, as sums that forget.
 
     Attributes:
@@ -85,11 +85,11 @@ class Looks:
     frame: float = 0.0
     last: float = -1.0
 
-    def with_look(self, look: Look, way: float, frame: float) -> Looks:
+    def with_picture(self, look: PictureTiming, way: float, frame: float) -> CameraTimingSums:
         """With one more; ``way``: seconds from Θ_{t−1} to Θ_t, ``frame``: from the frame before."""
         weight = 1 / (NEIGHBOURS * look.variance + USUAL**2)
         seconds = way * min(FARTHEST, max(-FARTHEST, look.offset))
-        return Looks(
+        return CameraTimingSums(
             KEEPS * self.weight + weight,
             KEEPS**2 * self.squares + weight**2,
             KEEPS * self.offset + weight * seconds,
@@ -116,7 +116,7 @@ class Looks:
         return sqrt(spread / (self.count - 1) + APART**2) if self.count > 1 else inf
 
 
-def noted(
+def record_timing(
     past: Past, before: Gaussians, result: UpdateResult, renderer: Renderer, way: float, frame: float, index: int
 ) -> Past:
     """The past with the looks at some cameras of a frame; the same where it says nothing.
@@ -132,11 +132,13 @@ def noted(
     plain = result.outcome is FrameOutcome.UPDATED and len(result.attempts) == 1 and result.exposure == 1.0
     if not plain or past.updates < 2 or trace.kept is Candidate.PREVIOUS or not trace.shown:
         return past
-    looks = {name: Looks(*row) for name, row in past.timing.items()}
+    looks = {name: CameraTimingSums(*row) for name, row in past.timing.items()}
     views = [one for one in result.views if one.name in trace.shown and one.name not in trace.left_out]
-    views = [one for one in views if not past.is_out(one.name)]
-    views.sort(key=lambda one: looks.get(one.name, Looks()).last)  # who has waited longest, in the rig's order
-    (ahead, back), most = moments(before, after), max(1, min(LOOKS, trace.iterations // ITERATIONS))
+    views = [one for one in views if not past.is_left_out(one.name)]
+    views.sort(
+        key=lambda one: looks.get(one.name, CameraTimingSums()).last
+    )  # who has waited longest, in the rig's order
+    (ahead, back), most = half_frame_states(before, after), max(1, min(LOOKS, trace.iterations // ITERATIONS))
     for view in views[:most]:
         every, planes = trace.shown[view.name]
         states = (ahead, back) if trace.kept is Candidate.END else (ahead, back, after)  # the end was shown
@@ -145,17 +147,17 @@ def noted(
         shifts = measure_shift(
             view.target[:3, ::every, ::every], *(_exposed(view, one) for one in (shown, here, there))
         )
-        known = replace(looks.get(view.name, Looks()), last=float(index))
-        looks[view.name] = known if shifts is None else known.with_look(shifts, way, frame)
+        known = replace(looks.get(view.name, CameraTimingSums()), last=float(index))
+        looks[view.name] = known if shifts is None else known.with_picture(shifts, way, frame)
     return replace(past, timing={name: astuple(one) for name, one in looks.items()})
 
 
-def astuple(looks: Looks) -> Row:
+def astuple(looks: CameraTimingSums) -> Row:
     """As ``Past.timing`` has it."""
     return looks.weight, looks.squares, looks.offset, looks.spread, looks.frame, looks.last
 
 
-def moments(before: Gaussians, after: Gaussians) -> tuple[Gaussians, Gaussians]:
+def half_frame_states(before: Gaussians, after: Gaussians) -> tuple[Gaussians, Gaussians]:
     """Θ_t half of a frame on and half of it back, along the way from Θ_{t−1}; only places and shapes change."""
     rows = np.flatnonzero(after.moving)
     ways = [(name, HALF * (getattr(after, name)[rows] - getattr(before, name)[rows])) for name in ("means", "factors")]
@@ -177,7 +179,7 @@ def _exposed(view: TrainingView, shown: Array) -> Array:
     return exposed
 
 
-def measure_shift(target: Array, shown: Array, ahead: Array, back: Array) -> Look | None:
+def measure_shift(target: Array, shown: Array, ahead: Array, back: Array) -> PictureTiming | None:
     """The moment of a picture; None: too little of it changes.
 
     Of its residual what goes with the change is separated from what goes with the bend of the change, which is that
@@ -203,12 +205,14 @@ def measure_shift(target: Array, shown: Array, ahead: Array, back: Array) -> Loo
             usual = max(QUIETEST, 1.4826 * float(np.median(np.abs(left))))
             weights = 1 / (1 + np.square(left / (CAUCHY * usual)))
     variance = float(weights @ np.square(left) / weights.sum() * inverse[0, 0])
-    return Look(float(numbers[0] / min(2.0, max(0.5, 1 + numbers[2]))), variance)  # the change has the gain too
+    return PictureTiming(
+        float(numbers[0] / min(2.0, max(0.5, 1 + numbers[2]))), variance
+    )  # the change has the gain too
 
 
 def timings(past: Past) -> dict[str, CameraTiming]:
     """By camera, the moment at which its pictures seem to be taken; only of those of which it is known well enough."""
-    looks = {name: Looks(*row) for name, row in past.timing.items()}
+    looks = {name: CameraTimingSums(*row) for name, row in past.timing.items()}
     known = {name: one for name, one in looks.items() if one.count >= ENOUGH and one.error <= MAX_ERROR}
     if len(known) < CAMERAS:
         return {}

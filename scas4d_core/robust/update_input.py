@@ -29,9 +29,10 @@ class UpdateInput:
         lengths: [N, 3] metres, of the axes in frame 0.
         exposure, left_out, unusable: by the brightness of the pictures, see ``checks.check_brightness``.
         light_moves: whether it goes on from frame to frame, see ``checks.goes_on``.
-        rests: whether the pictures have shown nothing to move yet, where they decide which Gaussians move.
+        may_be_static: whether the pictures have shown nothing to move yet, where they decide which Gaussians move.
         same: cameras whose picture is that of the last frame that was believed. sharp: ``alarms.sharpness`` of each.
-        end: moment by which the last iteration has to be over. each: seconds of an iteration in the updates before.
+        end: moment by which the last iteration has to be over. iteration_seconds: seconds of an iteration in the
+            updates before.
     """
 
     state: Gaussians
@@ -46,11 +47,11 @@ class UpdateInput:
     lengths: NDArray[np.float32]
     exposure: float = 1.0
     light_moves: bool = False
-    rests: bool = False
+    may_be_static: bool = False
     same: Collection[str] = ()
     sharp: Mapping[str, float] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     unusable: str | None = None
     carried: Mapping[str, Arrays] = field(default_factory=dict)
     end: float | None = None
-    each: float | None = None
+    iteration_seconds: float | None = None

@@ -154,7 +154,7 @@ def extend_roots(roots: Gaussians, state: Gaussians, parents: Int | None) -> Gau
         means[which] = roots.means[rows] + _turned(turn, means[which] - state.means[rows])
         factors[which] = turn @ factors[which]
         rotations[which] = quaternion_products(back, rotations[which])
-        roots = roots.joined(
+        roots = roots.concatenate(
             born.replace(
                 means=means.astype(np.float32),
                 factors=factors.astype(np.float32),

@@ -84,7 +84,7 @@ class HistoryReader(FramesReader):
         for birth in births:
             born = self._born(birth)
             given = {name: born[name] for name in (*FIXED, *PER_FRAME)}
-            roots = roots.joined(Gaussians(**given | {name: born[ROOT + name] for name in ROOTS}))
+            roots = roots.concatenate(Gaussians(**given | {name: born[ROOT + name] for name in ROOTS}))
         fixed = self._fixed_after(births)
         return roots.replace(ids=fixed["ids"], retired=retired_after(log, fixed["ids"]))
 
@@ -97,7 +97,7 @@ class HistoryReader(FramesReader):
         for birth in births_in(log):
             born = self._born(birth)
             if self.rows_of(birth[1:2])[0] >= len(state):
-                state = state.joined(Gaussians(**{name: born[name] for name in (*FIXED, *PER_FRAME)}))
+                state = state.concatenate(Gaussians(**{name: born[name] for name in (*FIXED, *PER_FRAME)}))
         later = next((one for one in self._times if one > index), None)
         back = revived_in(log, index, state.ids)
         if later is None or not len(back):

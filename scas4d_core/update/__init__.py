@@ -12,7 +12,7 @@ The values that one update passes through, from ``Reconstruction.step`` to the c
 2. ``checkpoint.CarryOver``: all that the update before left beside Θ_{t−1}; in the end, that of this one.
 3. ``robust.outliers.Past``: the usual figures of the scene and its cameras; a part of the carry-over.
 4. ``warm_start.Motion``: the motion of the update before; a part of the carry-over.
-5. ``preparation.Prepared``: the updater for today's clusters and effects, with the carry-over.
+5. ``preparation.PreparedUpdate``: the updater for today's clusters and effects, with the carry-over.
 6. ``robust.update_input.UpdateInput``: the above, and the limits in time, for one frame.
 7. ``result.AttemptOptions``: how one attempt at the frame is made.
 8. ``result.UpdateTrace``: the record of an attempt.

@@ -33,7 +33,7 @@ ALIASED = 2.0
 smaller than their pixels, and no motion, and whole pictures are compared."""
 
 
-def spread(rig: Rig, names: Sequence[str], count: int = VIEWS) -> list[str]:
+def spread_cameras(rig: Rig, names: Sequence[str], count: int = VIEWS) -> list[str]:
     """So many of the cameras, as far apart as can be: each next one is the farthest from those taken."""
     centres = np.array([rig[name].centre for name in names])
     return [names[index] for index in farthest_first(centres, count)]
@@ -57,18 +57,18 @@ SLOW = 0.5
 ones looked at."""
 
 
-def by_size(errors: Mapping[str, float], whole: bool) -> dict[str, float]:
+def label_by_size(errors: Mapping[str, float], whole: bool) -> dict[str, float]:
     """Errors under names that distinguish whole pictures, whose errors are smaller, from small ones.
 
-    >>> by_size({"c0": 0.1}, whole=True)
+    >>> label_by_size({"c0": 0.1}, whole=True)
     {'c0 whole': 0.1}
     """
     return {name + WHOLE if whole else name: error for name, error in errors.items()}
 
 
 def probe_views(rig: Rig, views: Sequence[TrainingView], count: int = VIEWS) -> list[TrainingView]:
-    """Those of the views that compare states, ``spread`` over the rig."""
-    chosen = set(spread(rig, [view.name for view in views], count))
+    """Those of the views that compare states, ``spread_cameras`` over the rig."""
+    chosen = set(spread_cameras(rig, [view.name for view in views], count))
     return [view for view in views if view.name in chosen]
 
 
@@ -76,7 +76,7 @@ class ProbeViews:
     """Fixed training views for comparing states: the engine gets ``views`` as the probes of a frame.
 
     Args:
-        factory: of the rig. engine: compares. views: of the frame; ``spread`` of them are taken; of none
+        factory: of the rig. engine: compares. views: of the frame; ``spread_cameras`` of them are taken; of none
             nothing is compared.
 
     Attributes:
@@ -110,7 +110,7 @@ class ProbeViews:
                 self._compared, self.whole = self._whole, True
         return self._errors(self._compared, moved, learnt)
 
-    def whole_errors(self, *, moved: bool, learnt: bool) -> dict[str, float]:
+    def full_size_errors(self, *, moved: bool, learnt: bool) -> dict[str, float]:
         """As ``errors``, in whole pictures."""
         return self._errors(self._whole, moved, learnt)
 
@@ -118,10 +118,10 @@ class ProbeViews:
         return dict(zip(self._names, self._engine.probe(which, moved=moved, learnt=learnt), strict=True))
 
 
-def slow(errors: Mapping[Candidate, Mapping[str, float]], kept: Candidate) -> bool:
+def is_slow_motion(errors: Mapping[Candidate, Mapping[str, float]], kept: Candidate) -> bool:
     """True where Θ_{t−1} shows a frame nearly (``SLOW``) as well as what was kept; ``errors`` by probe view.
 
-    >>> slow({Candidate.PREVIOUS: {"a": 1.4}, Candidate.END: {"a": 1.0}}, Candidate.END)
+    >>> is_slow_motion({Candidate.PREVIOUS: {"a": 1.4}, Candidate.END: {"a": 1.0}}, Candidate.END)
     True
     """
     still, ended = errors.get(Candidate.PREVIOUS, {}), errors.get(kept, {})
@@ -176,56 +176,58 @@ class BestState:
                 as long as since the motion was measured.
         """
         motion = self._motion
-        self._note(Candidate.PREVIOUS, self._probes.errors(moved=False, learnt=False))
+        self._record(Candidate.PREVIOUS, self._probes.errors(moved=False, learnt=False))
         tables = self._set(motion)
         if motion is not None and self.errors:
-            self._note(Candidate.WARM, self._probes.errors(moved=True, learnt=False))
+            self._record(Candidate.WARM, self._probes.errors(moved=True, learnt=False))
             if step is not None:
-                tables = self._try_after_rest(motion, step)
+                tables = self._try_after_pause(motion, step)
             if self._mean(Candidate.PREVIOUS) < self._mean(Candidate.WARM):
                 tables = self._set(None)
         return tables
 
-    def _try_after_rest(self, motion: Motion, step: float) -> Tables:
+    def _try_after_pause(self, motion: Motion, step: float) -> Tables:
         """The motion for the time since the frame before alone, kept where it shows the frame better."""
         whole, errors = self.seconds, self.errors[Candidate.WARM]
         self.seconds = step
         tables = self._set(motion)
-        self._note(Candidate.WARM, self._probes.errors(moved=True, learnt=False))
+        self._record(Candidate.WARM, self._probes.errors(moved=True, learnt=False))
         if mean_error(errors, list(errors)) <= self._mean(Candidate.WARM):
             self.seconds, self.errors[Candidate.WARM] = whole, errors
             tables = self._set(motion)
         return tables
 
-    def stands(self, enough: Mapping[str, float] | None, confirm: Callable[[], bool] | None = None) -> bool:
-        """True where Θ_{t−1} shows this frame as well as ``enough``, errors ``by_size``, and ``confirm`` agrees.
+    def can_skip(self, skip_below: Mapping[str, float] | None, confirm_skip: Callable[[], bool] | None = None) -> bool:
+        """True where Θ_{t−1} shows this frame as well as ``skip_below``, errors ``label_by_size``, and
+        ``confirm_skip`` agrees.
 
         None: never, and without being asked.
         """
         still = self.errors.get(Candidate.PREVIOUS)
         if (
-            enough is None
+            skip_below is None
             or still is None
             or self._mean(Candidate.PREVIOUS) > self._mean(Candidate.WARM, otherwise=np.inf)
         ):
             return False
-        return within(by_size(still, self.whole), enough) and (confirm is None or confirm())
+        return mean_is_within(label_by_size(still, self.whole), skip_below) and (confirm_skip is None or confirm_skip())
 
-    def unexplained(self, usual: Mapping[str, float] | None) -> float:
+    def unexplained(self, reference_errors: Mapping[str, float] | None) -> float:
         """Share of what changed since Θ_{t−1} that the motion before leaves: about 0 to 1.
 
         1 where nothing is compared, there was no motion before, or nothing changed.
 
-        What stands is met no better by any motion; ``usual``, errors ``by_size`` of updates at their end, takes it out.
+        What stands is met no better by any motion; ``reference_errors``, errors ``label_by_size`` of updates at their
+        end, takes it out.
         """
         still, warm = (self.errors.get(candidate) for candidate in (Candidate.PREVIOUS, Candidate.WARM))
-        if still is None or warm is None or not usual:
+        if still is None or warm is None or not reference_errors:
             return 1.0
-        names = sorted(by_size(still, self.whole).keys() & usual.keys())
+        names = sorted(label_by_size(still, self.whole).keys() & reference_errors.keys())
         if not names:
             return 1.0
-        unmoved, led = (mean_error(by_size(errors, self.whole), names) for errors in (still, warm))
-        met = mean_error(usual, names)
+        unmoved, led = (mean_error(label_by_size(errors, self.whole), names) for errors in (still, warm))
+        met = mean_error(reference_errors, names)
         return (led - met) / (unmoved - met) if unmoved > met else 1.0
 
     def error(self) -> float:
@@ -242,30 +244,30 @@ class BestState:
         if not self.errors:
             return Candidate.END
         if iterations:
-            self._note(Candidate.END, self._probes.errors(moved=True, learnt=True))
+            self._record(Candidate.END, self._probes.errors(moved=True, learnt=True))
         names = [name for name in self.errors[Candidate.PREVIOUS] if name not in left_out]
         compared = [candidate for candidate in Candidate if candidate in self.errors]  # of equal ones the first
-        best = min(compared, key=lambda candidate: _or_last(mean_error(self.errors[candidate], names)))
+        best = min(compared, key=lambda candidate: _nan_to_inf(mean_error(self.errors[candidate], names)))
         if best is not Candidate.END and iterations and not self.whole:
-            best = self._best_in_whole(best, left_out)
+            best = self._best_at_full_size(best, left_out)
         if best is not Candidate.END:
-            self._put(best)
+            self._set_candidate(best)
         return best
 
-    def _best_in_whole(self, best: Candidate, left_out: Mapping[str, str]) -> Candidate:
+    def _best_at_full_size(self, best: Candidate, left_out: Mapping[str, str]) -> Candidate:
         """The best candidate in whole pictures: slow motion may show in them alone. Of equal ones ``best`` is taken.
 
         The tables are left as they ended.
         """
         ended = self._engine.tables()
-        errors = {Candidate.END: self._in_whole(True, left_out)}
+        errors = {Candidate.END: self._full_size_error(True, left_out)}
         for candidate in self.errors.keys() - {Candidate.END}:
-            self._put(candidate)
-            errors[candidate] = self._in_whole(False, left_out)
+            self._set_candidate(candidate)
+            errors[candidate] = self._full_size_error(False, left_out)
         self._engine.set_tables(ended)
         return min(errors, key=lambda candidate: (errors[candidate], candidate is not best))
 
-    def _put(self, candidate: Candidate) -> None:
+    def _set_candidate(self, candidate: Candidate) -> None:
         """Sets the engine's tables to the start that a candidate is."""
         self._set(self._motion if candidate is Candidate.WARM else None)
 
@@ -274,30 +276,30 @@ class BestState:
         self._engine.set_tables(tables)
         return tables
 
-    def _note(self, candidate: Candidate, errors: dict[str, float]) -> None:
+    def _record(self, candidate: Candidate, errors: dict[str, float]) -> None:
         if errors:
             self.errors[candidate] = errors
 
-    def _in_whole(self, learnt: bool, left_out: Mapping[str, str]) -> float:
+    def _full_size_error(self, learnt: bool, left_out: Mapping[str, str]) -> float:
         """Mean error in whole pictures, but for cameras that have no say; not a number counts as infinite."""
-        errors = self._probes.whole_errors(moved=True, learnt=learnt)
-        return _or_last(mean_error(errors, [name for name in errors if name not in left_out]))
+        errors = self._probes.full_size_errors(moved=True, learnt=learnt)
+        return _nan_to_inf(mean_error(errors, [name for name in errors if name not in left_out]))
 
     def _mean(self, candidate: Candidate, otherwise: float = np.inf) -> float:
         errors = self.errors.get(candidate)
         return otherwise if errors is None else mean_error(errors, list(errors))
 
 
-def within(errors: Mapping[str, float], limits: Mapping[str, float]) -> bool:
+def mean_is_within(errors: Mapping[str, float], limits: Mapping[str, float]) -> bool:
     """True where the mean error of the views that have a limit is within the mean of these; false where none has.
 
-    >>> within({"a": 1.0, "b": 3.0}, {"a": 2.0, "b": 2.0}), within({"a": 1.0}, {"b": 2.0})
+    >>> mean_is_within({"a": 1.0, "b": 3.0}, {"a": 2.0, "b": 2.0}), mean_is_within({"a": 1.0}, {"b": 2.0})
     (True, False)
     """
     names = sorted(errors.keys() & limits.keys())
     return bool(names) and mean_error(errors, names) <= mean_error(limits, names)
 
 
-def _or_last(value: float) -> float:
+def _nan_to_inf(value: float) -> float:
     """Not a number comes last."""
     return value if value == value else np.inf

@@ -22,7 +22,7 @@ from scas4d_core.structure.neighbours import Neighbours
 from scas4d_core.update.best_state import BestState, ProbeViews
 from scas4d_core.update.parts import NOTHING, Arrays, Attempt, PlanBuilder
 from scas4d_core.update.rates import Rates
-from scas4d_core.update.result import AS_SET, AttemptOptions, Gate, Stopwatch, UpdateResult, UpdateTrace
+from scas4d_core.update.result import AS_CONFIGURED, AttemptOptions, Gate, Stopwatch, UpdateResult, UpdateTrace
 from scas4d_core.update.schedule import Stopping, ViewPlan, plan_samples
 from scas4d_core.update.warm_start import Motion, predicted
 
@@ -55,7 +55,7 @@ class FrameUpdate:
         self.settings, self.hierarchy = built.update, built.hierarchy
         self._engine, self.plan, self._parts, self._factory = engine, built.plan, built.parts, built.factory
         rates = Rates.of(self.settings, len(self.hierarchy.sizes), self._factory.rig.reach)
-        self._rates = rates.freed(self.plan.freedom)
+        self._rates = rates.restricted_to(self.plan.freedom)
         engine.bind(self.plan, structure_of(self.hierarchy, neighbours, built.first))
 
     def run(
@@ -65,7 +65,7 @@ class FrameUpdate:
         motion: Motion | None,
         seconds: float,
         seed: int,
-        options: AttemptOptions = AS_SET,
+        options: AttemptOptions = AS_CONFIGURED,
         carried: Mapping[str, Arrays] = NOTHING,
     ) -> UpdateResult:
         """Find D_t and apply it.
@@ -93,7 +93,7 @@ class FrameUpdate:
             part.begin(attempt)
         engine.set_tables(attempt.tables)
         engine.begin(self._start(rates, samples, attempt.gains, watch))
-        if not self.plan.always_updates and best.stands(options.enough, options.confirm):
+        if not self.plan.disables_skip and best.can_skip(options.skip_below, options.confirm_skip):
             stopping = Stopping(0)
         watch.lap("start")
         rendered: set[int] = set()
@@ -105,17 +105,17 @@ class FrameUpdate:
             step = self._step(rates, iteration, planned, planned_before or planned, len(samples))
             engine.iterate(chosen, step)  # cascade, render, compare, backward, Adam
             iteration, planned_before = iteration + 1, planned
-            trace.moments.append(watch.total)
+            trace.iteration_ends.append(watch.total)
             watch.lap(REPORT)
             all_seen = len(rendered) == len(views)
             rendered.update(chosen)
             if options.gate is not None and not all_seen and len(rendered) == len(views):
                 self._exclude_outliers(options.gate, attempt, order, trace)
                 watch.lap("judge")
-            if stopping.looks(iteration):
-                stopping.saw(iteration, best.error())
+            if stopping.needs_error(iteration):
+                stopping.record_error(iteration, best.error())
                 watch.lap("looks")
-        trace.take(engine.log(), views)
+        trace.load_log(engine.log(), views)
         trace.planned, trace.errors = stopping.planned_so_far, best.errors
         trace.kept = attempt.kept = best.end(iteration, trace.left_out)
         trace.whole = best.whole
@@ -129,7 +129,7 @@ class FrameUpdate:
 
     def _exclude_outliers(self, gate: Gate, attempt: Attempt, order: ViewPlan, trace: UpdateTrace) -> None:
         """Exclude cameras that do not fit from the rest of an attempt; called once each camera was rendered."""
-        trace.take(self._engine.log(), attempt.views)
+        trace.load_log(self._engine.log(), attempt.views)
         trace.left_out.update(gate(trace.first))
         excluded = [index for index, view in enumerate(attempt.views) if view.name in trace.left_out]
         order.leave_out(excluded)
@@ -148,18 +148,20 @@ class FrameUpdate:
 
     def _rates_of(self, options: AttemptOptions, motion: Motion | None, best: BestState) -> Rates:
         """The rates of an attempt: as set, and by how near the motion before leads."""
-        rates = self._rates.tried(options.rates, options.rigid, options.hold_colours)
+        rates = self._rates.for_attempt(options.rates, options.rigid, options.freeze_colours)
         if motion is None:
-            return rates.cold(options.faster * self.settings.cold_start_rates, options.several)
-        return rates.warm(best.unexplained(options.usual))
+            return rates.for_cold_start(
+                options.layer_rate_factor * self.settings.cold_start_rates, options.several_orders
+            )
+        return rates.for_warm_start(best.unexplained(options.reference_errors))
 
     def _start(
         self, rates: Rates, samples: Sequence[NDArray[np.int64]], gains: Array | None, watch: Stopwatch
     ) -> AttemptStart:
-        moving, standing = rates.of_colours(self.plan.colours)
+        moving, static = rates.colour_rates(self.plan.colours)
         return AttemptStart(
             layers=rates.layers, position=rates.position, rotation=rates.rotation, scale=rates.scale,
-            colour=moving, static_colour=standing, beta1=rates.beta1, beta2=rates.beta2,
+            colour=moving, static_colour=static, beta1=rates.beta1, beta2=rates.beta2,
             samples=samples, gains=gains, curve=self.curve, lap=watch.lap,
         )  # fmt: skip
 
@@ -174,9 +176,9 @@ class FrameUpdate:
         if self.plan.rigidity_fades:  # at the end of an update positions are better known than turns
             rigidity *= 0.5 * (1 + cos(pi * min(1.0, iteration / planned_before)))
         return StepScalars(
-            resting=rates.resting(iteration, planned),
+            frozen=rates.frozen_layers(iteration, planned),
             layers=tuple(
-                rates.factor(iteration, planned, rates.start_of(layer), rates.rest_of(layer))
+                rates.factor(iteration, planned, rates.layer_start(layer), rates.layer_end(layer))
                 for layer in range(len(rates.layers))
             ),
             own=rates.factor(iteration, planned, rates.start, 1.0),

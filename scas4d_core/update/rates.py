@@ -27,10 +27,10 @@ LAYER_STARTS = (0.0, 0.2, 0.4)
 """Share of the iterations after which a layer begins to learn, coarse to fine; with more layers the last is repeated.
 The coarse motion is found first: all at once, the finer layers take a part of it, each cluster another."""
 
-LAYER_RESTS = (0.5, 0.75, 1.0)
+LAYER_ENDS = (0.5, 0.75, 1.0)
 """Share of the iterations after which a layer rests, coarse to fine. 0.5 to 0.6 and 0.7 to 0.8 came out alike
 (docs/tried.md)."""
-FIRST_RESTS = (0.8, 0.9, 1.0)
+FIRST_UPDATE_LAYER_ENDS = (0.8, 0.9, 1.0)
 """The same of the first update, which is tried in several orders of its views: what one has not found by then, another
 finds. It gained 0.0 to 0.5 dB (docs/tried.md)."""
 NEAR_FINEST = 4.0
@@ -54,10 +54,10 @@ def first_iteration(start: float, iterations: int) -> int:
     return round(start * iterations)
 
 
-def learning(start: float, rest: float, iterations: int) -> range:
+def learning_span(start: float, rest: float, iterations: int) -> range:
     """The iterations, from 0, in which what learns from one share of all to another takes its steps: one at least.
 
-    >>> learning(0.25, 0.75, 8), learning(0.4, 0.5, 2)
+    >>> learning_span(0.25, 0.75, 8), learning_span(0.4, 0.5, 2)
     (range(2, 6), range(1, 2))
     """
     first = first_iteration(start, iterations)
@@ -74,9 +74,9 @@ class Rates:
         end: rates fall to this fraction in the last iteration before what they are of rests, or the update ends, along
             half a cosine; 1 keeps them.
         beta1, beta2: Adam's decays.
-        starts: share of the iterations after which a layer begins, one a layer; what is missing begins at once.
-        rests: share of the iterations after which it rests; what is missing goes on to the end.
-        start: as ``starts``, of the Gaussians' own Δp, ΔR, Δs.
+        layer_starts: share of the iterations after which a layer begins, one a layer; what is missing begins at once.
+        layer_ends: share of the iterations after which it rests; what is missing goes on to the end.
+        start: as ``layer_starts``, of the Gaussians' own Δp, ΔR, Δs.
     """
 
     layers: tuple[tuple[float, float, float], ...]
@@ -88,8 +88,8 @@ class Rates:
     end: float = 1.0
     beta1: float = 0.9
     beta2: float = 0.999
-    starts: tuple[float, ...] = ()
-    rests: tuple[float, ...] = ()
+    layer_starts: tuple[float, ...] = ()
+    layer_ends: tuple[float, ...] = ()
     start: float = 0.0
 
     def factor(self, iteration: int, iterations: int, start: float = 0.0, rest: float = 1.0) -> float:
@@ -101,30 +101,32 @@ class Rates:
         >>> [round(rates.factor(i, 8, 0.25, 0.75), 2) for i in range(8)]
         [0.0, 0.0, 1.0, 0.8, 0.4, 0.2, 0.0, 0.0]
         """
-        span = learning(start, rest, iterations)
+        span = learning_span(start, rest, iterations)
         if iteration not in span:
             return 0.0
         done = (iteration - span.start) / max(1, len(span) - 1)
         return self.end + (1 - self.end) * 0.5 * (1 + cos(pi * done))
 
-    def start_of(self, layer: int) -> float:
+    def layer_start(self, layer: int) -> float:
         """Share of the iterations after which a layer begins."""
-        return self.starts[layer] if layer < len(self.starts) else 0.0
+        return self.layer_starts[layer] if layer < len(self.layer_starts) else 0.0
 
-    def rest_of(self, layer: int) -> float:
+    def layer_end(self, layer: int) -> float:
         """Share of the iterations after which a layer rests; 1 where it goes on to the end."""
-        return self.rests[layer] if layer < len(self.rests) else 1.0
+        return self.layer_ends[layer] if layer < len(self.layer_ends) else 1.0
 
-    def resting(self, iteration: int, iterations: int) -> int:
+    def frozen_layers(self, iteration: int, iterations: int) -> int:
         """Number of layers, from the coarsest on, that do not learn any more in an iteration counted from 0."""
-        ends = (learning(self.start_of(k), self.rest_of(k), iterations).stop for k in range(len(self.rests)))
-        return next((k for k, end in enumerate(ends) if iteration < end), len(self.rests))
+        ends = (
+            learning_span(self.layer_start(k), self.layer_end(k), iterations).stop for k in range(len(self.layer_ends))
+        )
+        return next((k for k, end in enumerate(ends) if iteration < end), len(self.layer_ends))
 
-    def freed(self, freedom: Freedom) -> Rates:
+    def restricted_to(self, freedom: Freedom) -> Rates:
         """The rates with those of the deformation's parameters that are not free at 0.
 
         >>> rates = Rates(((0.1, 0.2, 0.3),), position=0.4, rotation=0.5, scale=0.6, colour=0.7)
-        >>> rates.freed(Freedom(cluster_translation=True, own_scale=True))
+        >>> rates.restricted_to(Freedom(cluster_translation=True, own_scale=True))
         Rates(layers=((0.0, 0.2, 0.0),), position=0.0, rotation=0.0, scale=0.6, colour=0.7, ...)
         """
         free = (freedom.cluster_rotation, freedom.cluster_translation, freedom.cluster_scaling)
@@ -136,40 +138,46 @@ class Rates:
             scale=self.scale * freedom.own_scale,
         )
 
-    def of_colours(self, plan: ColourPlan | None) -> tuple[float, float]:
+    def colour_rates(self, plan: ColourPlan | None) -> tuple[float, float]:
         """Rates of the colours of moving and of static Gaussians, as a plan frees them."""
         if plan is None:
             return 0.0, 0.0
-        moving, standing = self.colour, self.static_colour
+        moving, static = self.colour, self.static_colour
         if plan.changing_light:
-            standing = FASTER_IN_CHANGING_LIGHT * standing
-            moving = max(moving, standing)
-        return moving if plan.moving else 0.0, standing if plan.standing else 0.0
+            static = FASTER_IN_CHANGING_LIGHT * static
+            moving = max(moving, static)
+        return moving if plan.moving else 0.0, static if plan.static else 0.0
 
-    def cold(self, factor: float, several: bool = False) -> Rates:
+    def for_cold_start(self, factor: float, several_orders: bool = False) -> Rates:
         """Without a motion to start from: layers turn and shift faster, as there is further to go.
 
-        None rests but in an update that is tried in ``several`` orders of its views.
+        None rests but in an update that is tried in ``several_orders`` orders of its views.
         """
         layers = tuple((factor * r, factor * t, scaling) for r, t, scaling in self.layers)
-        return replace(self, layers=layers, rests=_of_layers(FIRST_RESTS, self.starts) if several else ())
+        return replace(
+            self,
+            layers=layers,
+            layer_ends=_layer_ends(FIRST_UPDATE_LAYER_ENDS, self.layer_starts) if several_orders else (),
+        )
 
-    def warm(self, unexplained: float) -> Rates:
+    def for_warm_start(self, unexplained: float) -> Rates:
         """From the motion before, where that leaves so much of what changed unexplained.
 
         Where it leads near (``NEAR``), layers rest, and what is below them learns faster; else none rests.
         """
         if not unexplained <= NEAR:  # or not a number
-            return replace(self, rests=())
+            return replace(self, layer_ends=())
         if len(self.layers) < 2:
             return self
         *above, (rotation, translation, scaling) = self.layers
         layers = (*above, (NEAR_FINEST * rotation, NEAR_FINEST * translation, NEAR_FINEST * scaling))
         return replace(self, layers=layers, position=NEAR_OWN * self.position)
 
-    def tried(self, factor: float, rigid: bool, hold_colours: bool) -> Rates:
-        """All rates times a factor; ``rigid``: of clusters that turn and shift only; ``hold_colours``: colours stay."""
-        if (factor, rigid, hold_colours) == (1.0, False, False):
+    def for_attempt(self, factor: float, rigid: bool, freeze_colours: bool) -> Rates:
+        """All rates times a factor; ``rigid``: of clusters that turn and shift only; ``freeze_colours``: colours
+        stay.
+        """
+        if (factor, rigid, freeze_colours) == (1.0, False, False):
             return self
         own = 0.0 if rigid else factor
         return replace(
@@ -178,14 +186,14 @@ class Rates:
             position=own * self.position,
             rotation=own * self.rotation,
             scale=own * self.scale,
-            colour=0.0 if hold_colours else factor * self.colour,
-            static_colour=0.0 if hold_colours else factor * self.static_colour,
+            colour=0.0 if freeze_colours else factor * self.colour,
+            static_colour=0.0 if freeze_colours else factor * self.static_colour,
         )
 
     @classmethod
     def of(cls, settings: UpdateSettings, layers: int, radius: float) -> Rates:
         """The rates of a scene whose cameras reach ``radius`` metres (``Rig.reach``), for so many layers."""
-        starts = tuple(LAYER_STARTS[min(k, len(LAYER_STARTS) - 1)] for k in range(layers))
+        layer_starts = tuple(LAYER_STARTS[min(k, len(LAYER_STARTS) - 1)] for k in range(layers))
         named = [settings.layer_rates[min(k, len(settings.layer_rates) - 1)] for k in range(layers)]
         return cls(
             layers=tuple((r.rotation, r.translation * radius / STANDARD_RADIUS_M, RATE_SCALING) for r in named),
@@ -197,18 +205,20 @@ class Rates:
             end=settings.final_rate,
             beta1=settings.beta1,
             beta2=settings.beta2,
-            starts=starts,
-            rests=_of_layers(LAYER_RESTS, starts),
+            layer_starts=layer_starts,
+            layer_ends=_layer_ends(LAYER_ENDS, layer_starts),
             start=settings.deltas_start,
         )
 
 
-def _of_layers(rests: tuple[float, ...], starts: tuple[float, ...]) -> tuple[float, ...]:
-    """When each layer rests: of fewer layers the last of ``rests``, of more the first is repeated; none too soon."""
-    ends = (rests[max(k - len(starts), -len(rests))] for k in range(len(starts)))
-    return tuple(min(1.0, max(end, start + LEAST_TIME)) for end, start in zip(ends, starts, strict=True))
+def _layer_ends(layer_ends: tuple[float, ...], layer_starts: tuple[float, ...]) -> tuple[float, ...]:
+    """When each layer rests: of fewer layers the last of ``layer_ends``, of more the first is repeated; none too
+    soon.
+    """
+    ends = (layer_ends[max(k - len(layer_starts), -len(layer_ends))] for k in range(len(layer_starts)))
+    return tuple(min(1.0, max(end, start + LEAST_TIME)) for end, start in zip(ends, layer_starts, strict=True))
 
 
-def all_begun(settings: UpdateSettings) -> float:
+def latest_start(settings: UpdateSettings) -> float:
     """Share of the iterations after which every layer and the Gaussians' own deltas learn."""
     return max(settings.deltas_start, *LAYER_STARTS)

@@ -60,38 +60,40 @@ class AttemptOptions:
 
     Attributes:
         name: as the report has it.
-        rates: factor on all of Adam's rates. rigid: clusters turn and shift, nothing else. hold_colours: colours stay.
-        cold: the motion of the update before is not used. longer: factor on the iterations.
-        several: other orders of the views are tried as well, and the best end is taken. faster: factor on the rates of
+        rates: factor on all of Adam's rates. rigid: clusters turn and shift, nothing else. freeze_colours: colours
+            stay.
+        cold: the motion of the update before is not used. iteration_factor: factor on the iterations.
+        several_orders: other orders of the views are tried as well, and the best end is taken. layer_rate_factor:
+            factor on the rates of
             the layers where no motion leads.
-        usual: errors of the updates before at their end, ``best_state.by_size``; None: not known.
+        reference_errors: errors of the updates before at their end, ``best_state.label_by_size``; None: not known.
         stopping: decides how many iterations there are; None: those of the settings.
         gate: called with each camera's first PSNR (dB) once all were rendered; returns the cameras to drop, with the
             reason. None: all stay.
         compare: whether the candidates for Θ_t are compared on the probe views (``best_state``).
-        enough: image loss by probe view at which Θ_{t−1} needs no iteration; None: there is always one.
-        confirm: asked where that is so; true where whole pictures show it, too. None: it is not asked.
+        skip_below: image loss by probe view at which Θ_{t−1} needs no iteration; None: there is always one.
+        confirm_skip: asked where that is so; true where whole pictures show it, too. None: it is not asked.
         step: seconds since the frame before, where nothing was learnt from that one (``BestState.start``); else None.
     """
 
     name: str = "as set"
     rates: float = 1.0
     rigid: bool = False
-    hold_colours: bool = False
+    freeze_colours: bool = False
     cold: bool = False
-    longer: float = 1.0
-    several: bool = False
-    faster: float = 1.0
+    iteration_factor: float = 1.0
+    several_orders: bool = False
+    layer_rate_factor: float = 1.0
     stopping: Stopping | None = None
     gate: Gate | None = None
     compare: bool = False
-    enough: Mapping[str, float] | None = None
-    confirm: Callable[[], bool] | None = None
-    usual: Mapping[str, float] | None = None
+    skip_below: Mapping[str, float] | None = None
+    confirm_skip: Callable[[], bool] | None = None
+    reference_errors: Mapping[str, float] | None = None
     step: float | None = None
 
 
-AS_SET = AttemptOptions()
+AS_CONFIGURED = AttemptOptions()
 """The update as the settings have it."""
 
 
@@ -120,7 +122,7 @@ class UpdateTrace:
 
     Attributes:
         losses: each iteration's weighted sum. psnr: dB of each view as it was rendered, in order, as many an iteration
-            as the settings say. moments: seconds from the start of the update to the end of each iteration.
+            as the settings say. iteration_ends: seconds from the start of the update to the end of each iteration.
         seconds: by stage.
         first: dB of each camera when first rendered. cameras: how well each was met when last rendered, by name.
         left_out: cameras that the gate left out, with the reason.
@@ -135,7 +137,7 @@ class UpdateTrace:
 
     losses: list[float] = field(default_factory=list)
     psnr: list[float] = field(default_factory=list)
-    moments: list[float] = field(default_factory=list)
+    iteration_ends: list[float] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)
     first: dict[str, float] = field(default_factory=dict)
     cameras: dict[str, CameraFit] = field(default_factory=dict)
@@ -162,7 +164,7 @@ class UpdateTrace:
         """DB of the cameras that were learnt from to the end."""
         return {name: psnr for name, psnr in self.fits.items() if name not in self.left_out}
 
-    def take(self, log: IterationLog, views: Sequence[TrainingView]) -> None:
+    def load_log(self, log: IterationLog, views: Sequence[TrainingView]) -> None:
         """Take what an engine has logged so far; colour shifts are evidence for gains of cameras, too."""
         self.losses, self.guards = log.losses, log.guards
         self.psnr = [rendered.psnr for rendered in log.rendered]
@@ -211,13 +213,13 @@ class UpdateResult:
     views: Sequence[TrainingView] = ()
     parents: NDArray[np.int64] | None = None
 
-    def joined(self, first: UpdateResult) -> UpdateResult:
+    def with_motion_after(self, first: UpdateResult) -> UpdateResult:
         """An update that went on from where another ended: its motion is that of both."""
         if self.motion is None or first.motion is None:
             return self
         return replace(self, motion=self.motion.after(first.motion))
 
-    def retold(self, first: UpdateResult) -> UpdateResult:
+    def with_errors_of(self, first: UpdateResult) -> UpdateResult:
         """A later attempt with the errors of the frame before and of the warm start as the first one found them."""
         errors: dict[Candidate, dict[str, float]] = {**first.trace.errors}
         errors.pop(Candidate.END, None)

@@ -92,7 +92,7 @@ LOOK_EVERY = 10
 PROBE = 4
 """Iterations after which an update's own speed is worth more than what the updates before took."""
 
-MOST_TIMED = 4000
+MAX_TIMED = 4000
 """Iterations that an update by the clock has at most."""
 
 UNTIMED = 100
@@ -113,7 +113,7 @@ class Stopping:
         most: iterations there can be at most.
         end: moment of ``clock`` by which the last iteration has to be over, seconds; at least one is made. None: there
             are ``most`` iterations.
-        each: seconds of an iteration in the updates before, or None where there was none.
+        iteration_seconds: seconds of an iteration in the updates before, or None where there was none.
         gain: every ``LOOK_EVERY`` iterations the probe views (training views, never those held out) are looked at;
             where their error fell by less than this share since the look before, the update cools down and ends.
             0: it does not look.
@@ -129,16 +129,16 @@ class Stopping:
 
     def __init__(
         self,
-        most: int = MOST_TIMED,
+        most: int = MAX_TIMED,
         *,
         end: float | None = None,
-        each: float | None = None,
+        iteration_seconds: float | None = None,
         gain: float = 0.0,
         first: float = 0.0,
         clock: Callable[[], float] = perf_counter,
     ) -> None:
         self.most, self.end = most, end
-        self._each, self._gain, self._first, self._clock = each, gain, first, clock
+        self._each, self._gain, self._first, self._clock = iteration_seconds, gain, first, clock
         self.planned_so_far: list[tuple[int, int]] = []
         self._began = 0.0
         self._error: float | None = None
@@ -153,12 +153,12 @@ class Stopping:
             self.planned_so_far.append((done, total))
         return total
 
-    def looks(self, done: int) -> bool:
+    def needs_error(self, done: int) -> bool:
         """True where it needs the error on the probe views after ``done`` iterations."""
         return self._gain > 0 and self._stop is None and done % LOOK_EVERY == 0
 
-    def saw(self, done: int, error: float) -> None:
-        """Take the error on the probe views after ``done`` iterations, where ``looks`` said so."""
+    def record_error(self, done: int, error: float) -> None:
+        """Take the error on the probe views after ``done`` iterations, where ``needs_error`` said so."""
         total = self._total(done)
         if self._error is not None and done >= self._first * total and error > (1 - self._gain) * self._error:
             self._stop = done + max(1, round(COOLING * total))
@@ -187,14 +187,15 @@ class TimeBudget:
     checkpoint and the commit come after them and are foreseen.
 
     Attributes:
-        milliseconds: a frame may take, None: as many as it needs. each: seconds of an iteration, None: not known yet.
+        milliseconds: a frame may take, None: as many as it needs. iteration_seconds: seconds of an iteration, None:
+            not known yet.
         after: seconds from the last iteration to the end of the commit, without fits of what is born.
         births: whether the next frame has time for such fits, taken from its iterations: the one before had some.
     """
 
     def __init__(self, milliseconds: float | None) -> None:
         self.milliseconds = milliseconds
-        self.each: float | None = None
+        self.iteration_seconds: float | None = None
         self.after = AFTER_S
         self.births = False
 
@@ -207,12 +208,12 @@ class TimeBudget:
         """The moment by which fits of what is born have to be over; None: no limit."""
         return None if self.milliseconds is None else began + self.milliseconds / 1000 - self.after
 
-    def saw_births(self, spent: float, put_off: Sequence[str]) -> None:
+    def record_birth_fits(self, spent: float, postponed: Sequence[str]) -> None:
         """Take how long fits of what was born took, and which of them there was no time for."""
         kept = self.births  # time that was kept and was too short is not kept again
-        self.births = bool(spent or put_off) and not (kept and put_off)
+        self.births = bool(spent or postponed) and not (kept and postponed)
 
-    def learn(self, moments: Sequence[float], seconds: Mapping[str, float], commit: float) -> None:
+    def record_frame(self, moments: Sequence[float], seconds: Mapping[str, float], commit: float) -> None:
         """Take how long a frame took.
 
         Args:
@@ -222,8 +223,10 @@ class TimeBudget:
             return
         each = max(0.0, moments[-1] - seconds.get("start", 0.0)) / len(moments)
         after = commit + sum(seconds.get(stage, 0.0) for stage in ("end", "commit"))
-        if self.each is None:
-            self.each, self.after = each, after
+        if self.iteration_seconds is None:
+            self.iteration_seconds, self.after = each, after
         else:
-            self.each = min(each, self.each + RATE * (each - self.each))  # one slow frame is forgotten with the next
+            self.iteration_seconds = min(
+                each, self.iteration_seconds + RATE * (each - self.iteration_seconds)
+            )  # one slow frame is forgotten with the next
             self.after += RATE * (after - self.after)

@@ -44,19 +44,20 @@ class Motion:
     Attributes:
         turns: per layer [K, 3] axis · tan(angle/2). shifts: per layer [K, 3] metres, relative to the layer above; both
             in the axes that the cluster has turned to.
-        rest: [M, 3] metres, Δp less what the finest clusters have taken of it. own_turns: [M, 3] Δr. seconds: it took.
+        own_shifts: [M, 3] metres, Δp less what the finest clusters have taken of it. own_turns: [M, 3] Δr. seconds: it
+            took.
     """
 
     turns: list[Float]
     shifts: list[Float]
-    rest: Float
+    own_shifts: Float
     own_turns: Float
     seconds: float
 
     @property
     def finite(self) -> bool:
         """True where all of it is: else it would spoil the next start."""
-        return all(np.isfinite(array).all() for array in (*self.turns, *self.shifts, self.rest, self.own_turns))
+        return all(np.isfinite(array).all() for array in (*self.turns, *self.shifts, self.own_shifts, self.own_turns))
 
     def after(self, first: Motion) -> Motion:
         """Both, one after the other in the same interval; small turns add up."""
@@ -64,7 +65,7 @@ class Motion:
             self,
             turns=[a + b for a, b in zip(first.turns, self.turns, strict=True)],
             shifts=[a + b for a, b in zip(first.shifts, self.shifts, strict=True)],
-            rest=first.rest + self.rest,
+            own_shifts=first.own_shifts + self.own_shifts,
             own_turns=first.own_turns + self.own_turns,
         )
 
@@ -152,7 +153,7 @@ def predicted(motion: Motion | None, freedom: Freedom) -> Motion | None:
         motion,
         turns=motion.turns if freedom.cluster_rotation else [np.zeros_like(turns) for turns in motion.turns],
         shifts=motion.shifts if freedom.cluster_translation else [np.zeros_like(shifts) for shifts in motion.shifts],
-        rest=motion.rest if freedom.own_position else np.zeros_like(motion.rest),
+        own_shifts=motion.own_shifts if freedom.own_position else np.zeros_like(motion.own_shifts),
         own_turns=motion.own_turns if freedom.own_rotation else np.zeros_like(motion.own_turns),
     )
 
@@ -164,13 +165,13 @@ def warm_start(hierarchy: Hierarchy, motion: Motion | None, seconds: float, mome
         motion: of the update before; None: no motion. seconds: since it was measured.
         momentum: share of what the layers leave of it that Δp and ΔR start from.
     """
-    tables = Tables.still(hierarchy)
+    tables = Tables.identity(hierarchy)
     if motion is None:
         return tables
     share = WARM_START * min(seconds / motion.seconds, LONGEST_PREDICTION)
     for values, turns, shifts in zip(tables.clusters, motion.turns, motion.shifts, strict=True):
         values[:, :3] = share * turns
         values[:, 3:6] = share * shifts
-    tables.deltas[:, :3] = share * momentum * motion.rest
+    tables.deltas[:, :3] = share * momentum * motion.own_shifts
     tables.deltas[:, 3:6] = share * momentum * motion.own_turns
     return tables

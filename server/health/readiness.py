@@ -48,11 +48,11 @@ def main(spec: None, connection: Connection[Any, Any]) -> None:
     end_with_parent()
     with contextlib.suppress(EOFError, OSError):
         try:
-            from scas4d_core.warm_up import warm_up, warm_up_more  # in this process only: the service stays light
+            from scas4d_core.warm_up import warm_up, warm_up_updates  # in this process only: the service stays light
 
             warm_up(lambda done, total: connection.send(Compiled(done, total)))
             connection.send(WarmedUp())
-            warm_up_more()
+            warm_up_updates()
         except (EOFError, OSError):
             raise
         except Exception as error:

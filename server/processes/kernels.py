@@ -44,7 +44,7 @@ def wait_for_updates(settings: Settings, connection: Connection[Any, Any] | None
 
 
 def _waited(groups: tuple[Any, ...], connection: Connection[Any, Any] | None, **more: Any) -> float:
-    from scas4d_core.warm_up import warm_up_elsewhere
+    from scas4d_core.warm_up import compile_in_processes
 
     began = time.perf_counter()
 
@@ -53,5 +53,5 @@ def _waited(groups: tuple[Any, ...], connection: Connection[Any, Any] | None, **
         if connection is not None:
             connection.send(Progressed(STAGE, done, total, {}))
 
-    warm_up_elsewhere(groups, on_progress=report_progress, **more)
+    compile_in_processes(groups, on_progress=report_progress, **more)
     return time.perf_counter() - began

@@ -45,9 +45,9 @@ def _replay(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
         if faults := history.pop_faults():
             connection.send(Damaged(faults))
     from scas4d_core.replay import replay  # in this process only: the one that imports this module stays light
-    from scas4d_core.warm_up import warm_up_elsewhere
+    from scas4d_core.warm_up import compile_in_processes
 
-    warm_up_elsewhere()
+    compile_in_processes()
 
     use_one_thread()
     for iterations in spec.iterations:

@@ -17,7 +17,7 @@ from client.wire import (
 )
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.effects.effect import effect
-from scas4d_core.effects.switches import first_switches, switches_of
+from scas4d_core.effects.switches import decode_switches, first_switches
 from scas4d_core.frame_outcome import first_warnings, timing_warnings
 from scas4d_core.settings import Settings
 from server.problems import Problem
@@ -136,9 +136,9 @@ def effects_of(settings: Settings, record: Mapping[str, Any] | None) -> dict[str
     Args:
         record: of the newest commit; None, or one that says nothing of effects: as before the first frame.
     """
-    switches = switches_of((record or {}).get("effects", {})) or first_switches(settings, 0)
+    switches = decode_switches((record or {}).get("effects", {})) or first_switches(settings, 0)
     return {
-        name: EffectStatus(**asdict(switch), group=effect(name).group, says=effect(name).says)
+        name: EffectStatus(**asdict(switch), group=effect(name).group, description=effect(name).description)
         for name, switch in switches.items()
     }
 

@@ -31,11 +31,11 @@ def effort(
     for part in only or ():
         if part not in PARTS:
             raise typer.BadParameter(f"part {part!r} is unknown; choose of {', '.join(PARTS)}")
-    from scas4d_core.warm_up import warm_up_elsewhere
+    from scas4d_core.warm_up import compile_in_processes
     from studies.effort.effort import measure_adaptive, measure_budgets
     from studies.effort.report import measure_report
 
-    warm_up_elsewhere()
+    compile_in_processes()
     for capture in captures:
         if "report" in (only or PARTS):
             measure_report(capture, out)

@@ -20,7 +20,7 @@ from scas4d_core.captures import Capture
 from scas4d_core.engines.engine import StepScalars, UpdateEngine
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.settings import Settings
-from scas4d_core.warm_up import warm_up_elsewhere
+from scas4d_core.warm_up import compile_in_processes
 from studies.captures import open_measured
 from studies.frontier.frontier import Variant
 from studies.machine import core_version
@@ -64,7 +64,7 @@ def measure_convergence(
         variants: none: those of ``WATCHED``.
         report: takes the lines that are printed.
     """
-    warm_up_elsewhere()
+    compile_in_processes()
     capture = open_measured(folder)
     updates = min(updates, capture.frame_count - 1)
     curves = []

@@ -22,7 +22,7 @@ from client.cli.evaluate import Report
 from client.cli.scores import Row, read_row, write_row
 from client.importers.open_source import open_source
 from scas4d_core.captures import Capture
-from scas4d_core.warm_up import warm_up_elsewhere
+from scas4d_core.warm_up import compile_in_processes
 from studies.constants import all_varied
 from studies.frontier.frontier import Variant
 from studies.machine import core_version, machine
@@ -77,7 +77,7 @@ def measure_times(
         raise ValueError("variants is empty; give at least one setting to time")
     if rounds < 1:
         raise ValueError(f"rounds is {rounds}; give at least 1")
-    warm_up_elsewhere()
+    compile_in_processes()
     # These bring the kernels.
     from scas4d_core.kernels.jit import threads
     from studies.quality.first_frame import started

@@ -176,11 +176,11 @@ def _culling_is_exact(problem: Rendering) -> list[str]:
         splats = rasterizer.splats
         order = np.argsort(splats[:, DEPTH], kind="stable").astype(np.int32)
         tiles = -(-view.width // TILE) * -(-view.height // TILE)
-        image, rest = np.empty_like(rasterizer.planes), np.empty(rasterizer.planes.shape[1:], np.float32)
+        image, transmittance = np.empty_like(rasterizer.planes), np.empty(rasterizer.planes.shape[1:], np.float32)
         blend(
             splats, features, (0,), np.arange(tiles + 1) * len(order), np.tile(order, tiles),
             np.full(tiles * len(order), 2**64 - 1, np.uint64), np.full(tiles, 2**64 - 1, np.uint64),
-            np.arange(tiles), 1, (view.width, view.height), black, rasterizer.limits, image, rest,
+            np.arange(tiles), 1, (view.width, view.height), black, rasterizer.limits, image, transmittance,
         )  # fmt: skip
         changed += int((image[:, : view.height, : view.width] != picture).any(axis=0).sum())
     return [f"culling changes {changed} pixels"] if changed else []

@@ -75,7 +75,7 @@ class Rendering:
         picture = rasterizer.forward(
             self.means, self.factors, self.opacities, self.features.copy(), CameraArrays.of(self.camera), BACKGROUND
         )
-        values = {"features": picture.features.copy(), "alpha": 1 - picture.rest}
+        values = {"features": picture.features.copy(), "alpha": 1 - picture.transmittance}
         g_image, g_alpha = rasterizer.gradient_buffers()
         height, width = self.camera.height, self.camera.width
         g_image[:, :height, :width], g_alpha[:height, :width] = self.weights()

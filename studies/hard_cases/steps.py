@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.guards import EXPONENT
 from scas4d_core.kernels import activation, image_loss
-from scas4d_core.kernels.adam import ACTED, EVERY_ROW, adam
+from scas4d_core.kernels.adam import COUNTED_GUARDS, EVERY_ROW, adam
 from scas4d_core.query.ply import split_factors
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.structure.neighbours import build_neighbours
@@ -92,7 +92,7 @@ def _adam(gradient: Callable[[int, Array], None], acted: int, flushed: int = 0, 
         for step, table in enumerate(gradients, 1):
             counts += adam(parameters, table, first, second, rates, EVERY_ROW, np.float32(0.9), np.float32(0.999), step)
         values = {"parameters": parameters, "first": first, "second": second}
-        return BackendResult(values, {}, dict(zip(ACTED, counts.tolist(), strict=True)))
+        return BackendResult(values, {}, dict(zip(COUNTED_GUARDS, counts.tolist(), strict=True)))
 
     def in_torch() -> BackendResult:
         import torch
@@ -107,7 +107,9 @@ def _adam(gradient: Callable[[int, Array], None], acted: int, flushed: int = 0, 
             optimizer.step()
         return BackendResult({"parameters": leaf.detach().numpy()})
 
-    return HardStep({CPU: on_cpu, REFERENCE: in_torch}, guards={ACTED[0]: acted, ACTED[1]: flushed}, **changes)
+    return HardStep(
+        {CPU: on_cpu, REFERENCE: in_torch}, guards={COUNTED_GUARDS[0]: acted, COUNTED_GUARDS[1]: flushed}, **changes
+    )
 
 
 def _spoil(value: float, once: bool) -> Callable[[int, Array], None]:
@@ -157,7 +159,7 @@ def _activation(
         counts = activation.activate(table, *arrays)
         gradients = np.full_like(table, np.nan)
         activation.activate_backward(table, *arrays[1:], *pulls, gradients)
-        acted = dict(zip(activation.ACTED, counts.tolist(), strict=True))
+        acted = dict(zip(activation.COUNTED_GUARDS, counts.tolist(), strict=True))
         return BackendResult(dict(zip(names, arrays, strict=True)), {"parameters": gradients}, acted)
 
     def in_torch() -> BackendResult:
@@ -199,7 +201,7 @@ def _opposite(scale: float) -> HardStep:
         gradients = np.empty_like(table)
         pulls = [np.ones(shape, np.float32) for shape in shapes]
         activation.activate_backward(table, *arrays[1:], *pulls, gradients)
-        acted = dict(zip(activation.ACTED, counts.tolist(), strict=True))
+        acted = dict(zip(activation.COUNTED_GUARDS, counts.tolist(), strict=True))
         return BackendResult({"factors": arrays[1]}, {"parameters": gradients}, acted)
 
     def opposite(outcomes: Mapping[str, BackendResult]) -> list[str]:

@@ -129,15 +129,15 @@ def played(capture: Capture, index: int, step: int, shifts: Mapping[str, int]) -
 @contextmanager
 def clocked() -> Iterator[list[float]]:
     """Seconds that the looks of each frame take, while this lasts."""
-    spent, looked = list[float](), timing.noted
+    spent, looked = list[float](), timing.record_timing
 
-    def noted(*given: Any) -> Any:
+    def record_timing(*given: Any) -> Any:
         began = perf_counter()
         observation = looked(*given)
         spent.append(perf_counter() - began)
         return observation
 
-    with mock.patch.object(timing, "noted", noted):
+    with mock.patch.object(timing, "record_timing", record_timing):
         yield spent
 
 

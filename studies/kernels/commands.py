@@ -40,10 +40,10 @@ def moving(
     out: Page = None,
 ) -> None:
     """Measures the time of an update against the share of the pixels that move, on made-up footage, in turns."""
-    from scas4d_core.warm_up import warm_up_elsewhere
+    from scas4d_core.warm_up import compile_in_processes
     from studies.kernels import moving as study
 
-    warm_up_elsewhere()
+    compile_in_processes()
     text = study.table(study.measure(share or (0.05, 0.2, 1.0), frames))
     typer.echo(text)
     write_page(out, text)

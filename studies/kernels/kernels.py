@@ -32,7 +32,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.kernels.jit import threads
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
-from scas4d_core.warm_up import warm_up_elsewhere
+from scas4d_core.warm_up import compile_in_processes
 from studies.apart import in_a_process
 from studies.kernels.pairs import MicroKernel, blended_pairs
 from studies.machine import core_version, in_words, machine
@@ -68,7 +68,7 @@ def study(
     capture = open_source(folder)
     first_file = store / "first" / f"{first_frame_key(capture, settings)}.npz"
     report(f"a run of {min(frames, capture.frame_count)} frames, frame 0 first, in a process of its own")
-    warm_up_elsewhere()
+    compile_in_processes()
     timed = in_a_process(run_and_time, folder, settings, frames, first_file)
     kept = load_first_frame(first_file)
     assert kept is not None  # the run has left it there

@@ -54,7 +54,7 @@ def blended_pairs(
 
     Returns:
         Pairs; places in blocks of 4×4 pixels that some support meets (what a block-wise kernel computes at least); and
-        the light left [H, W], which is the rasterizer's ``rest`` if the count is right.
+        the light left [H, W], which is the rasterizer's ``transmittance`` if the count is right.
     """
     visible = np.flatnonzero(counts > 0)
     order = visible[np.argsort(splats[visible, DEPTH], kind="stable")]

@@ -22,10 +22,10 @@ from scas4d_core import metrics
 from scas4d_core.captures import Capture
 from scas4d_core.effect_names import EFFECTS
 from scas4d_core.effects.effect import effect
-from scas4d_core.effects.switches import contradictions
+from scas4d_core.effects.switches import find_contradictions
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
-from scas4d_core.warm_up import warm_up_elsewhere
+from scas4d_core.warm_up import compile_in_processes
 from studies.captures import open_measured
 from studies.machine import core_version, machine
 from studies.quality.first_frame import first_of
@@ -78,7 +78,7 @@ def run(
     """
     if frames is not None and frames < 2:
         raise ValueError("effects are compared in updates: give two frames or more")
-    warm_up_elsewhere()
+    compile_in_processes()
     rows = []
     for folder in captures:
         for seed in seeds:
@@ -111,7 +111,7 @@ def variants(names: Sequence[str], settings: Settings) -> list[Pins]:
         modes = ("off",) if not one.auto else ("off", "removed", "on")
         refused = one.refusal(settings) is not None
         for mode in modes:
-            contradicts = mode != "removed" and any(contradictions(pinned(settings, {name: mode})))
+            contradicts = mode != "removed" and any(find_contradictions(pinned(settings, {name: mode})))
             if not contradicts and not (refused and mode != "removed"):
                 pins.append({name: mode})
     return pins

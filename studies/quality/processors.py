@@ -107,9 +107,9 @@ def table(rows: Sequence[Row]) -> str:
 def measure(capture: Path, frames: int, seed: int, changes: Sequence[str]) -> Row:
     """Frame 0 and updates in this process: test cameras' mean PSNR of each update, and a digest of each state."""
     from scas4d_core.reconstruction import Reconstruction
-    from scas4d_core.warm_up import warm_up_elsewhere
+    from scas4d_core.warm_up import compile_in_processes
 
-    warm_up_elsewhere()
+    compile_in_processes()
     opened = open_measured(capture)
     assert opened.test_rig is not None
     settings = settings_of("scas4d", changes=changes)

@@ -17,7 +17,7 @@ from client.cli import evaluate
 from client.cli.evaluate import DEFAULT_OPTIONS, Job, Report, page
 from client.cli.scores import QUALITY, Row, Store, digest
 from client.importers.open_source import CaptureOptions
-from scas4d_core.warm_up import warm_up_elsewhere
+from scas4d_core.warm_up import compile_in_processes
 from studies.apart import in_a_process
 from studies.constants import all_varied
 from studies.machine import core_version, machine
@@ -94,7 +94,7 @@ def run_jobs(jobs: Sequence[Job], out: Path, *, again: bool = False, report: Rep
     """Measures what is not on disk yet, one process a row; prints the table and leaves it in ``out/table.md``."""
     store = Store(out)
     if jobs:
-        warm_up_elsewhere()
+        compile_in_processes()
     rows = []
     for number, job in enumerate(jobs, 1):
         row = None if again else store.row(job.key)

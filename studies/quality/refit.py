@@ -16,7 +16,7 @@ from client.importers.open_source import CaptureOptions
 from scas4d_core.captures import Capture
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.settings import Settings
-from scas4d_core.warm_up import warm_up_elsewhere
+from scas4d_core.warm_up import compile_in_processes
 from studies.captures import open_measured
 from studies.machine import core_version, machine
 from studies.quality.settings import settings_of
@@ -62,7 +62,7 @@ def run(
         ValueError: a frame that a capture does not have, or an unknown setting.
     """
     store, rows = Store(out), list[Row]()
-    warm_up_elsewhere()
+    compile_in_processes()
     for folder in captures:
         for seed in seeds:
             settings = settings_of(preset, None, seed, changes)

@@ -22,7 +22,7 @@ from client.importers.open_source import open_source
 from scas4d_core.cameras import Camera
 from scas4d_core.captures import Capture
 from scas4d_core.captures.frame import Frame
-from scas4d_core.effects.cameras.alignment import in_pixels, motion_of, offset_of
+from scas4d_core.effects.cameras.alignment import pixel_offset, turn_from_pixels, twist_to_matrix
 from scas4d_core.effects.cameras.pose_drift import NAME
 from scas4d_core.engines.views import CameraArrays
 from scas4d_core.metrics.evaluation import measure_pictures
@@ -117,7 +117,7 @@ def _played(folder: Path, out: Path, settings: Settings, updates: int, drift: tu
 def _pixels(scene: Reconstruction, name: str, twist: NDArray[np.float64]) -> NDArray[np.float64]:
     """[3] of the reconstruction's pictures; what is seen is taken to be as far away as the rig's middle."""
     camera = scene.rig[name]
-    return offset_of(CameraArrays.of(camera).lens, twist, float(np.linalg.norm(camera.centre)))
+    return pixel_offset(CameraArrays.of(camera).lens, twist, float(np.linalg.norm(camera.centre)))
 
 
 def _words(offsets: Mapping[str, NDArray[np.float64]]) -> str:
@@ -125,7 +125,7 @@ def _words(offsets: Mapping[str, NDArray[np.float64]]) -> str:
 
 
 def turned(capture: Capture, index: int, offsets: Mapping[str, NDArray[np.float64]]) -> Frame:
-    """A frame as some cameras see it that have turned by pixels across, down and round (``offset_of``)."""
+    """A frame as some cameras see it that have turned by pixels across, down and round (``pixel_offset``)."""
     frame = capture.frame(index)
     images, masks = dict(frame.images), dict(frame.masks)
     for name, offset in offsets.items():
@@ -139,8 +139,8 @@ def _seen(
     picture: NDArray[np.uint8], camera: Camera, offset: NDArray[np.float64], order: Literal[0, 3]
 ) -> NDArray[np.uint8]:
     """A picture [H, W] or [H, W, 3] of a camera that turns, to splines of an order; its rim is repeated."""
-    twist = np.concatenate([np.zeros(3), in_pixels(CameraArrays.of(camera).lens) @ offset])
-    back = camera.intrinsics @ motion_of(twist)[:3, :3].T @ np.linalg.inv(camera.intrinsics)
+    twist = np.concatenate([np.zeros(3), turn_from_pixels(CameraArrays.of(camera).lens) @ offset])
+    back = camera.intrinsics @ twist_to_matrix(twist)[:3, :3].T @ np.linalg.inv(camera.intrinsics)
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     x, y, z = np.einsum("ij,jhw->ihw", back, np.stack([u, v, np.ones_like(u)]))
     places = np.stack([y / z - 0.5, x / z - 0.5])

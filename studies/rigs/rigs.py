@@ -27,7 +27,7 @@ from scas4d_core.captures import Capture, Frame
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.presets import preset
 from scas4d_core.reconstruction import Reconstruction
-from scas4d_core.warm_up import warm_up_elsewhere
+from scas4d_core.warm_up import compile_in_processes
 from studies.machine import core_version, machine
 from studies.rigs.flow import flow_consistency
 
@@ -80,7 +80,7 @@ def run(
         report: takes the printed lines.
     """
     store, rows = Store(out), list[Row]()
-    warm_up_elsewhere()
+    compile_in_processes()
     for folder in captures:
         key = f"{folder.resolve().name}-{digest(list(changes), frames, longer, *options.changed.items())}"
         path = store.folder / "rigs" / f"{key}.json"

@@ -54,9 +54,9 @@ def frame(rig: Rig, size: int, index: int, masked: bool) -> Frame:
 def measure(cameras: int, size: int, gaussians: int, scale: float, masks: bool) -> dict[str, float]:
     """Reconstructs, and compares: MB at the peak and as estimated, their ratio, and the Gaussians kept."""
     from scas4d_core.reconstruction import Reconstruction
-    from scas4d_core.warm_up import warm_up_elsewhere
+    from scas4d_core.warm_up import compile_in_processes
 
-    warm_up_elsewhere()  # compilers would count
+    compile_in_processes()  # compilers would count
     static = {"iterations": 8, "max_gaussians": gaussians}
     settings = preset("scas4d", {"static": static, "update": {"iterations": 4}, "scene": {"image_scale": scale}})
     rig = ring(cameras, size)

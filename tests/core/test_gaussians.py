@@ -32,7 +32,7 @@ def test_without_any_retired_the_arrays_are_as_ever() -> None:
 
 def test_born_are_appended_without_ids() -> None:
     born = BOX.rows([3, 5])
-    grown = BOX.joined(born)
+    grown = BOX.concatenate(born)
     assert len(grown) == len(BOX) + 2
     assert_same(grown.rows(np.arange(len(BOX))), BOX)
     assert grown.ids[-2:].tolist() == [-1, -1]
@@ -87,6 +87,6 @@ def test_a_field_without_rows_is_carried_whole() -> None:
     light = np.arange(12, dtype=np.float32)
     lit = Lit(**BOX.arrays(), light=light)
     assert lit.rows([0, 1]).light is light  # type: ignore[attr-defined]
-    assert lit.joined(BOX).light is light  # type: ignore[attr-defined]
+    assert lit.concatenate(BOX).light is light  # type: ignore[attr-defined]
     assert lit.retire([0]).arrays()["light"] is light
     assert "light" not in Lit(**BOX.arrays()).arrays()

@@ -232,7 +232,7 @@ def test_births_have_their_time_in_the_budget(monkeypatch: pytest.MonkeyPatch) -
         assert seen.time.end is not None
         ends.append(seen.time.end)
         if seen.index == 2:
-            seen.time.put_off.append("a ball was not born")
+            seen.time.postponed.append("a ball was not born")
         return seen.result
 
     monkeypatch.setattr(FrameSolver, "run", run)
@@ -240,8 +240,8 @@ def test_births_have_their_time_in_the_budget(monkeypatch: pytest.MonkeyPatch) -
     scene = start(History(), masks=True, settings=SETTINGS)
     scene.set_budget(budget_ms=1000.0)
     reports = [scene.step(frame) for frame in FRAMES[True][1:5]]
-    assert [report.put_off for report in reports] == [[], ["a ball was not born"], [], []]
-    assert scene.history.report(2)["put_off"] == ["a ball was not born"]
+    assert [report.postponed for report in reports] == [[], ["a ball was not born"], [], []]
+    assert scene.history.report(2)["postponed"] == ["a ball was not born"]
     assert all("presence" in report.seconds for report in reports)
     left = [births - iterations for iterations, births in zip(ends[::2], ends[1::2], strict=True)]
     assert left == pytest.approx([0, 0, FOR_BIRTHS, 0], abs=1e-6)
@@ -272,8 +272,8 @@ def test_the_motion_between_two_states_goes_on_in_other_clusters(monkeypatch: py
     known = np.random.default_rng(0).random(MOVING) > 0.3  # the others were born meanwhile
     motion = motion_between(hierarchy, BOX, now, known, 0.1)
     assert isinstance(motion, Motion)
-    assert np.abs(motion.rest[known]).max() < 1e-3
-    assert (motion.rest[~known] == 0).all()
+    assert np.abs(motion.own_shifts[known]).max() < 1e-3
+    assert (motion.own_shifts[~known] == 0).all()
     engine.load_state(now)
     engine.set_tables(warm_start(hierarchy, motion, 0.1, 1.0))
     means = engine.state(learnt=False).means
@@ -281,4 +281,4 @@ def test_the_motion_between_two_states_goes_on_in_other_clusters(monkeypatch: py
     off = np.linalg.norm(means[:MOVING] - after(2), axis=1)
     assert off.mean() < 0.05 * moved_on
     nothing = motion_between(hierarchy, BOX, now, np.zeros(MOVING, np.bool_), 0.1)
-    assert all((array == 0).all() for array in (*nothing.turns, *nothing.shifts, nothing.rest))
+    assert all((array == 0).all() for array in (*nothing.turns, *nothing.shifts, nothing.own_shifts))

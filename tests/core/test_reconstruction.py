@@ -238,7 +238,7 @@ def test_without_masks_everything_moves_until_motion_tells() -> None:
 
 def unmet(patch: pytest.MonkeyPatch) -> None:
     """From here on no frame is met."""
-    patch.setattr("scas4d_core.robust.outliers.unmet", lambda past, psnr, iterations: "it is another scene")
+    patch.setattr("scas4d_core.robust.outliers.misfit_reason", lambda past, psnr, iterations: "it is another scene")
 
 
 def test_what_seems_to_move_in_a_frame_that_is_held_is_not_learnt() -> None:

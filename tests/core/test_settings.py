@@ -10,7 +10,7 @@ import pytest
 from pydantic import BaseModel, ValidationError
 
 from scas4d_core import settings as module
-from scas4d_core.effects.switches import contradictions
+from scas4d_core.effects.switches import find_contradictions
 from scas4d_core.presets import PRESETS, SettingError, preset
 from scas4d_core.settings import Settings, UpdateSettings, Weights
 
@@ -60,7 +60,7 @@ def test_a_preset_of_a_kind_of_scene_pins_effects_and_nothing_else(name: str) ->
     found = preset(name)
     assert found.effects
     assert found.model_copy(update={"effects": {}}) == Settings()
-    assert list(contradictions(found)) == []
+    assert list(find_contradictions(found)) == []
     assert preset(name, {"effects": dict.fromkeys(found.effects, "auto")}).effects == dict.fromkeys(
         found.effects, "auto"
     )

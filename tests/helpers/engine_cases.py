@@ -10,7 +10,7 @@ from scas4d_core.cameras import Camera, Rig
 from scas4d_core.engines.cpu.gloss import features_seen
 from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.engine import AttemptStart, StepScalars, Tables, UpdateEngine
-from scas4d_core.engines.exposure import exposure_of
+from scas4d_core.engines.exposure import gain_to_exposure
 from scas4d_core.engines.freedom import Freedom
 from scas4d_core.engines.limits import Limits
 from scas4d_core.engines.plan import ColourPlan, Structure, UpdatePlan
@@ -54,7 +54,7 @@ class Case:
 def step(**changes: object) -> StepScalars:
     """An iteration in which everything learns."""
     standard = StepScalars(
-        resting=0, layers=(1.0,) * len(CLUSTERS), own=1.0, colour=1.0, gloss=1.0, smooth_gloss=False, rigidity=4.0,
+        frozen=0, layers=(1.0,) * len(CLUSTERS), own=1.0, colour=1.0, gloss=1.0, smooth_gloss=False, rigidity=4.0,
         sample=0, keep_pictures=False,
     )  # fmt: skip
     return replace(standard, **changes)  # type: ignore[arg-type]
@@ -123,7 +123,7 @@ def case(previous: Gaussians | None = None, **plan: object) -> Case:
     cameras = rig()
     standard = UpdatePlan(
         cameras=cameras.names, background=(0.1, 0.2, 0.3), limits=Limits(near=0.2), soft_colour=0.01,
-        freedom=EVERYTHING, whole_pictures=True,
+        freedom=EVERYTHING, full_images=True,
     )  # fmt: skip
     made = replace(standard, **plan)  # type: ignore[arg-type]
     sound = previous.replace(means=np.nan_to_num(previous.means))
@@ -136,7 +136,7 @@ def case(previous: Gaussians | None = None, **plan: object) -> Case:
         arrays = CameraArrays.of(camera)
         planes = renderer.render(after, arrays, features_seen(after, arrays)).features.copy()
         gain = np.float32([1.0 + 0.06 * (number - 2) * made.camera_gains] * 3)
-        exposed = exposure_of(gain)
+        exposed = gain_to_exposure(gain)
         planes[:3] = planes[:3] * exposed[:, :1, None] + exposed[:, 1:, None]
         planes[:3] += rng.normal(0, 0.01, planes[:3].shape)
         planes[3] = planes[3] > 0.5
@@ -161,7 +161,7 @@ def loaded(engine: UpdateEngine, scene: Case, tables: Tables | None = None, **st
 
 def random_tables(scene: Case, size: float = 0.01, seed: int = 2) -> Tables:
     """Small parameters, none of them 0: a deformation in general position."""
-    rng, still = np.random.default_rng(seed), Tables.still(scene.structure.hierarchy)
+    rng, still = np.random.default_rng(seed), Tables.identity(scene.structure.hierarchy)
     for values in (*still.clusters, still.deltas):
         values[:] = size * rng.standard_normal(values.shape)
     return still
@@ -180,16 +180,16 @@ EFFECTS: dict[str, dict[str, object]] = {
     "bending": {"neighbour_terms": True, "rigidity": 4.0, "rigidity_fades": True},
     "floor": {"floor": (0.0, 1.0, 0.0, -0.05), "floor_weight": 2.0},
     "moving colours": {"colours": COLOURS},
-    "standing colours": {"colours": ColourPlan(moving=True, standing=True)},
-    "changing light": {"colours": ColourPlan(moving=True, standing=True, changing_light=True)},
+    "standing colours": {"colours": ColourPlan(moving=True, static=True)},
+    "changing light": {"colours": ColourPlan(moving=True, static=True, changing_light=True)},
     "gloss": {"gloss": True, "colours": COLOURS},
     "camera gains": {"camera_gains": True, "colours": COLOURS},
-    "changed pixels": {"whole_pictures": False, "colours": COLOURS},
+    "changed pixels": {"full_images": False, "colours": COLOURS},
 }
 """Each effect that acts inside an iteration, as its plan has it."""
 TOGETHER: dict[str, object] = {
     "mask": 3.0, "axis_length": 10.0, "neighbour_terms": True, "rigidity": 4.0, "isometry": 2.0, "rotation": 4.0,
     "rigidity_fades": True, "floor": (0.0, 1.0, 0.0, -0.05), "floor_weight": 2.0,
-    "colours": ColourPlan(moving=True, standing=True, changing_light=True), "gloss": True, "camera_gains": True,
+    "colours": ColourPlan(moving=True, static=True, changing_light=True), "gloss": True, "camera_gains": True,
 }  # fmt: skip
 """All of them at once."""

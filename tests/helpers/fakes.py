@@ -292,8 +292,8 @@ def install(**others):
         "scas4d_core.replay": {"replay": replay},
         "scas4d_core.warm_up": {
             "warm_up": warm_up,
-            "warm_up_more": lambda: None,
-            "warm_up_elsewhere": lambda *groups, **more: None,
+            "warm_up_updates": lambda: None,
+            "compile_in_processes": lambda *groups, **more: None,
             "first_frame_groups": lambda **given: (),
             "update_groups": lambda covariance: (),
         },

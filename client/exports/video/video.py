@@ -95,8 +95,8 @@ def background_colour(text: str) -> tuple[float, float, float]:
 
 def _compile_kernels(bars: Bars) -> None:
     from scas4d_core.compilation.manifest import KernelGroup
-    from scas4d_core.warm_up import warm_up_elsewhere
+    from scas4d_core.warm_up import compile_in_processes
 
-    warm_up_elsewhere(
+    compile_in_processes(
         (KernelGroup.FIRST_FRAME,), on_progress=lambda done, total: bars("compiling the kernels", done, total)
     )

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.effects.evidence import Evidence, FrameObservation
-from scas4d_core.engines.exposure import CAMERAS, FOOT, exposure_of, gain_of
+from scas4d_core.engines.exposure import CAMERAS, FOOT, exposure_to_gain, gain_to_exposure
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.update.parts import Array, Arrays, Attempt, PlanBuilder, UpdatePart
 
@@ -30,7 +30,9 @@ POWER = 2.4
 # on basketball, whose gains frame 0 knows, and that gains 0.03 dB with these; 0.078 to 0.094 on lamps.
 
 
-def known_gains(exposures: dict[str, Array], carried: Mapping[str, Arrays], names: tuple[str, ...]) -> dict[str, Array]:
+def current_exposures(
+    exposures: dict[str, Array], carried: Mapping[str, Arrays], names: tuple[str, ...]
+) -> dict[str, Array]:
     """The exposures of the cameras, [3, 2] gain and offset by name: those given, or the gains as they were last.
 
     Args:
@@ -38,7 +40,7 @@ def known_gains(exposures: dict[str, Array], carried: Mapping[str, Arrays], name
     """
     if NAME not in carried:
         return exposures
-    return {name: exposure_of(gain) for name, gain in zip(names, carried[NAME]["gains"], strict=True)}
+    return {name: gain_to_exposure(gain) for name, gain in zip(names, carried[NAME]["gains"], strict=True)}
 
 
 class CameraGains(UpdatePart):
@@ -54,7 +56,7 @@ class CameraGains(UpdatePart):
             return
         gains = np.ones((len(self._rows), 3), np.float32)
         for view in attempt.views:
-            gains[self._rows[view.name]] = gain_of(view.exposure)
+            gains[self._rows[view.name]] = exposure_to_gain(view.exposure)
         attempt.gains = gains / _centre(gains)
 
     def end(self, attempt: Attempt, state: Gaussians) -> Gaussians:
@@ -101,20 +103,21 @@ class CameraGain(Effect):
             else Evidence(min(1.0, spread), f"colour gains of the cameras differ by {spread:.1%}")
         )
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Adds the gains; they are read off whole pictures."""
-        builder.plan.whole_pictures = builder.plan.camera_gains = True
+        builder.plan.full_images = builder.plan.camera_gains = True
         builder.parts.append(CameraGains(builder))
 
 
 EFFECT = CameraGain(
     name=NAME,
     group=EffectGroup.APPEARANCE,
-    says="Each camera has a gain per channel, which may drift.",
-    gauge="Per channel the product over the cameras is 1: what all cameras share is light, and goes into the colours.",
+    description="Each camera has a gain per channel, which may drift.",
+    disambiguation="Per channel the product over the cameras is 1: what all cameras share is light, and goes into "
+    "the colours.",
     cost="the median over about 4,000 pixels per iteration, 1 % of an update",
     auto=True,
     on_above=0.04,
     off_below=0.02,
-    kept=("gains",),
+    committed_arrays=("gains",),
 )

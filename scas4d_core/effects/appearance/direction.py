@@ -80,12 +80,12 @@ class Direction(Effect):
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
         """The share of the squared error of a few pictures that the gloss takes away."""
-        from scas4d_core.update.best_state import spread
+        from scas4d_core.update.best_state import spread_cameras
 
         if seen.before.gloss is None:
             return None
         state = seen.result.gaussians
-        chosen = set(spread(seen.rig, [view.name for view in seen.views], FEW))
+        chosen = set(spread_cameras(seen.rig, [view.name for view in seen.views], FEW))
         left = np.zeros(2)
         for view in seen.views:
             if view.name not in chosen:
@@ -95,17 +95,18 @@ class Direction(Effect):
         share = float(max(0, 1 - left[1] / max(left[0], 1e-12)))
         return Evidence(share, f"explains {100 * share:.0f} % of the residual")
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Adds the part; what a camera sees of what stands is another thing in each frame."""
-        builder.plan.whole_pictures = builder.plan.gloss = True
+        builder.plan.full_images = builder.plan.gloss = True
         builder.parts.append(DirectionPart(builder))
 
 
 EFFECT = Direction(
     name="direction",
     group=EffectGroup.APPEARANCE,
-    says="Colour depends on direction: glossy objects mirror lights and surroundings, which stay as the objects move.",
-    gauge="The environment sums to zero over the sphere: what is seen from everywhere is colour.",
+    description="Colour depends on direction: glossy objects mirror lights and surroundings, which stay as the "
+    "objects move.",
+    disambiguation="The environment sums to zero over the sphere: what is seen from everywhere is colour.",
     cost="two passes over the Gaussians per rendered view; a trial in frame 0, which takes half as long again where on",
     auto=True,
     on_above=0.1,  # the trial has 0.25 on `gloss`, at most 0.03 on the five objects

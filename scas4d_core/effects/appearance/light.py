@@ -85,17 +85,18 @@ class Light(Effect):
         change = change_of_light(seen.before, seen.result.gaussians, centre)
         return Evidence(min(1.0, change), f"the light changes by {change:.1%} a frame")
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Frees the colours that are learnt, also from a frame that is shown well enough in the light before."""
         builder.plan.learns_colours().changing_light = True
-        builder.plan.always_updates = True
+        builder.plan.disables_skip = True
 
 
 EFFECT = Light(
     name="light",
     group=EffectGroup.APPEARANCE,
-    says="While the light changes, colours follow faster, those of moving Gaussians as fast as those of static ones.",
-    gauge="Colours hold the light of their frame; differences between cameras, and flicker, are gains.",
+    description="While the light changes, colours follow faster, those of moving Gaussians as fast as those of "
+    "static ones.",
+    disambiguation="Colours hold the light of their frame; differences between cameras, and flicker, are gains.",
     cost="none that can be measured",
     auto=True,
     on_above=0.035,

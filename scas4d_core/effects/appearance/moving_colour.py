@@ -20,7 +20,7 @@ class MovingColour(Effect):
         """Refused with a rate of 0."""
         return refusal_at_zero(settings, "rate_colour")
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Frees their colours."""
         builder.plan.learns_colours().moving = True
 
@@ -28,7 +28,7 @@ class MovingColour(Effect):
 EFFECT = MovingColour(
     name="moving_colour",
     group=EffectGroup.APPEARANCE,
-    says="The colours of moving Gaussians follow the pictures slowly: shading changes as objects rotate.",
-    gauge="The mean absolute colour change is a loss term: motion and gains are not absorbed by colours.",
+    description="The colours of moving Gaussians follow the pictures slowly: shading changes as objects rotate.",
+    disambiguation="The mean absolute colour change is a loss term: motion and gains are not absorbed by colours.",
     cost="one Adam step over RGB per iteration, shared with the other colours",
 )

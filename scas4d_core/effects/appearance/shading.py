@@ -43,7 +43,7 @@ class Shading(Effect):
         """Refused with a rate of 0."""
         return refusal_at_zero(settings, "rate_colour")
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Adds the part."""
         builder.parts.append(ShadingPart(builder))
 
@@ -51,7 +51,7 @@ class Shading(Effect):
 EFFECT = Shading(
     name="shading",
     group=EffectGroup.APPEARANCE,
-    says="The colours of moving Gaussians follow the pictures once per frame, as objects rotate in the light.",
-    gauge="Moving Gaussians only, once the motion of the frame is found; camera gains are removed before.",
+    description="The colours of moving Gaussians follow the pictures once per frame, as objects rotate in the light.",
+    disambiguation="Moving Gaussians only, once the motion of the frame is found; camera gains are removed before.",
     cost="one render of each view, with its blending weights, per frame",
 )

@@ -68,7 +68,7 @@ class Shadows(Effect):
         """Refused with a rate of 0."""
         return refusal_at_zero(settings, "rate_static_colour")
 
-    def began(self, seen: FrameObservation) -> Arrays | None:
+    def first_frame_arrays(self, seen: FrameObservation) -> Arrays | None:
         """[h, w, 4] float16 of each view: mean colours of squares, and 1 where what moves reaches."""
         state = seen.result.gaussians
         stands = float((~state.moving).mean())
@@ -104,7 +104,7 @@ class Shadows(Effect):
         share = changed / compared
         return Evidence(share, f"{100 * share:.0f} % of what stands looks other than in frame 0")
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Adds the part."""
         builder.parts.append(ShadowsPart(builder))
 
@@ -134,8 +134,9 @@ def _hidden(view: TrainingView, state: Gaussians, renderer: Renderer) -> NDArray
 EFFECT = Shadows(
     name=NAME,
     group=EffectGroup.APPEARANCE,
-    says="The colours of static Gaussians follow the pictures once per frame, as shadows and light move over them.",
-    gauge="Static Gaussians only, where they look different from frame 0; camera gains are removed before.",
+    description="The colours of static Gaussians follow the pictures once per frame, as shadows and light move over "
+    "them.",
+    disambiguation="Static Gaussians only, where they look different from frame 0; camera gains are removed before.",
     cost="one render of each view, with its blending weights, per frame",
     auto=True,
     on_above=0.02,

@@ -20,17 +20,17 @@ class StaticColour(Effect):
         """Refused with a rate of 0."""
         return refusal_at_zero(settings, "rate_static_colour")
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Frees their colours."""
-        builder.plan.learns_colours().standing = True
-        builder.plan.whole_pictures = True
+        builder.plan.learns_colours().static = True
+        builder.plan.full_images = True
 
 
 EFFECT = StaticColour(
     name="static_colour",
     group=EffectGroup.APPEARANCE,
-    says="The colours of static Gaussians follow the pictures in every iteration; only where it is pinned on.",
-    gauge="The mean absolute colour change is a loss term: motion and gains are not absorbed by colours.",
+    description="The colours of static Gaussians follow the pictures in every iteration; only where it is pinned on.",
+    disambiguation="The mean absolute colour change is a loss term: motion and gains are not absorbed by colours.",
     cost="full pictures are rendered, and one Adam step over RGB per iteration",
     auto=True,
 )

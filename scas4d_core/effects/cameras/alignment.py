@@ -38,7 +38,7 @@ RESIDUAL_SCALE = 0.02
 """Residual, 0…1, at which ``FEW`` pixels with a slope of 1 weigh as much as what is thought before."""
 
 
-class Pictures(NamedTuple):
+class AlignedPixels(NamedTuple):
     """A picture and its rendering, at some pixels.
 
     Attributes:
@@ -68,7 +68,7 @@ class Equations(NamedTuple):
     depth: float
 
 
-def pictures(target: Array, shown: Array, every: int = 1) -> Pictures | None:
+def align_pixels(target: Array, shown: Array, every: int = 1) -> AlignedPixels | None:
     """Both at the informative pixels among those that are looked at; None: there are too few.
 
     Args:
@@ -98,7 +98,7 @@ def pictures(target: Array, shown: Array, every: int = 1) -> Pictures | None:
     row, column = row[::thin], column[::thin]
     v, u = inner[row], across[column]
     here = target[:, v, u], shown[:, v // every, u // every]
-    return Pictures(*here, slopes[:, :, row, column], np.stack([u, v]) + 0.5, v * width + u)
+    return AlignedPixels(*here, slopes[:, :, row, column], np.stack([u, v]) + 0.5, v * width + u)
 
 
 def flow(lens: Array | Double, places: Double, depth: Double | float = 1.0) -> Double:
@@ -119,7 +119,7 @@ def flow(lens: Array | Double, places: Double, depth: Double | float = 1.0) -> D
     return moved
 
 
-def equations(seen: Pictures, moved: Double, depth: float = 1.0) -> Equations:
+def equations(seen: AlignedPixels, moved: Double, depth: float = 1.0) -> Equations:
     """The normal equations of what moves the pixels.
 
     They are weighed twice: with the residual as it is, what a shift explains would pass for things in the way.
@@ -144,7 +144,7 @@ def _weights(residual: Double) -> Double:
     return weights
 
 
-def twist_equations(lens: Array, seen: Pictures, depth: Array) -> Equations:
+def twist_equations(lens: Array, seen: AlignedPixels, depth: Array) -> Equations:
     """Those of a twist, six numbers.
 
     Args:
@@ -156,21 +156,21 @@ def twist_equations(lens: Array, seen: Pictures, depth: Array) -> Equations:
     return equations(seen, flow(lens, seen.places, np.where(known, here, middle) / middle), middle)
 
 
-def turn_equations(lens: Array, seen: Pictures) -> Equations:
+def turn_equations(lens: Array, seen: AlignedPixels) -> Equations:
     """Those of a turn, three numbers in pixels: across, down, and round by so many at a quarter of the width.
 
     They hang on no depth.
     """
-    return equations(seen, np.einsum("dkp,kl->dlp", flow(lens, seen.places)[:, 3:], in_pixels(lens)))
+    return equations(seen, np.einsum("dkp,kl->dlp", flow(lens, seen.places)[:, 3:], turn_from_pixels(lens)))
 
 
-def in_pixels(lens: Array) -> Double:
+def turn_from_pixels(lens: Array) -> Double:
     """[3, 3] the turn, radians, for each of the three numbers of ``turn_equations``."""
     fx, fy, width = float(lens[0]), float(lens[1]), float(lens[4])
     return np.array([[0, -1 / fy, 0], [1 / fx, 0, 0], [0, 0, 4 / width]])
 
 
-def offset_of(lens: Array, twist: Double, depth: float) -> Double:
+def pixel_offset(lens: Array, twist: Double, depth: float) -> Double:
     """[3] pixels across, down and round by which a twist moves the middle of a picture.
 
     Args:
@@ -180,7 +180,7 @@ def offset_of(lens: Array, twist: Double, depth: float) -> Double:
     return np.append(flow(lens, middle, depth) @ twist, twist[5] * float(lens[4]) / 4)
 
 
-def solved(one: Equations, lens: Array, twist: Double, vector: Double | None = None) -> Double:
+def solve_twist(one: Equations, lens: Array, twist: Double, vector: Double | None = None) -> Double:
     """[6] the twist beside one that a camera has already, shift in metres; their sum is small where little is seen.
 
     Args:
@@ -193,7 +193,7 @@ def solved(one: Equations, lens: Array, twist: Double, vector: Double | None = N
     return twist_of
 
 
-def of_the_world(one: Equations, pose: Double) -> Double:
+def to_camera_twist(one: Equations, pose: Double) -> Double:
     """[6, 6] a twist of the world's axes, in the numbers of a camera's equations.
 
     Args:
@@ -216,10 +216,10 @@ def adjoint(pose: Double) -> Double:
     return matrix
 
 
-def motion_of(twist: Double) -> Double:
+def twist_to_matrix(twist: Double) -> Double:
     """[4, 4] the exponential of a twist [6].
 
-    >>> motion_of(np.array([1.0, 2, 3, 0, 0, 0]))[:3, 3]
+    >>> twist_to_matrix(np.array([1.0, 2, 3, 0, 0, 0]))[:3, 3]
     array([1., 2., 3.])
     """
     motion, cross, angle = np.eye(4), _crossing(twist[3:]), float(np.linalg.norm(twist[3:]))

@@ -30,14 +30,14 @@ from scas4d_core.effects.cameras.alignment import (
     Double,
     Equations,
     adjoint,
-    in_pixels,
-    motion_of,
-    of_the_world,
-    offset_of,
-    pictures,
-    solved,
+    align_pixels,
+    pixel_offset,
+    solve_twist,
+    to_camera_twist,
     turn_equations,
+    turn_from_pixels,
     twist_equations,
+    twist_to_matrix,
 )
 from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.effects.evidence import Evidence
@@ -75,7 +75,7 @@ SMALLEST = 1e-3
 """Added to the 3×3 equations of a turn in pixels, 0.3 pixels of one that weighs nothing: a bare wall shows no turn."""
 
 
-def posed(rig: Rig, carried: Mapping[str, Arrays]) -> Rig:
+def rig_with_drift(rig: Rig, carried: Mapping[str, Arrays]) -> Rig:
     """The cameras as they stand by now; the rig itself where none has moved.
 
     Args:
@@ -88,7 +88,7 @@ def posed(rig: Rig, carried: Mapping[str, Arrays]) -> Rig:
 
 
 def _moved(camera: Camera, twist: Double) -> Camera:
-    return replace(camera, world_to_camera=motion_of(twist) @ camera.world_to_camera) if twist.any() else camera
+    return replace(camera, world_to_camera=twist_to_matrix(twist) @ camera.world_to_camera) if twist.any() else camera
 
 
 @dataclass(eq=False)
@@ -97,54 +97,54 @@ class Poses:
 
     Attributes:
         twists: [C, 6] float64 by which each is moved against its calibration: shift (metres) and turn, camera's axes.
-        moved: [C, 3] the same in pixels, see ``alignment.offset_of``, when last looked at.
+        moved: [C, 3] the same in pixels, see ``alignment.pixel_offset``, when last looked at.
         offsets: [C, 3] pixels that each has been off by, against its calibration: a mean that forgets.
         shares: [C] 0…1 of its residual that offsets of earlier frames explained: a mean that forgets.
-        looks: [C] frames in which it was looked at.
+        observations: [C] frames in which it was looked at.
     """
 
     twists: Double
     moved: Double
     offsets: Double
     shares: Double
-    looks: NDArray[np.int64]
+    observations: NDArray[np.int64]
 
     @classmethod
     def of(cls, arrays: Arrays, count: int) -> Poses:
         """From ``arrays``; those that are not there are 0."""
         shapes = {"twists": (count, 6), "moved": (count, 3), "offsets": (count, 3), "shares": (count,)}
         blank: dict[str, NDArray[Any]] = {name: np.zeros(shape) for name, shape in shapes.items()}
-        blank["looks"] = np.zeros(count, np.int64)
+        blank["observations"] = np.zeros(count, np.int64)
         return cls(**{name: arrays[name].copy() if name in arrays else empty for name, empty in blank.items()})
 
     def arrays(self) -> Arrays:
         """As they are carried to the next frame; no twists where no camera has moved."""
-        arrays: Arrays = {name: getattr(self, name) for name in ("moved", "offsets", "shares", "looks")}
+        arrays: Arrays = {name: getattr(self, name) for name in ("moved", "offsets", "shares", "observations")}
         return {**arrays, "twists": self.twists} if self.twists.any() else arrays
 
-    def look(self, row: int, turn: Equations) -> None:
+    def record_offset(self, row: int, turn: Equations) -> None:
         """Notes what a camera's residual says, in the numbers of ``turn_equations``, relative to its present pose."""
         here = self.moved[row]
         now = here + np.linalg.solve(turn.matrix + SMALLEST * np.eye(3), turn.vector)
-        if self.looks[row] == 0:
+        if self.observations[row] == 0:
             self.offsets[row] = now
         else:
             without = _left(turn, -here)
             explained = 1 - _left(turn, self.offsets[row] - here) / without if without > 0 else 0.0
             self.shares[row] += SHARE * (max(0.0, explained) - self.shares[row])
             self.offsets[row] += SHARE * (now - self.offsets[row])
-        self.looks[row] += 1
+        self.observations[row] += 1
 
-    def seems(self) -> NDArray[np.bool_]:
+    def suspects(self) -> NDArray[np.bool_]:
         """[C] the cameras that may have moved: they are rendered, to be looked at again at once."""
-        sizes, looked = np.linalg.norm(self.offsets, axis=1), self.looks > 0
+        sizes, looked = np.linalg.norm(self.offsets, axis=1), self.observations > 0
         usual = float(np.median(sizes[looked])) if looked.any() else 0.0
         off: NDArray[np.bool_] = sizes >= max(LEAST, TIMES * usual)
         return off
 
-    def off(self) -> NDArray[np.bool_]:
+    def drifted(self) -> NDArray[np.bool_]:
         """[C] the cameras that have moved."""
-        return self.twists.any(axis=1) | (self.seems() & (self.shares >= EFFECT.on_above))
+        return self.twists.any(axis=1) | (self.suspects() & (self.shares >= EFFECT.on_above))
 
 
 def _left(turn: Equations, way: Double) -> float:
@@ -152,7 +152,7 @@ def _left(turn: Equations, way: Double) -> float:
     return float(turn.energy - 2 * turn.vector @ way + way @ turn.matrix @ way)
 
 
-def stepped(
+def step_twists(
     twists: Double, aligned: Mapping[int, tuple[Equations, Camera, Array]], follow: NDArray[np.bool_]
 ) -> Double:
     """[C, 6] the twists after a frame, for the cameras that follow.
@@ -167,25 +167,25 @@ def stepped(
     standing = [row for row in aligned if not follow[row]] or list(aligned)
     for row in standing:
         one, camera, _ = aligned[row]
-        units = of_the_world(one, camera.world_to_camera)
+        units = to_camera_twist(one, camera.world_to_camera)
         matrix += units.T @ one.matrix @ units
         vector += units.T @ one.vector
     scene = np.linalg.solve(matrix, vector)
     after = twists.copy()
     for row, (one, camera, lens) in aligned.items():
         if follow[row]:
-            own = one.vector - one.matrix @ of_the_world(one, camera.world_to_camera) @ scene
-            after[row] = bounded(after[row] + SHARE * solved(one, lens, after[row], own), lens, one.depth)
+            own = one.vector - one.matrix @ to_camera_twist(one, camera.world_to_camera) @ scene
+            after[row] = limit_twist(after[row] + SHARE * solve_twist(one, lens, after[row], own), lens, one.depth)
     return after
 
 
-def bounded(twist: Double, lens: Array, depth: float) -> Double:
+def limit_twist(twist: Double, lens: Array, depth: float) -> Double:
     """The twist, or as much of it as a pose may be moved by."""
-    size = float(np.linalg.norm(offset_of(lens, twist, depth)[:2])) / (LARGEST * float(lens[4]))
+    size = float(np.linalg.norm(pixel_offset(lens, twist, depth)[:2])) / (LARGEST * float(lens[4]))
     return twist / max(1.0, size, float(np.linalg.norm(twist[3:])) / TURN)
 
 
-def centred(twists: Double, rig: Rig, believed: NDArray[np.bool_]) -> Double:
+def remove_common_motion(twists: Double, rig: Rig, believed: NDArray[np.bool_]) -> Double:
     """[C, 6] the twists without what most cameras share: that is a motion of the scene.
 
     The median is taken of each number, in the world's axes, over the cameras that are believed. With a mean, a camera
@@ -217,25 +217,25 @@ class PoseDrift(Effect):
         poses = Poses.of(dict(seen.result.carried.get(NAME, {})), len(seen.rig))
         rows = {name: row for row, name in enumerate(seen.rig.names)}
         aligned = _aligned(seen, _looked_at(seen, poses, rows)) if on else {}
-        seems = poses.seems()
+        seems = poses.suspects()
         for row, (one, _, lens) in aligned.items():
-            poses.moved[row] = offset_of(lens, poses.twists[row], one.depth)
-            turn = in_pixels(lens)
+            poses.moved[row] = pixel_offset(lens, poses.twists[row], one.depth)
+            turn = turn_from_pixels(lens)
             matrix = turn.T @ one.matrix[3:, 3:] @ turn
-            poses.look(row, Equations(matrix, turn.T @ one.vector[3:], one.energy, one.depth))
+            poses.record_offset(row, Equations(matrix, turn.T @ one.vector[3:], one.energy, one.depth))
         trace = seen.result.trace
         for view in seen.views if trace.kept is Candidate.END else ():
             if rows[view.name] not in aligned and view.name in trace.shown and (on or not seems[rows[view.name]]):
                 every, planes = trace.shown[view.name]
-                _look(poses, rows[view.name], view, planes[:3], every)
+                _record_offset(poses, rows[view.name], view, planes[:3], every)
         if on and aligned:
             believed = np.isin(np.arange(len(rows)), [rows[view.name] for view in seen.views])
-            poses.twists = centred(stepped(poses.twists, aligned, poses.off()), seen.rig, believed)
+            poses.twists = remove_common_motion(step_twists(poses.twists, aligned, poses.drifted()), seen.rig, believed)
             for row, (one, _, lens) in aligned.items():
-                poses.moved[row] = offset_of(lens, poses.twists[row], one.depth)
+                poses.moved[row] = pixel_offset(lens, poses.twists[row], one.depth)
         elif not on:
             for view in [*(view for view in seen.views if seems[rows[view.name]]), *seen.suspects]:
-                _look(poses, rows[view.name], view, _rendered(seen, view)[0], 1)
+                _record_offset(poses, rows[view.name], view, _rendered(seen, view)[0], 1)
         return poses.arrays()
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
@@ -244,14 +244,14 @@ class PoseDrift(Effect):
         if arrays is None or not _says(seen):
             return None
         poses = Poses.of(dict(arrays), len(seen.rig))
-        shares = np.where(poses.seems(), poses.shares, 0.0)
+        shares = np.where(poses.suspects(), poses.shares, 0.0)
         row = int(shares.argmax())
         if shares[row] == 0:
             return Evidence(0.0, "")
         size = float(np.linalg.norm(poses.offsets[row]))
         return Evidence(float(shares[row]), f"camera {seen.rig.names[row]} is off by {size:.1f} pixels")
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Adds nothing: updates know nothing of it, for the poses are those of their views."""
 
 
@@ -261,7 +261,7 @@ def _says(seen: FrameObservation) -> bool:
 
 def _looked_at(seen: FrameObservation, poses: Poses, rows: Mapping[str, int]) -> list[TrainingView]:
     """Views to be aligned: of cameras that are off or excluded, and of some that stand, others in each frame."""
-    off = poses.off()
+    off = poses.drifted()
     standing = [view for view in seen.views if not off[rows[view.name]]]
     count = len(standing)
     some = {(seen.index + count * k // STANDING) % count for k in range(STANDING)} if count else set()
@@ -274,17 +274,17 @@ def _aligned(seen: FrameObservation, views: list[TrainingView]) -> dict[int, tup
     rows, by_row = {name: row for row, name in enumerate(seen.rig.names)}, {}
     for view in views:
         shown, depth = _rendered(seen, view)
-        compared = pictures(view.target[:3], _exposed(view, shown))
+        compared = align_pixels(view.target[:3], _exposed(view, shown))
         if compared is not None:
             equations = twist_equations(view.camera.lens, compared, depth)
             by_row[rows[view.name]] = (equations, seen.rig[view.name], view.camera.lens)
     return by_row
 
 
-def _look(poses: Poses, row: int, view: TrainingView, shown: Array, every: int) -> None:
-    compared = pictures(view.target[:3], _exposed(view, shown), every)
+def _record_offset(poses: Poses, row: int, view: TrainingView, shown: Array, every: int) -> None:
+    compared = align_pixels(view.target[:3], _exposed(view, shown), every)
     if compared is not None:
-        poses.look(row, turn_equations(view.camera.lens, compared))
+        poses.record_offset(row, turn_equations(view.camera.lens, compared))
 
 
 def _exposed(view: TrainingView, shown: Array) -> Array:
@@ -303,11 +303,11 @@ def _rendered(seen: FrameObservation, view: TrainingView) -> tuple[Array, Array]
 EFFECT = PoseDrift(
     name=NAME,
     group=EffectGroup.CAMERAS,
-    says="Cameras drift, or are knocked by a few pixels: their poses follow the pictures once per frame.",
-    gauge="The median twist over the cameras is 0: what most cameras share is motion of the scene.",
+    description="Cameras drift, or are knocked by a few pixels: their poses follow the pictures once per frame.",
+    disambiguation="The median twist over the cameras is 0: what most cameras share is motion of the scene.",
     cost="samples of eight renderings per frame; where on, one render of each camera that is off, and of six others",
     auto=True,
     on_above=0.2,
     off_below=0.08,
-    kept=("twists",),
+    committed_arrays=("twists",),
 )

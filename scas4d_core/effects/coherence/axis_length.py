@@ -23,7 +23,7 @@ class AxisLength(Effect):
         """Refused with a weight of 0."""
         return refusal_at_zero(settings, "weights.scale")
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Adds the term, with its weight."""
         builder.plan.axis_length = builder.update.weights.scale
 
@@ -31,7 +31,7 @@ class AxisLength(Effect):
 EFFECT = AxisLength(
     name="axis_length",
     group=EffectGroup.COHERENCE,
-    says="No Gaussian grows longer than in frame 0, or than 2 cm.",
-    gauge="Lengths of frame 0.",
+    description="No Gaussian grows longer than in frame 0, or than 2 cm.",
+    disambiguation="Lengths of frame 0.",
     cost="none measurable: a part of the cascade's backward pass",
 )

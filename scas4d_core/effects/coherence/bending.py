@@ -43,7 +43,7 @@ REST = 1e-3
 Double = NDArray[np.float64]
 
 
-def turns_of(before: Double, after: Double) -> tuple[Double, Double]:
+def patch_rotations(before: Double, after: Double) -> tuple[Double, Double]:
     """The rotations that come nearest to the motions of patches (Kabsch), and what of these is no rotation.
 
     Args:
@@ -62,7 +62,7 @@ def turns_of(before: Double, after: Double) -> tuple[Double, Double]:
     return left @ right, np.sqrt(np.maximum(rest, 0) / size)
 
 
-def bend(before: Gaussians, after: Gaussians) -> float | None:
+def measure_bending(before: Gaussians, after: Gaussians) -> float | None:
     """How much patches turn otherwise than those around them, median in radians; None: too little moves, or too few.
 
     Args:
@@ -80,7 +80,7 @@ def bend(before: Gaussians, after: Gaussians) -> float | None:
     if np.quantile(ways, 0.9) < REST * np.linalg.norm(np.ptp(old, axis=0)):
         return None
     patches = cKDTree(old).query(middles, k=PATCH + 1)[1]
-    turns, rest = turns_of(old[patches], new[patches])
+    turns, rest = patch_rotations(old[patches], new[patches])
     around = np.asarray(cKDTree(middles).query(middles, k=AROUND + 1)[1])[:, 1:]
     cosines = (np.einsum("pkij,pij->pk", turns[around], turns) - 1) / 2
     angles = np.median(np.arccos(np.clip(cosines, -1, 1)), axis=1)
@@ -100,13 +100,13 @@ class Bending(Effect):
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
         """The turn of neighbourhoods against those around them, from a frame to the next."""
-        angle = bend(seen.before, seen.result.gaussians)
+        angle = measure_bending(seen.before, seen.result.gaussians)
         if angle is None:
             return None
         angle = max(0.0, angle)
         return Evidence(min(1.0, angle), f"neighbourhoods turn {np.degrees(angle):.1f}° a frame unlike each other")
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Leaves out the term of rotation, and lets rigidity fall along an update."""
         builder.plan.neighbour_terms, builder.plan.rotation = True, 0.0
         builder.plan.rigidity_fades = builder.plan.rigidity > 0
@@ -115,8 +115,9 @@ class Bending(Effect):
 EFFECT = Bending(
     name="bending",
     group=EffectGroup.COHERENCE,
-    says="Neighbours rotate each in their own way, as in cloth: the term rotation is left out.",
-    gauge="Rotations of patches beyond the rest of their motion; joints between rigid parts are too few to count.",
+    description="Neighbours rotate each in their own way, as in cloth: the term rotation is left out.",
+    disambiguation="Rotations of patches beyond the rest of their motion; joints between rigid parts are too few to "
+    "count.",
     cost="1 % of an update: the rotations of 400 patches per frame",
     auto=True,
     on_above=0.018,

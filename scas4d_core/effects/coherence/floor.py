@@ -50,7 +50,7 @@ class Floor(Effect):
             return "the scene names no floor", "give scene.floor, a plane (a, b, c, d)"
         return None
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Adds the term."""
         assert builder.scene.floor is not None
         builder.plan.floor, builder.plan.floor_weight = builder.scene.floor, FLOOR_WEIGHT
@@ -59,7 +59,7 @@ class Floor(Effect):
 EFFECT = Floor(
     name="floor",
     group=EffectGroup.COHERENCE,
-    says="Moving Gaussians stay above the floor plane of the scene.",
-    gauge="A plane in the user's world.",
+    description="Moving Gaussians stay above the floor plane of the scene.",
+    disambiguation="A plane in the user's world.",
     cost="one dot product per moving Gaussian and iteration",
 )

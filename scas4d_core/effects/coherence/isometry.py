@@ -23,7 +23,7 @@ class Isometry(Effect):
         """Refused with a weight of 0."""
         return refusal_at_zero(settings, "weights.isometry")
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Adds the term, with its weight."""
         builder.plan.neighbour_terms = True
         builder.plan.isometry = builder.update.weights.isometry
@@ -32,7 +32,7 @@ class Isometry(Effect):
 EFFECT = Isometry(
     name="isometry",
     group=EffectGroup.COHERENCE,
-    says="Neighbours keep the distance that they had in frame 0: objects bend, but do not tear.",
-    gauge="Distances of frame 0; it ignores rotations.",
+    description="Neighbours keep the distance that they had in frame 0: objects bend, but do not tear.",
+    disambiguation="Distances of frame 0; it ignores rotations.",
     cost="one pass over 4,000 Gaussians and their neighbours per iteration, shared with rigidity and rotation",
 )

@@ -23,7 +23,7 @@ class Rigidity(Effect):
         """Refused with a weight of 0."""
         return refusal_at_zero(settings, "weights.rigidity")
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Adds the term, with its weight."""
         builder.plan.neighbour_terms = True
         builder.plan.rigidity = builder.update.weights.rigidity
@@ -32,7 +32,7 @@ class Rigidity(Effect):
 EFFECT = Rigidity(
     name="rigidity",
     group=EffectGroup.COHERENCE,
-    says="Neighbours keep the offsets that they had in the previous frame.",
-    gauge="It constrains motion, not colour: nothing else explains it.",
+    description="Neighbours keep the offsets that they had in the previous frame.",
+    disambiguation="It constrains motion, not colour: nothing else explains it.",
     cost="one pass over 4,000 Gaussians and their neighbours per iteration, shared with isometry and rotation",
 )

@@ -23,7 +23,7 @@ class Rotation(Effect):
         """Refused with a weight of 0."""
         return refusal_at_zero(settings, "weights.rotation")
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Adds the term, with its weight."""
         builder.plan.neighbour_terms = True
         builder.plan.rotation = builder.update.weights.rotation
@@ -32,7 +32,7 @@ class Rotation(Effect):
 EFFECT = Rotation(
     name="rotation",
     group=EffectGroup.COHERENCE,
-    says="Neighbours rotate alike.",
-    gauge="Rotations since the previous frame.",
+    description="Neighbours rotate alike.",
+    disambiguation="Rotations since the previous frame.",
     cost="one pass over 4,000 Gaussians and their neighbours per iteration, shared with rigidity and isometry",
 )

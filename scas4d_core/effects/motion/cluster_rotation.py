@@ -11,7 +11,7 @@ from scas4d_core.effects.motion.free_columns import ClusterColumns
 EFFECT = ClusterColumns(
     name="cluster_rotation",
     group=EffectGroup.MOTION,
-    says="Clusters rotate: the parts of an object, and the parts of these.",
-    gauge="About the cluster's centroid, beside a translation; coarse layers learn first.",
+    description="Clusters rotate: the parts of an object, and the parts of these.",
+    disambiguation="About the cluster's centroid, beside a translation; coarse layers learn first.",
     cost="none measurable: off saves three numbers per cluster in Adam's step, not the cascade",
 )

@@ -11,7 +11,7 @@ from scas4d_core.effects.motion.free_columns import ClusterColumns
 EFFECT = ClusterColumns(
     name="cluster_translation",
     group=EffectGroup.MOTION,
-    says="Clusters translate: whole objects first, then their parts.",
-    gauge="Of the cluster's centroid, beside a rotation; coarse layers learn first.",
+    description="Clusters translate: whole objects first, then their parts.",
+    disambiguation="Of the cluster's centroid, beside a rotation; coarse layers learn first.",
     cost="none measurable: off saves three numbers per cluster in Adam's step, not the cascade",
 )

@@ -37,7 +37,7 @@ class FreeColumns(Effect):
             return None
         return "no motion of clusters and of Gaussians is left", f"leave one of {', '.join(MOVES)} 'auto'"
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Frees them."""
         builder.plan.freedom = replace(builder.plan.freedom, **{self.name: True})
 

@@ -8,7 +8,7 @@ from scas4d_core.effects.motion.free_columns import FreeColumns
 EFFECT = FreeColumns(
     name="own_rotation",
     group=EffectGroup.MOTION,
-    says="Each Gaussian may rotate relative to its clusters.",
-    gauge="It learns last and slowly, so it finds only what the clusters leave.",
+    description="Each Gaussian may rotate relative to its clusters.",
+    disambiguation="It learns last and slowly, so it finds only what the clusters leave.",
     cost="1 % of an update, together with own_position and own_scale",
 )

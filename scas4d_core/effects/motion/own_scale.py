@@ -24,7 +24,7 @@ class OwnScale(FreeColumns):
 EFFECT = OwnScale(
     name="own_scale",
     group=EffectGroup.MOTION,
-    says="Each Gaussian's axes may grow and shrink.",
-    gauge="The limit of the axes' lengths; it learns last and slowly.",
+    description="Each Gaussian's axes may grow and shrink.",
+    disambiguation="The limit of the axes' lengths; it learns last and slowly.",
     cost="1 % of an update, together with own_position and own_rotation",
 )

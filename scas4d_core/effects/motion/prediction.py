@@ -30,7 +30,7 @@ class Prediction(Effect):
             return None
         return f"{' and '.join(carried)} are 'off'", "leave one of them 'auto'"
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Lets the update start from the motion before."""
         builder.plan.freedom = replace(builder.plan.freedom, prediction=True)
 
@@ -38,7 +38,7 @@ class Prediction(Effect):
 EFFECT = Prediction(
     name="prediction",
     group=EffectGroup.MOTION,
-    says="An update starts from the motion of the previous frame, if that shows the frame better.",
-    gauge="It sets the start alone: the pictures decide where the update ends.",
+    description="An update starts from the motion of the previous frame, if that shows the frame better.",
+    disambiguation="It sets the start alone: the pictures decide where the update ends.",
     cost="one comparison of half-size pictures of four views per update",
 )

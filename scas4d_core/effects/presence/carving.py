@@ -30,9 +30,9 @@ COARSE = 32
 """Voxels along an edge of the first grid."""
 VOXEL_PIXELS = 1.5
 """Edge of the smallest voxel, at most, in pixels at the middle of the stage."""
-MOST_CELLS = 1 << 24
+MAX_CELLS = 1 << 24
 """Cells of the grid that separates new objects; a sparser cluster is no object."""
-MOST_VOXELS = 1_000_000
+MAX_VOXELS = 1_000_000
 """A level that would hold more is not entered."""
 AT_ONCE = 1 << 16
 """Voxels that are looked at together: each takes 200 bytes meanwhile."""
@@ -74,7 +74,7 @@ def carve_new(seen: Sequence[Novelty]) -> Hull:
     cells = np.stack(np.meshgrid(*[np.arange(COARSE, dtype=np.int32)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     distances = [(_distance(one.new), _distance(one.new | one.covered)) for one in seen]
     while True:
-        last = voxel <= VOXEL_PIXELS * pixel or 8 * len(cells) > MOST_VOXELS
+        last = voxel <= VOXEL_PIXELS * pixel or 8 * len(cells) > MAX_VOXELS
         parts = np.split(cells, range(AT_ONCE, len(cells), AT_ONCE))
         cells = cells[np.concatenate([_kept(seen, distances, origin + part * voxel, voxel, last) for part in parts])]
         if last or len(cells) == 0:
@@ -128,7 +128,7 @@ def _hull(cells: NDArray[np.int32], origin: Float, voxel: float) -> Hull:
     # Things far apart are moved together, with an empty layer between them: the grid is as large as they are.
     close = np.stack([_without_gaps(column) for column in cells.T], axis=1)
     shape = close.max(axis=0) + 2
-    if np.prod(shape) > MOST_CELLS:
+    if np.prod(shape) > MAX_CELLS:
         return _hull(cells[:0], origin, voxel)
     grid = np.zeros(shape, np.bool_)
     at = tuple(close.T)

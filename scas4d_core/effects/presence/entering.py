@@ -14,8 +14,8 @@ from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.effects.evidence import Evidence
 from scas4d_core.effects.presence.carving import Hull, carve_new, footprint
 from scas4d_core.effects.presence.newborn_tracking import NewbornTracking
-from scas4d_core.effects.presence.novelty import Novelty, glance, said
-from scas4d_core.effects.presence.returning import returned, revived
+from scas4d_core.effects.presence.novelty import Novelty, novelty_of_views, screen_novelty
+from scas4d_core.effects.presence.returning import find_returned, revive_returned
 from scas4d_core.posed_pictures import pixels_inside
 from scas4d_core.update.parts import Arrays
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 Bool = NDArray[np.bool_]
 
 NAME = "entering"
-GLANCED = 2
+MIN_CAMERAS = 2
 """Cameras of a glance that have to see something new before all are asked."""
 SMALLEST = 0.003
 """Share of a camera's pixels that it must see as new to have a say: 200 of 256 x 256. What an update leaves behind of
@@ -51,7 +51,7 @@ DENIED = 0.5
 """Share of the cameras that have what was born in view and see something else there, above which it is retired once it
 is settled: it was an error."""
 NONE = np.zeros(0, np.int64)
-NOBODY: Arrays = {
+NO_NEWBORNS: Arrays = {
     "rows": NONE,
     "age": NONE,
     "newborn": NONE,
@@ -70,7 +70,7 @@ BUDGET = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class EnteredThings:
     """The hull of what has entered.
 
     Attributes:
@@ -84,11 +84,11 @@ class Found:
     cameras: int
 
 
-def entered(seen: FrameObservation) -> Found | None:
+def find_entered(seen: FrameObservation) -> EnteredThings | None:
     """What a frame shows that the state does not have; None where there is nothing of the kind."""
-    if sum(_says(one) for one in glance(seen, GLANCED, new=SMALLEST)) < GLANCED:
+    if sum(_says(one) for one in screen_novelty(seen, MIN_CAMERAS, new=SMALLEST)) < MIN_CAMERAS:
         return None
-    everyone = said(seen, seen.views)
+    everyone = novelty_of_views(seen, seen.views)
     hull = carve_new(everyone)
     total = sum(float(one.error.sum()) for one in everyone)
     kept, share, cameras, pixels = np.zeros(len(hull.points), np.bool_), 0.0, 0, 0
@@ -106,7 +106,7 @@ def entered(seen: FrameObservation) -> Found | None:
             pixels += sum(int(where.sum()) for where in shown)
     if not kept.any() or sum(one.surplus for one in everyone) < SURPLUS * pixels:
         return None
-    return Found(everyone, hull.only(kept), share, cameras)
+    return EnteredThings(everyone, hull.only(kept), share, cameras)
 
 
 def _at_border(pixels: Bool) -> bool:
@@ -117,18 +117,18 @@ def _says(one: Novelty) -> bool:
     return one.surplus >= SMALLEST * one.new.size
 
 
-def _denied(seen: Sequence[Novelty], means: NDArray[np.float64]) -> Bool:
+def _find_denied(seen: Sequence[Novelty], means: NDArray[np.float64]) -> Bool:
     """[P] the means in whose pixels most cameras see that nothing of the kind is there."""
     against, asked = np.zeros(len(means), np.int64), np.zeros(len(means), np.int64)
     for one in seen:
         column, row, _, inside = pixels_inside(one.camera, means)
         asked += inside
         against += inside & one.stale[row, column]
-    denied: Bool = (asked >= GLANCED) & (against > DENIED * asked)
+    denied: Bool = (asked >= MIN_CAMERAS) & (against > DENIED * asked)
     return denied
 
 
-def _remembered(found: Found, state: Gaussians, rows: NDArray[np.int64], left: Arrays) -> Arrays:
+def _record_newborns(found: EnteredThings, state: Gaussians, rows: NDArray[np.int64], left: Arrays) -> Arrays:
     """The arrays that the births and returns of a frame add to those that were left; ``rows`` are theirs."""
     things = np.unique(found.hull.things)
     thing = found.hull.things[cKDTree(found.hull.points).query(state.means[rows])[1]]
@@ -163,51 +163,51 @@ class Entering(Effect):
         left = seen.result.carried.get(NAME)
         if left is not None and seen.result.gaussians.present[left["rows"]].any():
             return _evidence(float(left["share"]), int(left["cameras"]))
-        things = entered(seen)
+        things = find_entered(seen)
         return Evidence(0.0, "") if things is None else _evidence(things.share, things.cameras)
 
     def add_and_retire_gaussians(self, seen: FrameObservation) -> UpdateResult:
         """The result with the Gaussians that are born, and the newborn ones settled."""
-        from scas4d_core.effects.presence.growing import grown, seeds, settled
+        from scas4d_core.effects.presence.newborn_fit import fit_newborns, refine_newborns, sample_seeds
 
-        result, things = seen.result, entered(seen)
-        left = result.carried.get(NAME, NOBODY)
+        result, things = seen.result, find_entered(seen)
+        left = result.carried.get(NAME, NO_NEWBORNS)
         state, rng = result.gaussians, np.random.default_rng([seen.index, len(result.gaussians)])
         newborn = left["age"] < SETTLED
         settling = left["rows"][newborn & state.present[left["rows"]]]
         if len(settling):
-            state = settled(state, settling, seen.views, seen.rig, seen.renderer, rng, seen.time)
-        arrays = {**left, **{name: NOBODY[name] for name in NEWBORN_ARRAYS}, "age": left["age"] + 1}
+            state = refine_newborns(state, settling, seen.views, seen.rig, seen.renderer, rng, seen.time)
+        arrays = {**left, **{name: NO_NEWBORNS[name] for name in NEWBORN_ARRAYS}, "age": left["age"] + 1}
         parents = result.parents
         grown_up = left["rows"][(left["age"] == SETTLED) & state.present[left["rows"]]]
         if len(grown_up):
-            denied = _denied(said(seen, seen.views), state.means[grown_up].astype(np.float64))
+            denied = _find_denied(novelty_of_views(seen, seen.views), state.means[grown_up].astype(np.float64))
             state = state.retire(grown_up[denied]) if denied.any() else state
         if things is not None and state.retired.any():
-            back = returned(things.seen, things.hull, state, seen.renderer)
+            back = find_returned(things.seen, things.hull, state, seen.renderer)
             if back:
-                state = revived(state, back)
-                arrays |= _remembered(things, state, np.concatenate([one.rows for one in back]), arrays)
+                state = revive_returned(state, back)
+                arrays |= _record_newborns(things, state, np.concatenate([one.rows for one in back]), arrays)
                 rest = ~np.isin(things.hull.things, [one.thing for one in back])
                 things = replace(things, hull=things.hull.only(rest)) if rest.any() else None
         if things is not None:
-            points, colours = seeds(things.seen, things.hull, min(int(BUDGET * len(state)), seen.room), rng)
+            points, colours = sample_seeds(things.seen, things.hull, min(int(BUDGET * len(state)), seen.room), rng)
             things = things if len(points) else None
         born = None
         if things is not None:
             given = seen.views, seen.rig, seen.renderer, rng
-            born = grown(state, points, colours, *given, moves=True, time=seen.time)
+            born = fit_newborns(state, points, colours, *given, moves=True, time=seen.time)
         if things is not None and born is not None:
             rows = np.arange(len(state), len(state) + len(born))
-            state = state.joined(born)
-            arrays |= _remembered(things, state, rows, arrays)
+            state = state.concatenate(born)
+            arrays |= _record_newborns(things, state, rows, arrays)
             alone = np.full(len(born), -1, np.int64)
             parents = alone if parents is None else np.concatenate([parents, alone])
-        if state is result.gaussians and left is NOBODY:
+        if state is result.gaussians and left is NO_NEWBORNS:
             return result
         return replace(result, gaussians=state, parents=parents, carried={**result.carried, NAME: arrays})
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Adds the search for what was born in the frame before."""
         builder.parts.append(NewbornTracking(builder, NAME))
 
@@ -219,11 +219,11 @@ def _evidence(share: float, cameras: int) -> Evidence:
 EFFECT = Entering(
     name=NAME,
     group=EffectGroup.PRESENCE,
-    says="Objects enter the scene: Gaussians are added where cameras agree that nothing explains the pictures.",
-    gauge="Only what no Gaussian covers, beyond what has moved away elsewhere.",
+    description="Objects enter the scene: Gaussians are added where cameras agree that nothing explains the pictures.",
+    disambiguation="Only what no Gaussian covers, beyond what has moved away elsewhere.",
     cost="a check of the last rendered pictures; where something enters, about an update more",
     auto=True,
     on_above=SHARE,
     off_below=WORTH,
-    kept=tuple(NOBODY),
+    committed_arrays=tuple(NO_NEWBORNS),
 )

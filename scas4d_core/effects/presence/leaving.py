@@ -34,7 +34,7 @@ WIDTHS = 3.0
 """Standard deviations of a Gaussian that have to be outside as well."""
 
 
-def outside(state: Gaussians, rig: Rig) -> NDArray[np.bool_]:
+def outside_all_views(state: Gaussians, rig: Rig) -> NDArray[np.bool_]:
     """[N] the moving Gaussians that are in no picture.
 
     Args:
@@ -68,12 +68,12 @@ class Leaving(Effect):
         if left is not None and state.retired.any():
             return _evidence(float(left["share"]))
         moving = int(state.moving.sum())
-        return _evidence(float(outside(state, seen.rig).sum()) / max(1, moving))
+        return _evidence(float(outside_all_views(state, seen.rig).sum()) / max(1, moving))
 
     def add_and_retire_gaussians(self, seen: FrameObservation) -> UpdateResult:
         """The result with those retired that have been outside for long enough."""
         state = seen.result.gaussians
-        out = outside(state, seen.rig)
+        out = outside_all_views(state, seen.rig)
         left: Arrays = dict(seen.result.carried.get(NAME, {}))
         before = left.get("frames", np.zeros(0, np.int64))
         frames = np.where(out, 1 + np.pad(before, (0, len(out) - len(before))), 0)
@@ -88,7 +88,7 @@ class Leaving(Effect):
         carried = {**seen.result.carried, NAME: arrays}
         return replace(seen.result, gaussians=state.retire(gone) if gone.any() else state, carried=carried)
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Adds nothing: retirements come after the update of a frame."""
 
 
@@ -99,11 +99,11 @@ def _evidence(share: float) -> Evidence:
 EFFECT = Leaving(
     name=NAME,
     group=EffectGroup.PRESENCE,
-    says="Objects leave the scene: Gaussians in no picture are retired, and may come back under their ids.",
-    gauge="None is needed: what is in no picture explains nothing.",
+    description="Objects leave the scene: Gaussians in no picture are retired, and may come back under their ids.",
+    disambiguation="None is needed: what is in no picture explains nothing.",
     cost="one projection of the moving Gaussians per frame; an update costs less without what has left",
     auto=True,
     on_above=SHARE,
     off_below=IDLE_SHARE,
-    kept=("share",),
+    committed_arrays=("share",),
 )

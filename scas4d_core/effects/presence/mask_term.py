@@ -28,7 +28,7 @@ class MaskTerm(Effect):
             return None
         return "update.weights.mask and update.weights.mask_alone are 0", "give one of them a weight above 0"
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Adds the term, with its weight."""
         from scas4d_core.update.schedule import mask_weight  # it loads the kernels
 
@@ -38,8 +38,8 @@ class MaskTerm(Effect):
 EFFECT = MaskTerm(
     name="mask_term",
     group=EffectGroup.PRESENCE,
-    says="With masks, moving and static Gaussians must cover the pixels that the masks give them.",
-    gauge="Labels come from frame 0 and are no parameter: the term moves Gaussians, and relabels none.",
+    description="With masks, moving and static Gaussians must cover the pixels that the masks give them.",
+    disambiguation="Labels come from frame 0 and are no parameter: the term moves Gaussians, and relabels none.",
     cost="a fourth channel beside RGB, forward and backward; without masks nothing",
     without_masks=False,
 )

@@ -15,7 +15,7 @@ from scas4d_core.update.parts import PlanBuilder
 class MotionLabels(Effect):
     """Labels from motion, in scenes without masks."""
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Asks for them."""
         builder.plan.learns_labels = True
 
@@ -23,7 +23,7 @@ class MotionLabels(Effect):
 EFFECT = MotionLabels(
     name="motion_labels",
     group=EffectGroup.PRESENCE,
-    says="Without masks, only Gaussians that most cameras have seen in changed pixels move.",
-    gauge="A Gaussian that has moved once may always move: labels are added and never removed.",
+    description="Without masks, only Gaussians that most cameras have seen in changed pixels move.",
+    disambiguation="A Gaussian that has moved once may always move: labels are added and never removed.",
     cost="a comparison of each view with the previous frame; static Gaussians save more than that",
 )

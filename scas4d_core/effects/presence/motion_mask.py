@@ -60,10 +60,10 @@ def first_labels(gaussians: Gaussians, rig: Rig, masks: Mapping[str, NDArray[np.
         gaussians: as they were fitted. rig: inside, at the size of the masks.
         masks: of frame 0, [H, W] by camera, not 0 on the foreground; empty where there are none.
     """
-    return with_reliable_labels(with_what_masks_hold(gaussians, rig, masks))
+    return with_reliable_labels(with_mask_hull_labels(gaussians, rig, masks))
 
 
-def with_what_masks_hold(gaussians: Gaussians, rig: Rig, masks: Mapping[str, NDArray[np.uint8]]) -> Gaussians:
+def with_mask_hull_labels(gaussians: Gaussians, rig: Rig, masks: Mapping[str, NDArray[np.uint8]]) -> Gaussians:
     """The Gaussians, with those in the visual hull of the masks moving as well (Laurentini 1994).
 
     Where no Gaussian is static, or none moves, labels say nothing of the inside, and stay.
@@ -122,7 +122,7 @@ def changed_pixels(before: Array, now: Array) -> Array:
     return marked
 
 
-def moving_between(
+def find_moving(
     gaussians: Gaussians, before: Sequence[TrainingView], now: Sequence[TrainingView], renderer: Renderer
 ) -> NDArray[np.bool_]:
     """[N] bool: Gaussians that the pictures of two frames show to move.
@@ -147,7 +147,7 @@ def moving_between(
     return moving
 
 
-def labels_learnt(
+def learn_labels_from_motion(
     gaussians: Gaussians,
     known: NDArray[np.bool_] | None,
     before: Sequence[TrainingView],
@@ -158,15 +158,15 @@ def labels_learnt(
 
     Args:
         gaussians: Θ_{t−1}. known: [N] those that had been seen to move before, or None.
-        before, now: see ``moving_between``.
+        before, now: see ``find_moving``.
     """
-    moving = moving_between(gaussians, before, now, renderer)
+    moving = find_moving(gaussians, before, now, renderer)
     if known is None:
         return moving if moving.sum() >= FIRST_LABELS else None
     enough = min(NEW_LABELS * len(gaussians), max(FIRST_LABELS, MORE_LABELS * known.sum()))
     return None if (moving & ~known).sum() <= enough else moving | known
 
 
-def labelled(gaussians: Gaussians, labels: NDArray[np.bool_] | None) -> Gaussians:
+def with_labels(gaussians: Gaussians, labels: NDArray[np.bool_] | None) -> Gaussians:
     """The Gaussians with the labels [N] learnt from motion; unchanged where ``labels`` is None."""
     return gaussians if labels is None else gaussians.replace(foreground=labels.astype(np.float32))

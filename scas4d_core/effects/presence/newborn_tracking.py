@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.effects.presence.carving import Hull, carve_new
-from scas4d_core.effects.presence.novelty import novelties
+from scas4d_core.effects.presence.novelty import measure_novelty
 from scas4d_core.update.parts import Attempt, PlanBuilder, UpdatePart
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ class NewbornTracking(UpdatePart):
         if arrays is None or not len(arrays["newborn"]) or not attempt.tables.clusters:
             return
         rest = attempt.previous.retire(arrays["newborn"])
-        hull = carve_new(novelties(rest, rest.colours, attempt.views, self._factory.posed, attempt.renderer))
+        hull = carve_new(measure_novelty(rest, rest.colours, attempt.views, self._factory.posed, attempt.renderer))
         thing = np.full(len(attempt.previous), -1)
         thing[arrays["newborn"]] = arrays["thing"]
         of_entries, labels = thing[self._hierarchy.rows], self._hierarchy.labels[0]

@@ -70,7 +70,7 @@ class Novelty:
         return int(self.new.sum()) - int(self.stale.sum())
 
 
-class Glimpse(NamedTuple):
+class CoarseNovelty(NamedTuple):
     """What a thinned rendering of the end of an update says, roughly, without another rendering.
 
     Attributes:
@@ -82,57 +82,63 @@ class Glimpse(NamedTuple):
     bare: float
 
 
-GLANCE = 6
+SCREENED_CAMERAS = 6
 """Cameras at most that are looked at in each frame before all are; where the update has left no rendering, others each
 time."""
-SEEMS = 0.5
+COARSE_SHARE = 0.5
 """Of a share of pixels: a glimpse has to find so much of it. On the captures it finds 0.6 to 0.9 of such as count; of
 rims that are none, 0.2 to 0.6."""
 
-_said: WeakKeyDictionary[Gaussians, dict[str, Novelty]] = WeakKeyDictionary()
+_novelty_cache: WeakKeyDictionary[Gaussians, dict[str, Novelty]] = WeakKeyDictionary()
 """What cameras say, by state: several effects ask for the same."""
-_glimpsed: WeakKeyDictionary[UpdateTrace, list[Glimpse]] = WeakKeyDictionary()
+_coarse_cache: WeakKeyDictionary[UpdateTrace, list[CoarseNovelty]] = WeakKeyDictionary()
 """Those of an update."""
 
 
-def glance(seen: FrameObservation, least: int, new: float = 0.0, bare: float = 0.0) -> list[Novelty]:
+def screen_novelty(seen: FrameObservation, least: int, new: float = 0.0, bare: float = 0.0) -> list[Novelty]:
     """What some cameras say of a frame; nothing where too few of them can say that something is new, or bare.
 
     Args:
         least: cameras that have to. new, bare: share of its pixels that each of them has to see as such.
     """
-    glimpses = _glimpses(seen) if seen.result.trace.kept is Candidate.END else []
-    if len(glimpses) >= min(GLANCE, len(seen.views)) > 0:  # fewer say too little: it ended otherwise than planned
-        seem = [one.view for one in glimpses if one.new >= SEEMS * new and one.bare >= SEEMS * bare]
-        return said(seen, seem[: max(GLANCE, least)]) if len(seem) >= least else []
+    glimpses = _coarse_novelties(seen) if seen.result.trace.kept is Candidate.END else []
+    if (
+        len(glimpses) >= min(SCREENED_CAMERAS, len(seen.views)) > 0
+    ):  # fewer say too little: it ended otherwise than planned
+        seem = [one.view for one in glimpses if one.new >= COARSE_SHARE * new and one.bare >= COARSE_SHARE * bare]
+        return novelty_of_views(seen, seem[: max(SCREENED_CAMERAS, least)]) if len(seem) >= least else []
     count = len(seen.views)
-    looked_at = min(GLANCE, count)
-    return said(seen, [seen.views[(seen.index + count * k // looked_at) % count] for k in range(looked_at)])
+    looked_at = min(SCREENED_CAMERAS, count)
+    return novelty_of_views(seen, [seen.views[(seen.index + count * k // looked_at) % count] for k in range(looked_at)])
 
 
-def _glimpses(seen: FrameObservation) -> list[Glimpse]:
+def _coarse_novelties(seen: FrameObservation) -> list[CoarseNovelty]:
     """Those of the cameras that the update rendered last."""
     trace = seen.result.trace
-    if trace not in _glimpsed:
-        _glimpsed[trace] = [_glimpse(view, trace.shown[view.name]) for view in seen.views if view.name in trace.shown]
-    return _glimpsed[trace]
+    if trace not in _coarse_cache:
+        _coarse_cache[trace] = [
+            _coarse_novelty(view, trace.shown[view.name]) for view in seen.views if view.name in trace.shown
+        ]
+    return _coarse_cache[trace]
 
 
-def _glimpse(view: TrainingView, thinned: Thinned) -> Glimpse:
+def _coarse_novelty(view: TrainingView, thinned: Thinned) -> CoarseNovelty:
     """One of a view and its rendering; four pixels that touch have to agree."""
     every, shown = thinned
     target = view.target[:, ::every, ::every]
     gain, offset = view.exposure[:3, 0, None, None], view.exposure[:3, 1, None, None]
     difference = sum(_corners(np.abs(target[:3] - (gain * shown[:3] + offset)).mean(axis=0))) / 4
-    label, rest = shown[3], shown[4]
+    label, transmittance = shown[3], shown[4]
     if len(target) > 3:
         new, stands = (target[3] > 0.5) & (label < ABSENT), (target[3] <= 0.5) & (label < ABSENT)
-        new_squares = _all(new)
+        new_squares = _all_corners(new)
     else:
         stands = label < ABSENT
-        new_squares = _all(label < THERE) & (difference > max(DIFFERENT, TIMES_USUAL * float(np.median(difference))))
-    bare = _all(stands & (rest > BARE)) & (difference > DIFFERENT)
-    return Glimpse(view, float(new_squares.mean()), float(bare.mean()))
+        new_squares = _all_corners(label < THERE) & (
+            difference > max(DIFFERENT, TIMES_USUAL * float(np.median(difference)))
+        )
+    bare = _all_corners(stands & (transmittance > BARE)) & (difference > DIFFERENT)
+    return CoarseNovelty(view, float(new_squares.mean()), float(bare.mean()))
 
 
 def _corners(plane: NDArray[Any]) -> tuple[NDArray[Any], ...]:
@@ -140,25 +146,25 @@ def _corners(plane: NDArray[Any]) -> tuple[NDArray[Any], ...]:
     return plane[:-1, :-1], plane[:-1, 1:], plane[1:, :-1], plane[1:, 1:]
 
 
-def _all(plane: Bool) -> Bool:
+def _all_corners(plane: Bool) -> Bool:
     one, two, three, four = _corners(plane)
     everywhere: Bool = one & two & three & four
     return everywhere
 
 
-def said(seen: FrameObservation, views: Sequence[TrainingView]) -> list[Novelty]:
+def novelty_of_views(seen: FrameObservation, views: Sequence[TrainingView]) -> list[Novelty]:
     """What some views say, in the colours of the frame before: what is new may be painted on what stands by now."""
     state = seen.result.gaussians
-    known = _said.setdefault(state, {})
+    known = _novelty_cache.setdefault(state, {})
     missing = [view for view in views if view.name not in known or known[view.name].view is not view]
     colours = state.colours.copy()
     colours[: len(seen.before)] = seen.before.colours
-    new_things = novelties(state, colours, missing, seen.rig, seen.renderer)
+    new_things = measure_novelty(state, colours, missing, seen.rig, seen.renderer)
     known.update({view.name: one for view, one in zip(missing, new_things, strict=True)})
     return [known[view.name] for view in views]
 
 
-def novelties(
+def measure_novelty(
     state: Gaussians,
     colours: Array,
     views: Sequence[TrainingView],
@@ -176,7 +182,7 @@ def novelties(
 
 
 def _novelty(state: Gaussians, view: TrainingView, camera: Camera, renderer: Renderer) -> Novelty:
-    planes, rest = renderer.render(state, view.camera)
+    planes, transmittance = renderer.render(state, view.camera)
     gain, offset = view.exposure[:3, 0, None, None], view.exposure[:3, 1, None, None]
     difference: Array = view.target[:3] - (gain * planes[:3] + offset)
     label = planes[3]
@@ -190,7 +196,7 @@ def _novelty(state: Gaussians, view: TrainingView, camera: Camera, renderer: Ren
         off = blurred > max(DIFFERENT, TIMES_USUAL * float(np.median(blurred)))
         new, stale = off & (label < THERE), off & (label >= THERE)
         behind = label < ABSENT
-    bare = behind & (rest > BARE) & (blurred > DIFFERENT)
+    bare = behind & (transmittance > BARE) & (blurred > DIFFERENT)
     image = np.moveaxis((view.target[:3] - offset) / gain, 0, -1)
     error = np.square(difference).mean(axis=0)
     return Novelty(view, camera, image, _wide(new), _wide(stale), label >= ABSENT, _wide(bare), behind, error)

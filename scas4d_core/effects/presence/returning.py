@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import label
 
 from scas4d_core.effects.presence.carving import Hull, footprint
-from scas4d_core.effects.presence.novelty import novelties
+from scas4d_core.effects.presence.novelty import measure_novelty
 from scas4d_core.gaussians import Gaussians
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ APART = 0.25
 """Of the size of a hull: retired Gaussians that are no farther apart are of one thing."""
 
 
-class Returned(NamedTuple):
+class ReturnedThing(NamedTuple):
     """Retired Gaussians that explain a thing.
 
     Attributes:
@@ -41,17 +41,17 @@ class Returned(NamedTuple):
     shift: Float
 
 
-def returned(seen: Sequence[Novelty], hull: Hull, state: Gaussians, renderer: Renderer) -> list[Returned]:
+def find_returned(seen: Sequence[Novelty], hull: Hull, state: Gaussians, renderer: Renderer) -> list[ReturnedThing]:
     """What of the retired explains things that are new; they are shown as they were, moved to the hull's middle.
 
     Args:
         seen: what the cameras say. hull: of what is new. state: Θ_t. renderer: draws.
     """
     retired = np.flatnonzero(state.retired & (state.foreground > 0.5))
-    revivals: list[Returned] = []
+    revivals: list[ReturnedThing] = []
     for thing in np.unique(hull.things):
         points = hull.points[hull.things == thing]
-        best: tuple[float, Returned] | None = None
+        best: tuple[float, ReturnedThing] | None = None
         for rows in _groups(state.means[retired].astype(np.float64), APART * _size(points)):
             own = retired[rows]
             means = state.means[own].astype(np.float64)
@@ -59,15 +59,17 @@ def returned(seen: Sequence[Novelty], hull: Hull, state: Gaussians, renderer: Re
             if taken or not 1 / ALIKE <= _size(means) / _size(points) <= ALIKE:
                 continue
             shift = points.mean(axis=0) - means.mean(axis=0)
-            left = _left(seen, points, hull.voxel, revived(state, [Returned(int(thing), own, shift)]), renderer)
+            left = _left(
+                seen, points, hull.voxel, revive_returned(state, [ReturnedThing(int(thing), own, shift)]), renderer
+            )
             if left < 1 - EXPLAINS and (best is None or left < best[0]):
-                best = left, Returned(int(thing), own, shift)
+                best = left, ReturnedThing(int(thing), own, shift)
         if best is not None:
             revivals.append(best[1])
     return revivals
 
 
-def revived(state: Gaussians, found: Sequence[Returned]) -> Gaussians:
+def revive_returned(state: Gaussians, found: Sequence[ReturnedThing]) -> Gaussians:
     """The state with what has returned, where it is now."""
     means = state.means.copy()
     for one in found:
@@ -104,7 +106,7 @@ def _left(seen: Sequence[Novelty], points: Float, voxel: float, state: Gaussians
     for one in seen:
         where = one.new & footprint(one, points, voxel)
         if where.any():
-            now = novelties(state, state.colours, [one.view], {one.view.name: one.camera}, renderer)[0]
+            now = measure_novelty(state, state.colours, [one.view], {one.view.name: one.camera}, renderer)[0]
             before += float(one.error[where].sum())
             after += float(now.error[where].sum())
     return after / before if before > 0 else 1.0

@@ -11,8 +11,8 @@ import numpy as np
 from scas4d_core.effects.effect import Effect, EffectGroup
 from scas4d_core.effects.evidence import Evidence
 from scas4d_core.effects.presence.carving import footprint
-from scas4d_core.effects.presence.novelty import glance, said
-from scas4d_core.effects.presence.uncovering import Uncovered, uncovered
+from scas4d_core.effects.presence.novelty import novelty_of_views, screen_novelty
+from scas4d_core.effects.presence.uncovered_points import UncoveredPoints, find_uncovered_points
 
 if TYPE_CHECKING:
     from scas4d_core.effects.evidence import FrameObservation
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from scas4d_core.update.result import UpdateResult
 
 NAME = "uncovered"
-GLANCED, GLANCED_ON = 3, 1
+MIN_CAMERAS, MIN_CAMERAS_WHILE_ON = 3, 1
 """Cameras of a glance that have to see something bare before all are asked; and where the effect is on. What moves on
 goes on uncovering, and a hole behind it is seen by few cameras at first."""
 SMALLEST = 0.0004
@@ -34,24 +34,27 @@ BUDGET = 0.05
 """Gaussians that are born in a frame at most, as a share of those that are there."""
 
 
-Found = tuple[Uncovered, float]
-_found_in: WeakKeyDictionary[Gaussians, dict[int, Found | None]] = WeakKeyDictionary()
+Found = tuple[UncoveredPoints, float]
+_points_cache: WeakKeyDictionary[Gaussians, dict[int, Found | None]] = WeakKeyDictionary()
 """What was found, by state and the cameras of a glance that were asked for: evidence and births ask for the same."""
 
 
-def _found(seen: FrameObservation, glanced: int) -> Found | None:
+def _find_points(seen: FrameObservation, glanced: int) -> Found | None:
     """Points on what is uncovered, and the share of the squared error that they explain."""
-    known = _found_in.setdefault(seen.result.gaussians, {})
+    known = _points_cache.setdefault(seen.result.gaussians, {})
     if glanced not in known:
         known[glanced] = _looked_for(seen, glanced)
     return known[glanced]
 
 
 def _looked_for(seen: FrameObservation, glanced: int) -> Found | None:
-    if sum(one.bare.sum() >= SMALLEST * one.bare.size for one in glance(seen, glanced, bare=SMALLEST)) < glanced:
+    if (
+        sum(one.bare.sum() >= SMALLEST * one.bare.size for one in screen_novelty(seen, glanced, bare=SMALLEST))
+        < glanced
+    ):
         return None
-    everyone = said(seen, seen.views)
-    points = uncovered(everyone, seen.result.gaussians, seen.renderer)
+    everyone = novelty_of_views(seen, seen.views)
+    points = find_uncovered_points(everyone, seen.result.gaussians, seen.renderer)
     if not len(points.points):
         return None
     total = sum(float(one.error.sum()) for one in everyone)
@@ -68,15 +71,15 @@ class UncoveredEffect(Effect):
         """What is bare has so much of the error; once something was born, fewer cameras have to see it."""
         if not seen.views:
             return None
-        points = _found(seen, GLANCED_ON if NAME in seen.result.carried else GLANCED)
+        points = _find_points(seen, MIN_CAMERAS_WHILE_ON if NAME in seen.result.carried else MIN_CAMERAS)
         return Evidence(0.0, "") if points is None else _evidence(points[1])
 
     def add_and_retire_gaussians(self, seen: FrameObservation) -> UpdateResult:
         """The result with the Gaussians that are born."""
-        result, uncovered_points = seen.result, _found(seen, GLANCED_ON)
+        result, uncovered_points = seen.result, _find_points(seen, MIN_CAMERAS_WHILE_ON)
         if uncovered_points is None or uncovered_points[1] < WORTH:
             return result
-        from scas4d_core.effects.presence.growing import grown
+        from scas4d_core.effects.presence.newborn_fit import fit_newborns
 
         points, share = uncovered_points
         state, rng = result.gaussians, np.random.default_rng([seen.index, len(result.gaussians)])
@@ -87,7 +90,7 @@ class UncoveredEffect(Effect):
         if len(some) > most:
             some = np.sort(rng.choice(some, most, replace=False))
         given = seen.views, seen.rig, seen.renderer, rng
-        born = grown(state, points.points[some], points.colours[some], *given, moves=False, time=seen.time)
+        born = fit_newborns(state, points.points[some], points.colours[some], *given, moves=False, time=seen.time)
         if born is None:
             return result
         parents = np.full(len(born), -1, np.int64)
@@ -95,12 +98,12 @@ class UncoveredEffect(Effect):
         arrays: Arrays = {"share": np.array(share if left is None else max(share, float(left["share"])))}
         return replace(
             result,
-            gaussians=state.joined(born),
+            gaussians=state.concatenate(born),
             parents=parents if result.parents is None else np.concatenate([result.parents, parents]),
             carried={**result.carried, NAME: arrays},
         )
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         """Adds nothing: births come after the update of a frame."""
 
 
@@ -111,11 +114,11 @@ def _evidence(share: float) -> Evidence:
 EFFECT = UncoveredEffect(
     name=NAME,
     group=EffectGroup.PRESENCE,
-    says="Motion uncovers what was hidden: static Gaussians are added where nothing was known.",
-    gauge="Only pixels in which the state has nothing.",
+    description="Motion uncovers what was hidden: static Gaussians are added where nothing was known.",
+    disambiguation="Only pixels in which the state has nothing.",
     cost="a check of the last rendered pictures; where something is uncovered, about half an update more",
     auto=True,
     on_above=SHARE,
     off_below=WORTH,
-    kept=("share",),
+    committed_arrays=("share",),
 )

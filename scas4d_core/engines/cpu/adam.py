@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scas4d_core.guards import GuardCounts
-from scas4d_core.kernels.adam import ACTED, EVERY_ROW, adam
+from scas4d_core.kernels.adam import COUNTED_GUARDS, EVERY_ROW, adam
 
 Array = NDArray[np.float32]
 
@@ -33,7 +33,7 @@ class Adam:
         self._rates = np.array(columns, np.float32)
         self._beta1, self._beta2 = np.float32(betas[0]), np.float32(betas[1])
         self._steps = 0
-        self.guards = GuardCounts(*ACTED)
+        self.guards = GuardCounts(*COUNTED_GUARDS)
 
     def step(self, gradients: Array, factor: float) -> None:
         """Take a step.
@@ -44,11 +44,11 @@ class Adam:
         if factor == 0:
             return
         self._steps += 1
-        acted = adam(
+        guard_counts = adam(
             self._parameters, gradients, self._first, self._second, self._rates * np.float32(factor), self._by_row,
             self._beta1, self._beta2, self._steps,
         )  # fmt: skip
-        self.guards.add(ACTED, acted)
+        self.guards.add(COUNTED_GUARDS, guard_counts)
 
 
 class AdamColumns:

@@ -49,9 +49,10 @@ class Region:
             of the R these are.
         box: rows and columns of the picture that hold the blocks and ``REACH`` around.
         near: [h, columns] uint8, where in the box the losses can change, see ``image_loss.near``: elsewhere they are
-            in ``rest``.
+            in ``outside_losses``.
         view: whose pictures the following belong to; None: nobody's yet.
-        target: [C, h, w], moments: twice the same, of the view in the box. rest: image loss, mask loss and squared
+        target: [C, h, w], moments: twice the same, of the view in the box. outside_losses: image loss, mask loss and
+            squared
             error of the view where they cannot change.
     """
 
@@ -64,7 +65,7 @@ class Region:
     view: TrainingView | None = None
     target: Array = field(default_factory=lambda: np.empty((0, 0, 0), np.float32))
     moments: tuple[Array, Array] = ()  # type: ignore[assignment]
-    rest: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    outside_losses: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
 
 class ChangedPixels(CpuRenderer):
@@ -87,14 +88,14 @@ class ChangedPixels(CpuRenderer):
     ) -> None:
         super().__init__(background, image_weight, mask_weight, limits=limits)
         self._moving = np.sort(moving)
-        self._moves = np.zeros(count, bool)
-        self._moves[moving] = True
-        self._standing = np.flatnonzero(~self._moves)
-        self._stood: State | None = None
-        self._bases: dict[tuple[str, int, int], Array] = {}
+        self._is_moving = np.zeros(count, bool)
+        self._is_moving[moving] = True
+        self._static_rows = np.flatnonzero(~self._is_moving)
+        self._static_state: State | None = None
+        self._static_planes: dict[tuple[str, int, int], Array] = {}
         self._poses: dict[tuple[str, int, int], Array] = {}
-        self._base_rests: dict[tuple[str, int, int], Array] = {}
-        self._base_means: dict[tuple[str, int, int], NDArray[np.float64]] = {}
+        self._static_transmittances: dict[tuple[str, int, int], Array] = {}
+        self._static_means: dict[tuple[str, int, int], NDArray[np.float64]] = {}
         self._regions: dict[tuple[str, int, int], Region] = {}
         self._gradients: Gradients | None = None
         self._box_scratch, self._planes = np.empty(0, np.float32), np.empty(0, np.float32)
@@ -103,13 +104,13 @@ class ChangedPixels(CpuRenderer):
     def load_state(self, previous: Gaussians) -> None:
         """Take the state that a frame starts from; static Gaussians that differ from those before are drawn anew."""
         features = previous.features(previous.colours)
-        state = taken((previous.means, previous.factors, previous.opacities, features), self._standing)
-        if self._stood is None or not all(map(np.array_equal, state, self._stood)):
-            self._bases.clear()
+        state = take_rows((previous.means, previous.factors, previous.opacities, features), self._static_rows)
+        if self._static_state is None or not all(map(np.array_equal, state, self._static_state)):
+            self._static_planes.clear()
             self._regions.clear()
-            self._stood = state
+            self._static_state = state
 
-    def evaluate(
+    def forward_backward(
         self,
         means: Array,
         factors: Array,
@@ -119,7 +120,7 @@ class ChangedPixels(CpuRenderer):
         lap: Callable[[str], None] = no_lap,
     ) -> Gradients:
         """Renders what changed; sets the losses and ``psnr`` of the whole picture; see ``CpuRenderer``."""
-        region = self._drawn((means, factors, opacities, features), view)
+        region = self._render_region((means, factors, opacities, features), view)
         lap("render")
         self._compare_box(region, view)
         lap("picture loss")
@@ -132,19 +133,19 @@ class ChangedPixels(CpuRenderer):
         lap("render backward")
         return self._gradients
 
-    def measure(self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView) -> None:
-        """As ``evaluate``, without gradients."""
-        region = self._drawn((means, factors, opacities, features), view)
+    def forward(self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView) -> None:
+        """As ``forward_backward``, without gradients."""
+        region = self._render_region((means, factors, opacities, features), view)
         self._compare_box(region, view)
 
     def residuals(
         self, state: Gaussians, view: TrainingView, learnt: NDArray[np.uint8], most: float
     ) -> tuple[Array, Array]:
         """See ``Renderer.residuals``; of moving Gaussians, from the pixels alone that they reach."""
-        if not np.array_equal(learnt, self._moves):
+        if not np.array_equal(learnt, self._is_moving):
             return super().residuals(state, view, learnt, most)
         count, shown = len(state), features_seen(state, view.camera)
-        region = self._drawn((state.means, state.factors, state.opacities, shown), view)
+        region = self._render_region((state.means, state.factors, state.opacities, shown), view)
         sums, weights = np.zeros((count, 3), np.float32), np.zeros(count, np.float32)
         missing = self._lacking(view, most)
         sums[self._moving], weights[self._moving] = missing[0][region.moving], missing[1][region.moving]
@@ -153,8 +154,10 @@ class ChangedPixels(CpuRenderer):
     def shown(self, view: TrainingView) -> Picture:
         """See ``CpuRenderer``."""
         drawn, shown = self.rasterizer.picture, pixels_of(self.rasterizer.drawn, view.camera)
-        whole = Picture(self._base(view).copy(), self._base_rests[_key(view)].copy())
-        for plane, new in zip((*whole.features, whole.rest), (*drawn.features, drawn.rest), strict=True):
+        whole = Picture(self._static_background(view).copy(), self._static_transmittances[_key(view)].copy())
+        for plane, new in zip(
+            (*whole.features, whole.transmittance), (*drawn.features, drawn.transmittance), strict=True
+        ):
             np.copyto(plane, new, where=shown)
         return whole
 
@@ -164,75 +167,80 @@ class ChangedPixels(CpuRenderer):
         red, green, blue = (view.mean - shown).tolist()
         return red, green, blue
 
-    def _drawn(self, state: State, view: TrainingView) -> Region:
+    def _render_region(self, state: State, view: TrainingView) -> Region:
         """Renders the region of a view; widens it until it holds all that moves."""
         key = _key(view)
         region = self._regions.get(key)
         if region is None or region.view is not view:
             # Made anew in each frame: a replay has no frames before, and figures hang on the box by their rounding.
-            region = self._regions[key] = self._made(self._marks(state, view.camera), view)
+            region = self._regions[key] = self._make_region(self._moving_blocks(state, view.camera), view)
         while True:
-            part = taken(state, region.rows)
-            drawing = Drawing(region.blocks, region.learnt, narrow=True)
+            part = take_rows(state, region.rows)
+            drawing = Drawing(region.blocks, region.learnt, mask_to_region=True)
             self.rasterizer.forward(*part, view.camera, self._background, drawing=drawing)
-            if not self.rasterizer.escaped:
+            if not self.rasterizer.outside_region:
                 return region
-            region = self._regions[key] = self._made(self._marks(state, view.camera) | region.blocks, view)
+            region = self._regions[key] = self._make_region(
+                self._moving_blocks(state, view.camera) | region.blocks, view
+            )
 
-    def _marks(self, state: State, camera: CameraArrays) -> NDArray[np.uint64]:
-        return blocks_of(self.rasterizer, *taken(state, self._moving), camera)
+    def _moving_blocks(self, state: State, camera: CameraArrays) -> NDArray[np.uint64]:
+        return blocks_of(self.rasterizer, *take_rows(state, self._moving), camera)
 
-    def _made(self, marks: NDArray[np.uint64], view: TrainingView) -> Region:
+    def _make_region(self, marks: NDArray[np.uint64], view: TrainingView) -> Region:
         """A region around marks, with those of the standing Gaussians that meet it."""
-        assert self._stood is not None
+        assert self._static_state is not None
         blocks, camera = widened(marks, view.camera, MARGIN), view.camera
-        splats, rects, _ = self.rasterizer.project(*self._stood, camera)
-        meets = np.empty(len(self._standing), bool)
+        splats, rects, _ = self.rasterizer.project(*self._static_state, camera)
+        meets = np.empty(len(self._static_rows), bool)
         tiles.find_meeting(splats, rects, tile_grid(camera)[0], blocks, meets)
-        rows = np.sort(np.concatenate([self._moving, self._standing[meets]]))
-        learnt, shown = self._moves[rows].astype(np.uint8), pixels_of(blocks, camera)
+        rows = np.sort(np.concatenate([self._moving, self._static_rows[meets]]))
+        learnt, shown = self._is_moving[rows].astype(np.uint8), pixels_of(blocks, camera)
         box = _box(shown)
         region = Region(blocks, rows, learnt, np.flatnonzero(learnt), box, image_loss.near(shown[box]))
-        self._follow(region, view)
+        self._load_view(region, view)
         return region
 
-    def _follow(self, region: Region, view: TrainingView) -> None:
+    def _load_view(self, region: Region, view: TrainingView) -> None:
         """Takes the pictures of a view: its box, and what the rest of the picture adds to the losses."""
-        base = self._base(view)
+        base = self._static_background(view)
         where = (slice(None), *region.box)
         region.view, region.target = view, np.ascontiguousarray(view.target[where])
         whole = self._moments(view)
         region.moments = np.ascontiguousarray(whole[0][where]), np.ascontiguousarray(whole[1][where])
-        wanted = _around(region.box, region.near, view.camera.height, view.camera.width)
-        region.rest = self._losses(base, view, view.target, whole, wanted, base)
+        wanted = _outside_region(region.box, region.near, view.camera.height, view.camera.width)
+        region.outside_losses = self._losses(base, view, view.target, whole, wanted, base)
         forget_moments(view)  # those of the box are kept, and nobody needs both
 
-    def _base(self, view: TrainingView) -> Array:
+    def _static_background(self, view: TrainingView) -> Array:
         """[4, H, W] of what stands alone."""
         key = _key(view)
-        if key not in self._bases or not np.array_equal(self._poses[key], view.camera.pose):
-            assert self._stood is not None
+        if key not in self._static_planes or not np.array_equal(self._poses[key], view.camera.pose):
+            assert self._static_state is not None
             self._poses[key] = view.camera.pose
-            picture = self.rasterizer.forward(*self._stood, view.camera, self._background)
-            self._bases[key], self._base_rests[key] = picture.features.copy(), picture.rest.copy()
-            self._base_means[key] = means(self._bases[key][:3])
-        return self._bases[key]
+            picture = self.rasterizer.forward(*self._static_state, view.camera, self._background)
+            self._static_planes[key], self._static_transmittances[key] = (
+                picture.features.copy(),
+                picture.transmittance.copy(),
+            )
+            self._static_means[key] = means(self._static_planes[key][:3])
+        return self._static_planes[key]
 
     def _compare_box(self, region: Region, view: TrainingView) -> None:
         """Fills the losses of what was rendered, and the gradient of what is drawn."""
-        base, (rows, columns) = self._base(view), region.box
+        base, (rows, columns) = self._static_background(view), region.box
         box = (rows.start, rows.stop, columns.start, columns.stop)
         part, g_part = self._part(len(base), box)
         drawn, tiles_x = self.rasterizer.drawn, tile_grid(view.camera)[0]
         shifts = np.zeros(len(base))
-        tiles.take_blocks(self.rasterizer.planes, base, drawn, tiles_x, box, part, shifts)
-        sums = region.rest + self._losses(part, view, region.target, region.moments, region.near, g_part)
+        tiles.compose_box(self.rasterizer.planes, base, drawn, tiles_x, box, part, shifts)
+        sums = region.outside_losses + self._losses(part, view, region.target, region.moments, region.near, g_part)
         g_image, _ = self.rasterizer.gradient_buffers()
-        tiles.put_blocks(g_part, drawn, tiles_x, box, g_image)
+        tiles.write_blocks(g_part, drawn, tiles_x, box, g_image)
         self.image_part, self.mask_part = float(sums[0]), float(sums[1])
         pixels = view.camera.height * view.camera.width
         self.psnr = 10 * log10(3 * pixels / max(float(sums[2]), SMALLEST_SQUARE))
-        self._shown_mean = self._base_means[_key(view)] + shifts[:3] / pixels
+        self._shown_mean = self._static_means[_key(view)] + shifts[:3] / pixels
 
     def _part(self, channels: int, box: tuple[int, int, int, int]) -> tuple[Array, Array]:
         """[C, h, w] twice, of a box: buffers for what it shows and for the gradient of that."""
@@ -278,7 +286,7 @@ class ChangedPixels(CpuRenderer):
         return scratch
 
 
-def taken(state: State, rows: NDArray[np.int64]) -> State:
+def take_rows(state: State, rows: NDArray[np.int64]) -> State:
     """The rows of a state's arrays."""
     one, two, three, four = (np.take(array, rows, axis=0) for array in state)
     return one, two, three, four
@@ -308,7 +316,7 @@ def _box(shown: NDArray[np.bool_]) -> tuple[slice, slice]:
     )
 
 
-def _around(box: tuple[slice, slice], near: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
+def _outside_region(box: tuple[slice, slice], near: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
     """[height, columns] uint8, see ``image_loss.image_loss``: the losses of a picture that a part does not have.
 
     Args:

@@ -19,7 +19,7 @@ class Colours:
 
     Args:
         colours: [N, 3] RGB, changed in place. before: [N, 3] of Θ_{t−1}. rows: [M] the moving Gaussians.
-        standing: whether static Gaussians learn too. weight: of the mean absolute change (Dynamic3DGaussians).
+        static: whether static Gaussians learn too. weight: of the mean absolute change (Dynamic3DGaussians).
         start: rates and decays.
     """
 
@@ -28,17 +28,17 @@ class Colours:
         colours: Array,
         before: Array,
         rows: NDArray[np.int64],
-        standing: bool,
+        static: bool,
         weight: float,
         start: AttemptStart,
     ) -> None:
         count = len(colours)
         self._colours, self._rows = colours, rows
         self._weight = np.float32(weight / max(colours.size, 1))
-        self._whole = standing or len(rows) > MOST * count
+        self._whole = static or len(rows) > MOST * count
         if self._whole:
             self._before, self._table = before, colours
-            by_row = np.full(count, start.static_colour if standing else 0, np.float32)
+            by_row = np.full(count, start.static_colour if static else 0, np.float32)
             by_row[rows] = start.colour
         else:
             self._before, self._table = before[rows], colours[rows]

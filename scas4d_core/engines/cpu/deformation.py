@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.guards import GuardCounts
 from scas4d_core.kernels import neighbour_terms
-from scas4d_core.kernels.cascade import ACTED, PARAMETERS, RECORD, TABLE
-from scas4d_core.kernels.deform import BLOCKS, CARRIED, block_sums, deform, deform_backward, settle
+from scas4d_core.kernels.cascade import COUNTED_GUARDS, PARAMETERS, RECORD, TABLE
+from scas4d_core.kernels.deform import BLOCKS, CARRIED, block_sums, deform, deform_backward, freeze_layer
 from scas4d_core.kernels.deltas import PREVIOUS, STATE, TIED, TURN
 from scas4d_core.kernels.lanes import COUNT
 from scas4d_core.structure.hierarchy import Hierarchy
@@ -39,7 +39,8 @@ class CpuDeformation:
         means [N, 3], factors [N, 3, 3]: of all Gaussians, filled by ``forward``.
         turns: [M, 4], rotation since the frame before, filled by ``forward``.
         held_back: [held] int64, rows of Θ_{t−1} that are not finite, found by ``start``.
-        guards: how often each guard acted since the last ``reset`` of the counts: those of ``cascade.ACTED`` each
+        guards: how often each guard acted since the last ``reset`` of the counts: those of ``cascade.COUNTED_GUARDS``
+            each
             ``forward``, in layers that do not rest; the others each ``start``.
     """
 
@@ -77,7 +78,7 @@ class CpuDeformation:
         self._sums = np.zeros((max(layers, 1), held, 3), np.float32)
         self._before, self._entering = (np.zeros((held, CARRIED), np.float32) for _ in range(2))
         self._before[:, 9 * COUNT : 10 * COUNT] = 1  # no turn
-        self._resting = 0
+        self._frozen = 0
         self._records = np.zeros((held, layers, RECORD), np.float32)
         self._excess = np.zeros(held, np.float32)
         self._state = cache_lines(count)
@@ -87,8 +88,8 @@ class CpuDeformation:
         self._neighbour_sums = np.zeros((neighbour_terms.TASKS, 3), np.float32)
         self.means = np.zeros((0, 3), np.float32)
         self.factors = np.zeros((0, 3, 3), np.float32)
-        self.guards = GuardCounts(*ACTED, "held_back", "empty_cluster")
-        self._acted = np.zeros((-(-held // BLOCKS), len(ACTED)), np.int64)
+        self.guards = GuardCounts(*COUNTED_GUARDS, "held_back", "empty_cluster")
+        self._guard_counts = np.zeros((-(-held // BLOCKS), len(COUNTED_GUARDS)), np.int64)
         self.held_back = np.zeros(0, np.int64)
         self._held: tuple[Array, Array] = self.means, self.factors
 
@@ -110,7 +111,7 @@ class CpuDeformation:
         entering = self._before.reshape(-1, CARRIED // COUNT, COUNT)
         entering[:, :9] = np.swapaxes(factors[self._rows].reshape(*self._rows.shape, 9), 1, 2)
         block_sums(self._points, self._present, self._sums)
-        self._none_rests()
+        self._unfreeze_layers()
         self.means = previous.means.copy()
         self.factors = previous.factors.copy()
 
@@ -131,7 +132,7 @@ class CpuDeformation:
         empty = int(np.count_nonzero(self._ranges[:, 2] == 0))
         self.guards.add(("held_back", "empty_cluster"), np.array([len(self.held_back), empty]))
 
-    def rest(self, layers: int) -> None:
+    def freeze_layers(self, layers: int) -> None:
         """Let the first so many layers rest, as they are set now: they are applied once, and get no gradient.
 
         ``forward`` gives the same bits. Unfreeze all layers (``rest(0)``) before setting the parameters of one.
@@ -141,27 +142,27 @@ class CpuDeformation:
         """
         if layers and layers >= len(self.clusters):
             raise ValueError(f"{layers} of {len(self.clusters)} layers cannot rest: the last one goes on")
-        if layers < self._resting:
-            self._none_rests()
-        for layer in range(self._resting, layers):
-            settle(
+        if layers < self._frozen:
+            self._unfreeze_layers()
+        for layer in range(self._frozen, layers):
+            freeze_layer(
                 layer, self._parameters, self._offsets, self._ranges, self._clusters_of, self._present, self._entering,
                 self._about_origin, self._separate, self._points, self._sums, self._tables,
             )  # fmt: skip
-        self._resting = layers
+        self._frozen = layers
 
-    def _none_rests(self) -> None:
-        self._entering[:], self._resting = self._before, 0
+    def _unfreeze_layers(self) -> None:
+        self._entering[:], self._frozen = self._before, 0
 
     def forward(self) -> None:
         """Equations (5) to (7): fill ``means``, ``factors`` and ``turns``."""
         deform(
-            self._resting, self._parameters, self._offsets, self._ranges, self._clusters_of, self._entries, self._rows,
+            self._frozen, self._parameters, self._offsets, self._ranges, self._clusters_of, self._entries, self._rows,
             self._present, self._entering, self.deltas, self._about_origin, self._separate, self._points, self._sums,
-            self._tables, self.means, self.factors, self._state, self._acted,
+            self._tables, self.means, self.factors, self._state, self._guard_counts,
         )  # fmt: skip
         self.means[self.held_back], self.factors[self.held_back] = self._held
-        self.guards.add(ACTED, self._acted)
+        self.guards.add(COUNTED_GUARDS, self._guard_counts)
 
     def neighbour_losses(self, sample: NDArray[np.int64], weights: tuple[float, float, float]) -> Array:
         """Means over the sampled pairs of rigidity, isometry and rotation; ``backward`` adds their gradients.
@@ -190,7 +191,7 @@ class CpuDeformation:
         """
         axes = max(1, 3 * len(self.hierarchy.rows))
         deform_backward(
-            self._resting, self._offsets, self._ranges, self._clusters_of, self._entries, self._rows, self._present,
+            self._frozen, self._offsets, self._ranges, self._clusters_of, self._entries, self._rows, self._present,
             self._entering, self.deltas, self._about_origin, self._separate, self._points, self._tables,
             np.float32(scale_weight / axes), self._bounds, g_means, g_factors, self._tied, self._records,
             self._gradients, self.delta_gradients, self._excess,

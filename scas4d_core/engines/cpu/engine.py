@@ -41,7 +41,7 @@ class CpuEngine:
         hierarchy, count = structure.hierarchy, len(structure.roots)
         self._plan, self._structure, self._rows = plan, structure, hierarchy.rows
         given = (plan.background, plan.image, plan.mask)
-        if plan.whole_pictures or len(self._rows) > MOST * count:
+        if plan.full_images or len(self._rows) > MOST * count:
             self.renderer = CpuRenderer(*given, limits=plan.limits)
         else:
             self.renderer = ChangedPixels(*given, self._rows, count, plan.limits)
@@ -79,7 +79,7 @@ class CpuEngine:
 
     def set_tables(self, tables: Tables) -> None:
         """See ``UpdateEngine.set_tables``."""
-        self._deformation.rest(0)
+        self._deformation.freeze_layers(0)
         for values, given in zip(self._deformation.clusters, tables.clusters, strict=True):
             values[:] = given
         self._deformation.deltas[:] = tables.deltas
@@ -92,7 +92,7 @@ class CpuEngine:
         betas = start.beta1, start.beta2
         if plan.colours is not None:
             self._colour_table = Colours(
-                self._colours, previous.colours, self._rows, plan.colours.standing, plan.soft_colour, start
+                self._colours, previous.colours, self._rows, plan.colours.static, plan.soft_colour, start
             )
         if plan.gloss and previous.gloss is not None and previous.environment is not None:
             roots = self._structure.roots
@@ -111,7 +111,7 @@ class CpuEngine:
     def iterate(self, views: Sequence[int], step: StepScalars) -> None:
         """See ``UpdateEngine.iterate``."""
         deformation, lap = self._deformation, self._start.lap
-        deformation.rest(step.resting)
+        deformation.freeze_layers(step.frozen)
         deformation.forward()
         self._features[:, :3] = self._colours
         lap("cascade")
@@ -151,15 +151,15 @@ class CpuEngine:
         """Render a view, compare it, and carry its losses back; the log takes how well it was met."""
         view, deformation, renderer, lap = self._views[index], self._deformation, self.renderer, self._start.lap
         if self._gloss is not None:
-            self._gloss.show(deformation.means, deformation.turns, self._colours, view.camera, self._features)
-        gradients = renderer.evaluate(
+            self._gloss.shade(deformation.means, deformation.turns, self._colours, view.camera, self._features)
+        gradients = renderer.forward_backward(
             deformation.means, deformation.factors, self._previous.opacities, self._features, view, lap
         )
         if self._gloss is not None:
-            self._gloss.carry_back(deformation.means, self._colours, view.camera, gradients.features)
+            self._gloss.shade_backward(deformation.means, self._colours, view.camera, gradients.features)
         if self._gains is not None:
             height, width = view.target.shape[1:]
-            self._gains.saw(view, renderer.rasterizer.planes[:3, :height, :width])
+            self._gains.record_rendering(view, renderer.rasterizer.planes[:3, :height, :width])
         loss = renderer.image_part + renderer.mask_part
         self._log.rendered.append(ViewRecord(index, renderer.psnr, renderer.colour_shift(view)))
         if step.keep_pictures:
@@ -218,7 +218,7 @@ class CpuEngine:
         for index in which:
             view = self._probes[index]
             features = features_seen(state, view.camera, turns)
-            self.renderer.measure(state.means, state.factors, state.opacities, features, view)
+            self.renderer.forward(state.means, state.factors, state.opacities, features, view)
             losses.append(self.renderer.image_part)
         return losses
 
@@ -259,7 +259,7 @@ class CpuEngine:
         """See ``UpdateEngine.gains``."""
         if self._gains is None:
             raise ValueError("gains were not given to begin; the plan has to follow them (UpdatePlan.camera_gains)")
-        self._gains.settle()
+        self._gains.finish_round()
         return self._gains.gains.copy()
 
     def gradients(self) -> dict[str, Array]:

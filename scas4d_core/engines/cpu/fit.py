@@ -84,12 +84,12 @@ class CpuFitEngine:
         gloss = self._gloss
         if gloss is not None:
             turns, colours = without_turn(len(fitted.means)), fitted.features[:, :3].copy()
-            gloss.show(fitted.means, turns, colours, seen.camera, fitted.features)
-        gradients, g_features = self._carried_back(drawn, seen, scalars.rates)
+            gloss.shade(fitted.means, turns, colours, seen.camera, fitted.features)
+        gradients, g_features = self._backward(drawn, seen, scalars.rates)
         g_features = g_features[fixed:]
         shift = self.renderer.colour_shift(seen) if scalars.colour_shift else None
         if gloss is not None:
-            gloss.saw(fitted.means, turns, colours, seen.camera, g_features)
+            gloss.shade_backward(fitted.means, turns, colours, seen.camera, g_features)
             gloss.step(scalars.gloss)
         if gradients is None:
             self._gradients[:] = 0
@@ -99,7 +99,7 @@ class CpuFitEngine:
                 table.parameters, *fitted[1:], gradients.means[fixed:], gradients.factors[fixed:],
                 gradients.opacities[fixed:], g_features, self._gradients,
             )  # fmt: skip
-            self._note(fitted.factors, gradients.screen[fixed:], seen.camera, fixed)
+            self._record_rendering(fitted.factors, gradients.screen[fixed:], seen.camera, fixed)
         table.steps += 1
         moments = table.first, table.second
         adam(
@@ -108,21 +108,21 @@ class CpuFitEngine:
         loss = self.renderer.image_part + self.renderer.mask_part
         return FitLoss(view, loss, self.renderer.psnr, self.renderer.exposure_gradient, shift)
 
-    def _carried_back(self, drawn: _Shapes, view: TrainingView, rates: Array) -> tuple[Gradients | None, Array]:
+    def _backward(self, drawn: _Shapes, view: TrainingView, rates: Array) -> tuple[Gradients | None, Array]:
         """Gradients of all that was drawn, None where nothing but colours learns; and those of the features."""
         if rates[: COLOUR.start].any() or rates[COLOUR.stop :].any():
-            gradients = self.renderer.evaluate(*drawn, view)
+            gradients = self.renderer.forward_backward(*drawn, view)
             return gradients, gradients.features
-        self.renderer.measure(*drawn, view)
+        self.renderer.forward(*drawn, view)
         rasterizer = self.renderer.rasterizer
         return None, rasterizer.feature_gradients(rasterizer.gradient_buffers()[0])
 
-    def _note(self, factors: Array, g_screen: Array, camera: CameraArrays, fixed: int) -> None:
+    def _record_rendering(self, factors: Array, g_screen: Array, camera: CameraArrays, fixed: int) -> None:
         """Adds a rendering to the statistics, where there are any."""
         statistics = self._table.statistics
         if statistics is not None:
             half = np.array([camera.width / 2, camera.height / 2], np.float32)
-            statistics.pull += np.sqrt(np.square(g_screen * half).sum(axis=1))
+            statistics.screen_gradients += np.sqrt(np.square(g_screen * half).sum(axis=1))
             statistics.rendered += self.renderer.rasterizer.counts[fixed:] > 0
             statistics.factors = factors
 

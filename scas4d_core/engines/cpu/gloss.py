@@ -113,11 +113,13 @@ class GlossShading:
             environment[direction.NEARNESS, 0] = NEARNESS
         return cls(gloss, environment, (gloss_rate(RATE_GLOSS, gloss), RATE_ENVIRONMENT, RATE_NEARNESS))
 
-    def show(self, means: Array, turns: Array, colours: Array, camera: CameraArrays, features: Array) -> None:
+    def shade(self, means: Array, turns: Array, colours: Array, camera: CameraArrays, features: Array) -> None:
         """Fills RGB of ``features`` [N, 4] as a camera sees them."""
         self._kernel.shade(means, self.gloss, turns, colours, self.environment, camera.centre, features)
 
-    def saw(self, means: Array, turns: Array, colours: Array, camera: CameraArrays, g_features: Array) -> None:
+    def shade_backward(
+        self, means: Array, turns: Array, colours: Array, camera: CameraArrays, g_features: Array
+    ) -> None:
         """Turns the gradient of the features into that of the colours, and keeps what is its own."""
         g_environment = self._kernel.shade_backward(
             means, self.gloss, turns, colours, self.environment, camera.centre, g_features, self._turned
@@ -148,7 +150,7 @@ class GlossShading:
         nearness = self.environment[self._kernel.NEARNESS]
         np.clip(nearness, 0, None, out=nearness)
 
-    def taken(self, rows: NDArray[np.int64], parents: NDArray[np.int64]) -> GlossShading:
+    def select_rows(self, rows: NDArray[np.int64], parents: NDArray[np.int64]) -> GlossShading:
         """The same for some rows, with their moments, and for further ones like their parents, without."""
         every = np.concatenate([rows, parents])
         chosen = GlossShading(self.gloss[every], self.environment, self._rates)
@@ -213,14 +215,14 @@ class LearntGloss:
         """The environment as learnt so far."""
         return self._shading.environment
 
-    def show(self, means: Array, turns: Array, colours: Array, camera: CameraArrays, features: Array) -> None:
+    def shade(self, means: Array, turns: Array, colours: Array, camera: CameraArrays, features: Array) -> None:
         """Fill RGB of ``features`` [N, 4] as a camera sees them; ``turns`` [M, 4] of the moving Gaussians."""
         self._turns[self._rows] = turns
-        self._shading.show(means, self._turns, colours, camera, features)
+        self._shading.shade(means, self._turns, colours, camera, features)
 
-    def carry_back(self, means: Array, colours: Array, camera: CameraArrays, g_features: Array) -> None:
+    def shade_backward(self, means: Array, colours: Array, camera: CameraArrays, g_features: Array) -> None:
         """Turn gradients of features into those of colours, in place, and keep those of gloss and environment."""
-        self._shading.saw(means, self._turns, colours, camera, g_features)
+        self._shading.shade_backward(means, self._turns, colours, camera, g_features)
 
     @property
     def gradients(self) -> tuple[Array, Array]:

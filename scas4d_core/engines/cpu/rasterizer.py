@@ -33,13 +33,14 @@ class Drawing(NamedTuple):
 
     Attributes:
         blocks: [tiles] uint64, bits as of ``tiles.cover``. learnt: [N] uint8, 1 for the Gaussians that change: they
-            have to stay within (``CpuRasterizer.escaped`` is true where one did not), and they alone get gradients.
-        narrow: whether only those of the blocks are drawn that these Gaussians reach: ``CpuRasterizer.drawn``.
+            have to stay within (``CpuRasterizer.outside_region`` is true where one did not), and they alone get
+            gradients.
+        mask_to_region: whether only those of the blocks are drawn that these Gaussians reach: ``CpuRasterizer.drawn``.
     """
 
     blocks: NDArray[np.uint64]
     learnt: NDArray[np.uint8]
-    narrow: bool = False
+    mask_to_region: bool = False
 
 
 class ForwardPass(NamedTuple):
@@ -60,7 +61,7 @@ class ForwardPass(NamedTuple):
     learnt: NDArray[np.uint8]
     tile_order: NDArray[np.int64]
     image: Array
-    rest: Array
+    transmittance: Array
     pairs: int
 
 
@@ -69,7 +70,7 @@ class CpuRasterizer:
 
     Attributes:
         guards: number of times that each guard acted since the last ``reset`` of the counts.
-        escaped: whether a Gaussian that is learnt reached a block that the last forward pass did not draw.
+        outside_region: whether a Gaussian that is learnt reached a block that the last forward pass did not draw.
         drawn: [tiles] uint64, the blocks that it drew.
 
     >>> from scas4d_core.cameras import Camera
@@ -81,7 +82,7 @@ class CpuRasterizer:
     >>> picture = rasterizer.forward(
     ...     state.means, state.factors, state.opacities, features, CameraArrays.of(camera), np.zeros(4, np.float32)
     ... )
-    >>> picture.features[:, 8, 8].round(2), round(float(picture.rest[8, 8]), 2)
+    >>> picture.features[:, 8, 8].round(2), round(float(picture.transmittance[8, 8]), 2)
     (array([0.89, 0.  , 0.  , 0.  ], dtype=float32), 0.11)
     >>> g_image, g_alpha = rasterizer.gradient_buffers()
     >>> g_image[0, :16, :16] = 1  # of the sum of red over the pixels
@@ -90,9 +91,9 @@ class CpuRasterizer:
     """
 
     def __init__(self, limits: Limits = DEFAULT) -> None:
-        self.guards = GuardCounts(*projection.ACTED, *projection.ACTED_BACKWARD)
+        self.guards = GuardCounts(*projection.COUNTED_GUARDS, *projection.COUNTED_GUARDS_BACKWARD)
         self.limits = np.array(limits, dtype=np.float32)
-        self.escaped = False
+        self.outside_region = False
         self.drawn = np.zeros(0, np.uint64)
         self._last: ForwardPass
         self._buffers: dict[str, NDArray[Any]] = {}
@@ -126,12 +127,24 @@ class CpuRasterizer:
         splats = self._buffer("splats", (count + 15, projection.SPLAT_COLUMNS))[:count]
         rects = self._buffer("rects", (count, 4), np.int32)
         counts = self._buffer("counts", (count,), np.int32)
-        acted = self._buffer("acted", (-(-count // projection.CHUNK), len(projection.ACTED)), np.int64)
-        projection.project(
-            means, factors, opacities, features, camera.pose, camera.lens, self.limits, splats, rects, counts, acted
+        guard_counts = self._buffer(
+            "guard_counts", (-(-count // projection.CHUNK), len(projection.COUNTED_GUARDS)), np.int64
         )
-        if acted.any():
-            self.guards.add(projection.ACTED, acted)
+        projection.project(
+            means,
+            factors,
+            opacities,
+            features,
+            camera.pose,
+            camera.lens,
+            self.limits,
+            splats,
+            rects,
+            counts,
+            guard_counts,
+        )
+        if guard_counts.any():
+            self.guards.add(projection.COUNTED_GUARDS, guard_counts)
         return splats, rects, counts
 
     def forward(
@@ -164,11 +177,11 @@ class CpuRasterizer:
         if depth_channel >= 0:
             features[:, depth_channel] = splats[:, projection.DEPTH]
         drawing = drawing or self._whole(tiles_x * tiles_y, count)
-        self.escaped, self.drawn, learnt = False, drawing.blocks, drawing.learnt
-        if drawing.narrow:
+        self.outside_region, self.drawn, learnt = False, drawing.blocks, drawing.learnt
+        if drawing.mask_to_region:
             marks = np.zeros(tiles_x * tiles_y, np.uint64)
             tiles.mark_blocks(splats, rects, learnt, tiles_x, marks)
-            self.escaped, self.drawn = bool((marks & ~drawing.blocks).any()), marks & drawing.blocks
+            self.outside_region, self.drawn = bool((marks & ~drawing.blocks).any()), marks & drawing.blocks
         visible, order = tiles.depth_order(
             splats, counts, self._buffer("keys", (count,), np.uint32), self._buffer("order", (count,), np.int32),
             self._buffer("keys_too", (count,), np.uint32), self._buffer("order_too", (count,), np.int32),
@@ -186,7 +199,7 @@ class CpuRasterizer:
             splats, rects, order, visible, tiles_x, self.drawn, learnt, begins, ends, counts, firsts, pairs,
             pair_covers, tile_counts,
         )  # fmt: skip
-        self.escaped |= left > 0
+        self.outside_region |= left > 0
         starts = self._buffer("starts", (tiles_x * tiles_y + 1,), np.int64)
         cursors = self._buffer("cursors", (tasks, tiles_x * tiles_y), np.int64)
         entries = tiles.tile_offsets(tile_counts, starts, cursors)
@@ -198,14 +211,14 @@ class CpuRasterizer:
         tile_order = np.argsort(starts[:-1] - starts[1:], kind="stable")
         tile_order = tile_order[self.drawn[tile_order] != 0]
         image = self._buffer("image", (channels, tiles_y * TILE, tiles_x * TILE))
-        rest = self._buffer("rest", (tiles_y * TILE, tiles_x * TILE))
+        transmittance = self._buffer("transmittance", (tiles_y * TILE, tiles_x * TILE))
         blend_kernels.blend(
             splats, features, (0,) * (channels // blend_kernels.GROUP), starts, items, covers, self.drawn,
-            tile_order, tasks, (width, height), background, self.limits, image, rest,
+            tile_order, tasks, (width, height), background, self.limits, image, transmittance,
         )  # fmt: skip
         self._last = ForwardPass(
             means, factors, features, camera, depth_channel, splats, counts, firsts, starts, items, slots, covers,
-            learnt, tile_order, image, rest, most,
+            learnt, tile_order, image, transmittance, most,
         )  # fmt: skip
         return self.picture
 
@@ -221,9 +234,9 @@ class CpuRasterizer:
         Padded to whole tiles like the forward buffers. They hold 0 when first given out for a size of picture; the
         padding must keep it.
         """
-        camera, image, rest = self._last.camera, self._last.image, self._last.rest
+        camera, image, transmittance = self._last.camera, self._last.image, self._last.transmittance
         g_image = self._buffer("g_image", image.shape)
-        g_alpha = self._buffer("g_alpha", rest.shape)
+        g_alpha = self._buffer("g_alpha", transmittance.shape)
         # Pictures of another size may have the same tiles: their gradients would stay in the padding.
         shape = (len(image), camera.height, camera.width)
         if self._gradient_shape != shape:
@@ -252,7 +265,7 @@ class CpuRasterizer:
         blend_kernels.blend_backward(
             last.splats, features, (0,) * (channels // blend_kernels.GROUP), last.starts, last.items, last.slots,
             last.covers, last.learnt, last.tile_order, threads(), (last.camera.width, last.camera.height), self.limits,
-            image, last.rest, g_image, g_alpha, records,
+            image, last.transmittance, g_image, g_alpha, records,
         )  # fmt: skip
         gradients = Gradients(
             self._buffer("g_means", (count, 3)),
@@ -261,13 +274,13 @@ class CpuRasterizer:
             self._buffer("g_features", (count, channels)),
             self._buffer("g_screen", (count, 2)),
         )
-        shape = (-(-count // projection.CHUNK), len(projection.ACTED_BACKWARD))
-        acted = self._buffer("acted_backward", shape, np.int64)
+        shape = (-(-count // projection.CHUNK), len(projection.COUNTED_GUARDS_BACKWARD))
+        guard_counts = self._buffer("guard_counts_backward", shape, np.int64)
         projection.project_backward(
             last.means, last.factors, last.camera.pose, last.camera.lens, self.limits, last.splats,
-            last.counts * last.learnt, last.firsts, records, last.depth_channel, *gradients, acted,
+            last.counts * last.learnt, last.firsts, records, last.depth_channel, *gradients, guard_counts,
         )  # fmt: skip
-        self.guards.add(projection.ACTED_BACKWARD, acted)
+        self.guards.add(projection.COUNTED_GUARDS_BACKWARD, guard_counts)
         return gradients
 
     def feature_gradients(self, g_image: Array) -> Array:
@@ -279,10 +292,10 @@ class CpuRasterizer:
             (last.camera.width, last.camera.height), self.limits, g_image, records,
         )  # fmt: skip
         gradients = self._buffer("g_features", (count, blend_kernels.GROUP))
-        shape = (-(-count // projection.CHUNK), len(projection.ACTED_BACKWARD))
-        acted = self._buffer("acted_backward", shape, np.int64)
-        feature_gradients.sum_features(last.counts * last.learnt, last.firsts, records, gradients, acted)
-        self.guards.add(projection.ACTED_BACKWARD, acted)
+        shape = (-(-count // projection.CHUNK), len(projection.COUNTED_GUARDS_BACKWARD))
+        guard_counts = self._buffer("guard_counts_backward", shape, np.int64)
+        feature_gradients.sum_features(last.counts * last.learnt, last.firsts, records, gradients, guard_counts)
+        self.guards.add(projection.COUNTED_GUARDS_BACKWARD, guard_counts)
         return gradients
 
     @property
@@ -294,7 +307,7 @@ class CpuRasterizer:
     def picture(self) -> Picture:
         """The result of the last forward pass, valid until the next one."""
         height, width = self._last.camera.height, self._last.camera.width
-        return Picture(self._last.image[:, :height, :width], self._last.rest[:height, :width])
+        return Picture(self._last.image[:, :height, :width], self._last.transmittance[:height, :width])
 
     @property
     def splats(self) -> Array:

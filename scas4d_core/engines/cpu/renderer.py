@@ -91,7 +91,7 @@ class CpuRenderer:
     def compare(self, state: Gaussians, view: TrainingView, features: Array | None = None) -> Comparison:
         """See ``Renderer.compare``."""
         shown = features_seen(state, view.camera) if features is None else features
-        self.measure(state.means, state.factors, state.opacities, shown, view)
+        self.forward(state.means, state.factors, state.opacities, shown, view)
         return Comparison(self.psnr, self.image_part, self.colour_shift(view))
 
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
@@ -128,7 +128,7 @@ class CpuRenderer:
     def load_state(self, previous: Gaussians) -> None:
         """Take the state that a frame starts from; here nothing depends on it."""
 
-    def evaluate(
+    def forward_backward(
         self,
         means: Array,
         factors: Array,
@@ -154,14 +154,16 @@ class CpuRenderer:
         lap("render backward")
         return gradients
 
-    def measure(self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView) -> None:
-        """Render the view and set ``image_part``, ``mask_part`` and ``psnr``, without gradients; see ``evaluate``."""
+    def forward(self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView) -> None:
+        """Render the view and set ``image_part``, ``mask_part`` and ``psnr``, without gradients; see
+        ``forward_backward``.
+        """
         self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background)
         g_image, _ = self.rasterizer.gradient_buffers()
         self._compare(view, g_image)
 
     def shown(self, view: TrainingView) -> Picture:
-        """The view's whole picture as ``evaluate`` rendered it last; valid until anything else is rendered."""
+        """The view's whole picture as ``forward_backward`` rendered it last; valid until anything else is rendered."""
         return self.rasterizer.picture
 
     def colour_shift(self, view: TrainingView) -> tuple[float, float, float]:

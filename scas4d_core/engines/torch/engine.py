@@ -62,8 +62,8 @@ class TorchEngine:
     def load_state(self, previous: Gaussians) -> None:
         """See ``UpdateEngine.load_state``."""
         self._scene = scene = Scene(self._plan, self._structure, previous)
-        moving, standing = scene.colours[scene.rows].clone(), scene.colours[scene.standing].clone()
-        self._parameters = Parameters(*deformation_of(Tables.still(self._structure.hierarchy)), moving, standing)
+        moving, static = scene.colours[scene.rows].clone(), scene.colours[scene.static].clone()
+        self._parameters = Parameters(*deformation_of(Tables.identity(self._structure.hierarchy)), moving, static)
         self._gains: GainEstimator | None = None
         self._smoothing: tuple[Tensor, Tensor] | None = None
         self._log, self._gradients = IterationLog(), dict[str, Array]()
@@ -115,7 +115,7 @@ class TorchEngine:
             loss = loss + plan.mask * losses.image_loss(planes[..., LABEL:], target[..., LABEL:])
         picture = planes.detach().permute(2, 0, 1).float().numpy()
         if self._gains is not None:
-            self._gains.saw(view, picture[:LABEL])
+            self._gains.record_rendering(view, picture[:LABEL])
             gain, offset = leaf(view.exposure[:3, 0]), leaf(view.exposure[:3, 1])
         psnr = float(losses.psnr(shown.detach(), target[..., :LABEL]))
         mean = planes.detach()[..., :LABEL].mean(dim=(0, 1)) * gain + offset
@@ -244,7 +244,7 @@ class TorchEngine:
         """See ``UpdateEngine.gains``."""
         if self._gains is None:
             raise ValueError("gains were not given to begin; the plan has to follow them (UpdatePlan.camera_gains)")
-        self._gains.settle()
+        self._gains.finish_round()
         return self._gains.gains.copy()
 
     def gradients(self) -> dict[str, Array]:
@@ -260,7 +260,7 @@ class TorchEngine:
             f"{k}.{name}": v for k, params in enumerate(parameters.clusters) for name, v in params._asdict().items()
         }
         named |= parameters.deltas._asdict()
-        named |= {"moving": parameters.moving_colours, "standing": parameters.static_colours}
+        named |= {"moving": parameters.moving_colours, "static": parameters.static_colours}
         if gloss is not None:
             named |= {"gloss": gloss.gloss, "light": gloss.light, "nearness": gloss.nearness}
         return named
@@ -276,7 +276,7 @@ def tables_of_gradients(named: Mapping[str, Array], scene: Scene, layers: int) -
     }
     tables["deltas"] = np.concatenate([named[name] for name in ("dp", "dr", "ds")], axis=1)
     colours = np.zeros((len(scene.means), 3))
-    colours[scene.rows.numpy()], colours[scene.standing.numpy()] = named["moving"], named["standing"]
+    colours[scene.rows.numpy()], colours[scene.static.numpy()] = named["moving"], named["static"]
     tables["colours"] = colours
     if "gloss" in named:
         tables["gloss"] = named["gloss"]

@@ -88,7 +88,7 @@ class Parameters:
         self._free(zip(self.deltas, (start.position, start.rotation, start.scale), strict=True), betas, "own")
         if learnt is not None:
             self._free(iter([(self.moving_colours, start.colour)]), betas, "colour")
-            if learnt.standing:
+            if learnt.static:
                 self._free(iter([(self.static_colours, start.static_colour)]), betas, "colour")
         if self.gloss is not None:
             own = (self.gloss.gloss, self.gloss.light, self.gloss.nearness)

@@ -35,7 +35,7 @@ class Scene:
     A moving Gaussian that is not finite is held back: it stays as it is, is in no pivot and in no pair of neighbours.
 
     Attributes:
-        rows: [M] moving Gaussians. sound: [M] those that are not held back. standing: [N − M] the others.
+        rows: [M] moving Gaussians. sound: [M] those that are not held back. static: [N − M] the others.
     """
 
     def __init__(self, plan: UpdatePlan, structure: Structure, previous: Gaussians) -> None:
@@ -45,7 +45,7 @@ class Scene:
         held = np.concatenate([previous.means[moving], previous.factors[moving].reshape(-1, 9)], axis=1)
         self.sound = torch.as_tensor(np.isfinite(held).all(axis=1))
         self.rows = torch.as_tensor(moving)
-        self.standing = torch.as_tensor(np.setdiff1d(np.arange(len(previous)), moving))
+        self.static = torch.as_tensor(np.setdiff1d(np.arange(len(previous)), moving))
         self.means, self.factors = leaf(previous.means), leaf(previous.factors)
         self.opacities, self.labels = leaf(previous.opacities), leaf(previous.foreground)
         self.colours = leaf(previous.colours)
@@ -74,7 +74,7 @@ class Scene:
     def all_colours(self, parameters: Parameters) -> Tensor:
         """[N, 3] RGB, without gloss."""
         colours = self.colours.index_copy(0, self.rows, parameters.moving_colours)
-        return colours.index_copy(0, self.standing, parameters.static_colours)
+        return colours.index_copy(0, self.static, parameters.static_colours)
 
     def seen(
         self, moved: Moved, colours: Tensor, gloss: Tensor | None, environment: Tensor | None, camera: CameraArrays

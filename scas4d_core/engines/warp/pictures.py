@@ -11,7 +11,7 @@ from scas4d_core.engines.plan import UpdatePlan
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.engines.warp.layout import COLUMNS
 from scas4d_core.engines.warp.picture_loss import PictureLoss
-from scas4d_core.engines.warp.projection import ACTED
+from scas4d_core.engines.warp.projection import COUNTED_GUARDS
 from scas4d_core.engines.warp.rasterizer import Rasterizer
 from scas4d_core.guards import GuardCounts
 
@@ -65,13 +65,13 @@ class PicturePass:
 
     def guards(self) -> GuardCounts:
         """How often the guards of pictures have acted since ``forget_guards``; waits for the device."""
-        counts = GuardCounts(*ACTED)
-        counts.add(ACTED, self._rasterizer.acted.numpy().astype(np.int64))
+        counts = GuardCounts(*COUNTED_GUARDS)
+        counts.add(COUNTED_GUARDS, self._rasterizer.guard_counts.numpy().astype(np.int64))
         return counts
 
     def forget_guards(self) -> None:
         """Sets the counts of the guards to 0."""
-        self._rasterizer.acted.zero_()
+        self._rasterizer.guard_counts.zero_()
 
     def load_views(self, views: Sequence[TrainingView]) -> None:
         """Takes the pictures, cameras and exposures of a frame; pictures that it has are not sent again."""

@@ -19,7 +19,7 @@ FARTHEST = wp.constant(wp.float32(NOT_FINITE))
 BRIGHTEST = wp.constant(wp.float32(FEATURE_CEILING))
 WIDEST = wp.constant(wp.float32(FOOTPRINT_CEILING))
 STEEPEST = wp.constant(wp.float32(GRADIENT_NOT_FINITE))
-ACTED = ("not_finite", "footprint_ceiling", "gradient_not_finite")
+COUNTED_GUARDS = ("not_finite", "footprint_ceiling", "gradient_not_finite")
 """Guards that are counted: the first two in ``project``, the last in ``project_backward``."""
 RECORD = 4
 """Rows of a splat in ``records`` [4 N]. Ten numbers are sums over pixels: dL/dpower times 1, x, y, xx, xy and yy of
@@ -62,7 +62,7 @@ def sound(mean: wp.vec3, factor: wp.mat33, opacity: wp.float32, feature: wp.vec4
 def project_one(
     raster: Raster, camera: Camera, i: wp.int32, means: wp.array[wp.vec3], factors: wp.array[wp.mat33],
     opacities: wp.array[wp.float32], features: wp.array[wp.vec4], splats: wp.array[wp.vec4],
-    boxes: wp.array[wp.vec4i], records: wp.array[wp.vec4], acted: wp.array[wp.int32],
+    boxes: wp.array[wp.vec4i], records: wp.array[wp.vec4], guard_counts: wp.array[wp.int32],
 ) -> wp.int32:  # fmt: skip
     """Projects a Gaussian; returns 1 if its box meets the picture, else 0. See ``project``."""
     zero = wp.vec4(0.0, 0.0, 0.0, 0.0)
@@ -77,7 +77,7 @@ def project_one(
     # Comparisons with NaN are false.
     fit = sound(mean, factor, opacity, features[i])
     if not fit:
-        wp.atomic_add(acted, 0, 1)
+        wp.atomic_add(guard_counts, 0, 1)
     if fit and place[2] >= raster.near and opacity >= raster.alpha_floor:
         inverse = 1.0 / place[2]
         u = held(raster, place[0] * inverse, camera.fx, camera.cx, camera.width)[0]
@@ -92,7 +92,7 @@ def project_one(
         normal = wp.cross(m0, m1)
         determinant = wp.dot(normal, normal) + raster.low_pass * (xx + yy - raster.low_pass)
         if not (determinant > 0.0 and determinant < WIDEST):
-            wp.atomic_add(acted, 1, 1)
+            wp.atomic_add(guard_counts, 1, 1)
         else:
             x = camera.fx * place[0] * inverse + camera.cx
             y = camera.fy * place[1] * inverse + camera.cy
@@ -127,7 +127,7 @@ def project(
     splats: wp.array[wp.vec4],
     boxes: wp.array[wp.vec4i],
     records: wp.array[wp.vec4],
-    acted: wp.array[wp.int32],
+    guard_counts: wp.array[wp.int32],
     tile_counts: wp.array[wp.int32],
     starts: wp.array[wp.int32],
     keys: wp.array[wp.uint64],
@@ -138,14 +138,17 @@ def project(
         raster: constants. cameras: of all views. view: [1] index of the camera.
         means, factors, opacities, features: [N]; Σ = F Fᵀ.
         splats: out [2 N], see ``supports``. boxes: out [N] tiles x0, y0, x1, y1 (exclusive) around the support; where
-            culled, anything. records: out [4 N], set to 0. acted: [3] counts of the guards ``ACTED``, added to.
+            culled, anything. records: out [4 N], set to 0. guard_counts: [3] counts of the guards ``COUNTED_GUARDS``,
+            added to.
         tile_counts: [tiles], added to. starts, keys: of the lists, left alone.
     """
     i = wp.tid()
     camera = cameras[view[0]]
     drawn = wp.int32(0)
     if i < raster.count:
-        drawn = project_one(raster, camera, i, means, factors, opacities, features, splats, boxes, records, acted)
+        drawn = project_one(
+            raster, camera, i, means, factors, opacities, features, splats, boxes, records, guard_counts
+        )
     sync_lanes()
     enter_lists(raster, camera, i, drawn, splats, boxes, starts, tile_counts, keys, 0)
 
@@ -159,7 +162,7 @@ def project_backward(
     factors: wp.array[wp.mat33],
     splats: wp.array[wp.vec4],
     records: wp.array[wp.vec4],
-    acted: wp.array[wp.int32],
+    guard_counts: wp.array[wp.int32],
     g_means: wp.array[wp.vec3],
     g_factors: wp.array[wp.mat33],
     g_features: wp.array[wp.vec4],
@@ -168,7 +171,8 @@ def project_backward(
 
     Args:
         raster, cameras, view, means, factors: as of ``project``. splats: from it. records: from ``blend_backward``.
-        acted: [3] counts of the guards ``ACTED``, added to. g_means, g_factors, g_features: [N], added to.
+        guard_counts: [3] counts of the guards ``COUNTED_GUARDS``, added to. g_means, g_factors, g_features: [N], added
+            to.
     """
     i = wp.tid()
     second = load(splats, 2 * i + 1)
@@ -222,4 +226,4 @@ def project_backward(
             g_factors[i] = g_factors[i] + g_factor
             g_features[i] = g_features[i] + g_feature
         else:
-            wp.atomic_add(acted, 2, 1)
+            wp.atomic_add(guard_counts, 2, 1)

@@ -35,7 +35,7 @@ class Rasterizer:
         starts, items: [tiles + 1] and [capacity] the tile lists of the last picture. tiles_x: tiles of a row.
         overflow: [1] set to 1 on the device when the lists of a picture had more entries than there is room for; that
             picture is drawn empty.
-        acted: [3] number of times that the guards ``projection.ACTED`` acted.
+        guard_counts: [3] number of times that the guards ``projection.COUNTED_GUARDS`` acted.
         capacity: entries for which there is room.
     """
 
@@ -48,7 +48,7 @@ class Rasterizer:
         self.splats = wp.zeros(2 * count, dtype=wp.vec4, device=device)
         self.records = wp.zeros(projection.RECORD * count, dtype=wp.vec4, device=device)
         self._boxes = wp.zeros(count, dtype=wp.vec4i, device=device)
-        self.acted = wp.zeros(len(projection.ACTED), dtype=wp.int32, device=device)
+        self.guard_counts = wp.zeros(len(projection.COUNTED_GUARDS), dtype=wp.int32, device=device)
         self.overflow = wp.zeros(1, dtype=wp.int32, device=device)
 
     def resize(self, columns: int, rows: int) -> None:
@@ -103,7 +103,7 @@ class Rasterizer:
         device, view_of = self._device, [cameras, view]
         count = -(-self.count // self._lanes) * self._lanes
         given = [means, factors, opacities, features]
-        out = [self.splats, self._boxes, self.records, self.acted, self._tile_counts, self.starts, self._keys]
+        out = [self.splats, self._boxes, self.records, self.guard_counts, self._tile_counts, self.starts, self._keys]
         wp.launch(projection.project, count, [self._raster, *view_of, *given, *out], device=device)
         threads = tiles.SCAN_BLOCK if self._lanes > 1 else 1
         lists = [self.starts, self._segment_starts, self.overflow, record, log]
@@ -142,7 +142,7 @@ class Rasterizer:
         g_factors: wp.array, g_features: wp.array,
     ) -> None:  # fmt: skip
         """Adds the gradients of the Gaussians, from ``records``, to [N] of vec3, mat33 and vec4."""
-        given = [self._raster, cameras, view, means, factors, self.splats, self.records, self.acted]
+        given = [self._raster, cameras, view, means, factors, self.splats, self.records, self.guard_counts]
         inputs = [*given, g_means, g_factors, g_features]
         wp.launch(projection.project_backward, self.count, inputs, device=self._device)
 

@@ -59,7 +59,7 @@ export function showEffects(list, words, effects) {
   const listed = all.filter(([, one]) => one.pinned || one.text || one.since > first);
   list.replaceChildren(...listed.map(([name, one]) => {
     const state = one.pinned ? `pinned ${one.on ? "on" : "off"}` : `${one.on ? "on" : "off"} since frame ${one.since}`;
-    return node("li", { title: one.says, class: one.on ? "on" : "off" }, `${called(name)}: ${state}${one.text ? `, ${one.text}` : ""}`);
+    return node("li", { title: one.description, class: one.on ? "on" : "off" }, `${called(name)}: ${state}${one.text ? `, ${one.text}` : ""}`);
   }));
   const rest = (on) => all.filter((one) => !listed.includes(one) && one[1].on === on).map(([name]) => called(name).toLowerCase());
   const [usual, idle] = [rest(true), rest(false)];

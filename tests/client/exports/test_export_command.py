@@ -32,7 +32,7 @@ def state(frame: int) -> Gaussians:
     made = made.replace(means=made.means + shift, foreground=(LABELS == 1).astype(np.float32))
     if frame == 1:
         return made.retire([0])
-    return made if frame < 2 else made.joined(Gaussians.of_points([[0, 0.2, 0]], 0.1)).replace(ids=np.arange(6))
+    return made if frame < 2 else made.concatenate(Gaussians.of_points([[0, 0.2, 0]], 0.1)).replace(ids=np.arange(6))
 
 
 @pytest.fixture

@@ -34,7 +34,7 @@ def test_what_turns_keeps_its_size_between_frames():
 
 def test_what_comes_and_goes_fades_where_it_is():
     a = state(0).retire([0])
-    b = state(2).retire([1]).joined(Gaussians.of_points([[0, 1, 2]], radius=0.1))
+    b = state(2).retire([1]).concatenate(Gaussians.of_points([[0, 1, 2]], radius=0.1))
     middle = interpolated(a, b, 0.25)
     assert len(middle) == len(b)
     assert middle.opacities[[0, 1, 2, -1]] == pytest.approx(0.9 * np.array([0.25, 0.75, 1, 0.25]))

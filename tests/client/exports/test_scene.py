@@ -60,7 +60,7 @@ def test_tracks_follow_what_moves_or_what_is_asked_for(source):
 def test_what_is_not_there_is_told(tmp_path):
     first = state(0)
     later = first.retire([0])
-    born = later.joined(first.rows([1, 2]).replace(means=first.means[1:3] + np.float32(0.1)))
+    born = later.concatenate(first.rows([1, 2]).replace(means=first.means[1:3] + np.float32(0.1)))
     born = born.replace(ids=np.concatenate([first.ids, [400, 401]]))
     with CompactWriter(tmp_path / "states.s4d", FileHeader(WORLD)) as writer:
         for frame, one in enumerate((first, later, born)):

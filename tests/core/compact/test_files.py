@@ -48,7 +48,7 @@ def states() -> Iterator[tuple[int, float, Gaussians]]:
         )
         if index == BORN_AT:
             born = Gaussians.of_points(rng.uniform(-1, 1, (40, 3)), 0.02)
-            state = state.joined(born).replace(ids=np.concatenate([state.ids, 1000 + np.arange(40)]))
+            state = state.concatenate(born).replace(ids=np.concatenate([state.ids, 1000 + np.arange(40)]))
         if index == RETIRED_AT:
             state = state.retire([3, 260])
         if index == REVIVED_AT:

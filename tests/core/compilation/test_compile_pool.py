@@ -144,9 +144,9 @@ def test_a_process_asks_once_for_each_group(monkeypatch):
     monkeypatch.setattr(warm_up, "_settled", set())
     monkeypatch.setattr(warm_up, "wait_for_kernels", lambda wanted, then, told: asked.append(wanted))
     for _ in range(2):
-        warm_up.warm_up_elsewhere([KernelGroup.FIRST_FRAME])
-    warm_up.warm_up_elsewhere([KernelGroup.FIRST_FRAME, KernelGroup.UPDATE])
-    warm_up.warm_up_elsewhere()
+        warm_up.compile_in_processes([KernelGroup.FIRST_FRAME])
+    warm_up.compile_in_processes([KernelGroup.FIRST_FRAME, KernelGroup.UPDATE])
+    warm_up.compile_in_processes()
     assert asked == [
         (KernelGroup.FIRST_FRAME,),
         (KernelGroup.UPDATE,),

@@ -21,7 +21,7 @@ from numba.core import event
 from scas4d_core.captures import open_capture
 from scas4d_core.presets import preset
 from scas4d_core.reconstruction import Reconstruction
-from scas4d_core.warm_up import first_frame_groups, update_groups, warm_up_elsewhere
+from scas4d_core.warm_up import first_frame_groups, update_groups, compile_in_processes
 
 compiled = []
 class Heard(event.Listener):
@@ -38,10 +38,10 @@ def frame(index):
     found = capture.frame(index)
     return found if masked else replace(found, masks={})
 points = capture.points if given["points"] else None
-warm_up_elsewhere(first_frame_groups(points=points is not None))
+compile_in_processes(first_frame_groups(points=points is not None))
 scene = Reconstruction.start(capture.rig, frame(0), settings, points=points)
 first = list(compiled)
-warm_up_elsewhere(update_groups(settings.update.covariance))
+compile_in_processes(update_groups(settings.update.covariance))
 for index in (1, 2, 3): scene.step(frame(index))
 update = compiled[len(first):]
 camera = capture.test_rig.cameras[0]

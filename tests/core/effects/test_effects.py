@@ -16,7 +16,7 @@ from scas4d_core.effects import effect as effect_module
 from scas4d_core.effects.coherence.floor import FLOOR_WEIGHT
 from scas4d_core.effects.effect import Effect, EffectGroup, effect, refusal_at_zero
 from scas4d_core.effects.evidence import Evidence, FrameObservation
-from scas4d_core.effects.switches import IDLE, Switch, decided, first_switches, names_on, register_effects
+from scas4d_core.effects.switches import IDLE, Switch, decide_switches, first_switches, names_on, register_effects
 from scas4d_core.errors import InputError
 from scas4d_core.presets import SettingError, preset
 from scas4d_core.settings import SceneSettings, Settings
@@ -30,8 +30,10 @@ def test_every_effect_describes_itself(name: str) -> None:
     one = effect(name)
     assert one.name == name
     assert one.group.value in EFFECTS[name]  # it lies in the folder of its group
-    assert all(text and text[0].isalnum() and len(text) > 15 for text in (one.says, one.gauge, one.cost))
-    assert one.says.endswith(".")
+    assert all(
+        text and text[0].isalnum() and len(text) > 15 for text in (one.description, one.disambiguation, one.cost)
+    )
+    assert one.description.endswith(".")
 
 
 def test_the_descriptions_are_light() -> None:
@@ -49,7 +51,7 @@ def test_an_effect_that_is_off_has_no_part() -> None:
     assert plan.neighbour_terms
     assert (plan.rigidity, plan.isometry, plan.rotation) == (0, UPDATE.weights.isometry, 0)
     assert plan.colours is not None
-    assert (plan.colours.moving, plan.colours.standing) == (False, True)
+    assert (plan.colours.moving, plan.colours.static) == (False, True)
 
 
 @pytest.mark.parametrize(
@@ -136,7 +138,7 @@ class Shy(Effect):
         share = {0: 0.5, 1: 0.9, 2: None}.get(seen.index, 0.1)
         return None if share is None else Evidence(share, f"frame {seen.index}")
 
-    def join(self, builder: PlanBuilder) -> None:
+    def register(self, builder: PlanBuilder) -> None:
         builder.parts.append(UpdatePart())
 
 
@@ -162,7 +164,7 @@ def test_evidence_switches_with_hysteresis() -> None:
     assert not switches["shy"].on
     on = []
     for index in range(3 + IDLE):
-        switches = decided(switches, settings, seen(index))
+        switches = decide_switches(switches, settings, seen(index))
         on.append(switches["shy"].on)
     assert on == [False, True, True, *[True] * (IDLE - 1), False]
     assert switches["shy"] == Switch(False, 2 + IDLE, share=0.1, text=f"frame {2 + IDLE}")
@@ -171,7 +173,7 @@ def test_evidence_switches_with_hysteresis() -> None:
 @pytest.mark.usefixtures("shy")
 def test_a_pinned_switch_hears_no_evidence() -> None:
     settings = Settings(effects={"shy": "off"})
-    switches = decided({"shy": first_switches(settings, 0)["shy"]}, settings, seen(1))
+    switches = decide_switches({"shy": first_switches(settings, 0)["shy"]}, settings, seen(1))
     assert not switches["shy"].on
     assert switches["shy"].pinned
 
@@ -180,4 +182,4 @@ def test_a_pinned_switch_hears_no_evidence() -> None:
 def test_switches_stay_where_nothing_is_seen() -> None:
     settings = Settings()
     switches = {name: first_switches(settings, 0)[name] for name in ("rigidity", "floor", "shy")}
-    assert decided(switches, settings, seen(2)) == {name: replace(switch) for name, switch in switches.items()}
+    assert decide_switches(switches, settings, seen(2)) == {name: replace(switch) for name, switch in switches.items()}

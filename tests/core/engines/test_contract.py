@@ -50,7 +50,7 @@ def test_an_iteration_has_the_values_and_gradients_of_the_reference(effect: str,
     assert mine.log().losses == pytest.approx(true.log().losses, rel=TOLERANCE)
     assert set(gradients) == set(expected) == learnt_tables(scene)
     for name in gradients:
-        rows = scene.rows if name == "colours" and not scene.plan.colours.standing else slice(None)
+        rows = scene.rows if name == "colours" and not scene.plan.colours.static else slice(None)
         assert np.linalg.norm(expected[name][rows]) > 0, name
         assert apart(gradients[name][rows], expected[name][rows]) < TOLERANCE, name
 
@@ -145,7 +145,7 @@ def updated(scene: Case, engine: UpdateEngine):  # type: ignore[no-untyped-def]
 
 def test_no_motion_leaves_the_state_as_it_is(engine: UpdateEngine) -> None:
     scene = case()
-    loaded(engine, scene, Tables.still(scene.structure.hierarchy))
+    loaded(engine, scene, Tables.identity(scene.structure.hierarchy))
     state = engine.state(learnt=True)
     for name in ("means", "factors", "rotations", "colours", "opacities", "foreground"):
         assert np.allclose(getattr(state, name), getattr(scene.previous, name), atol=1e-6), name
@@ -174,7 +174,7 @@ def test_a_probe_of_the_state_before_does_not_depend_on_the_tables(engine: Updat
 
 def test_iterations_lower_the_error_of_the_probes(engine: UpdateEngine) -> None:
     scene = case(**EFFECTS["moving colours"])
-    loaded(engine, scene, Tables.still(scene.structure.hierarchy), layers=((0.01, 0.005, 0.002),) * 2)
+    loaded(engine, scene, Tables.identity(scene.structure.hierarchy), layers=((0.01, 0.005, 0.002),) * 2)
     before = np.mean(engine.probe(range(5), moved=True, learnt=True))
     for iteration in range(20):
         engine.iterate([iteration % 5], step(sample=iteration % 2, layers=(1.0, 0.3), own=0.0))
@@ -186,7 +186,7 @@ def test_what_has_no_rate_or_no_factor_stays(engine: UpdateEngine) -> None:
     tables = random_tables(scene)
     loaded(engine, scene, tables, layers=((0.02, 0.0, 0.005), (0.02, 0.02, 0.0)), scale=0.0, static_colour=0.0)
     for _ in range(3):
-        engine.iterate([1], step(layers=(1.0, 0.0), resting=0))
+        engine.iterate([1], step(layers=(1.0, 0.0), frozen=0))
     after, state = engine.tables(), engine.state(learnt=True)
     coarse, fine, own = after.clusters[0], after.clusters[1], after.deltas
     assert np.array_equal(coarse[:, 3:6], tables.clusters[0][:, 3:6])
@@ -194,8 +194,8 @@ def test_what_has_no_rate_or_no_factor_stays(engine: UpdateEngine) -> None:
     assert np.array_equal(fine, tables.clusters[1])
     assert np.array_equal(own[:, 6:], tables.deltas[:, 6:])
     assert not np.array_equal(own[:, :3], tables.deltas[:, :3])
-    standing = np.setdiff1d(np.arange(len(scene.previous)), scene.rows)
-    assert np.array_equal(state.colours[standing], scene.previous.colours[standing])
+    static = np.setdiff1d(np.arange(len(scene.previous)), scene.rows)
+    assert np.array_equal(state.colours[static], scene.previous.colours[static])
     assert not np.array_equal(state.colours[scene.rows], scene.previous.colours[scene.rows])
 
 
@@ -203,8 +203,8 @@ def test_layers_that_rest_do_not_move(engine: UpdateEngine) -> None:
     scene = case()
     tables = random_tables(scene)
     loaded(engine, scene, tables)
-    engine.iterate([0], step(resting=1, layers=(0.0, 1.0)))
-    engine.iterate([1], step(resting=1, layers=(0.0, 1.0)))
+    engine.iterate([0], step(frozen=1, layers=(0.0, 1.0)))
+    engine.iterate([1], step(frozen=1, layers=(0.0, 1.0)))
     after = engine.tables()
     assert np.array_equal(after.clusters[0], tables.clusters[0])
     assert not np.array_equal(after.clusters[1], tables.clusters[1])
@@ -295,7 +295,7 @@ def test_an_engine_that_cannot_do_what_a_plan_asks_says_so_by_name() -> None:
 
 def test_nothing_free_means_nothing_moves(engine: UpdateEngine) -> None:
     scene = case(freedom=Freedom(), **EFFECTS["moving colours"])
-    still = Tables.still(scene.structure.hierarchy)
+    still = Tables.identity(scene.structure.hierarchy)
     loaded(engine, scene, still, layers=((0.0, 0.0, 0.0),) * 2, position=0.0, rotation=0.0, scale=0.0)
     engine.iterate([0], step())
     assert np.allclose(engine.state(learnt=False).means, scene.previous.means, atol=1e-6)

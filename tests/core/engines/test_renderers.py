@@ -37,7 +37,7 @@ def test_pictures(tested: Renderer, glossy: bool) -> None:
     mine, true = tested.render(state, CAMERA), TRUE.render(state, CAMERA)
     assert mine.features.shape == true.features.shape == (4, 40, 48)
     assert apart(mine.features, true.features) < CLOSE
-    assert apart(mine.rest, true.rest) < CLOSE
+    assert apart(mine.transmittance, true.transmittance) < CLOSE
     if glossy:
         dull = TRUE.render(state.replace(gloss=None, environment=None), CAMERA)
         assert apart(dull.features, true.features) > 0.01
@@ -63,7 +63,7 @@ def test_eight_features_of_gaussians_that_are_not_all_sound(tested: Renderer) ->
     mine, true = (renderer.render(state, CAMERA, given) for renderer in (tested, TRUE))
     assert mine.features.shape == (8, 40, 48)
     assert apart(mine.features, true.features) < CLOSE
-    assert apart(mine.rest, true.rest) < CLOSE
+    assert apart(mine.transmittance, true.transmittance) < CLOSE
 
 
 def test_comparisons(tested: Renderer) -> None:

@@ -30,7 +30,7 @@ def sequence(changes: bool) -> list[Gaussians]:
         states[1] = states[1].retire([1, 2])
         born = LATER.replace(opacities=np.float32([0.4]), foreground=np.float32([0]))
         for frame in (2, 3):
-            joined = states[frame].joined(born)
+            joined = states[frame].concatenate(born)
             states[frame] = joined.replace(ids=np.append(states[frame].ids, 97))
     return states
 

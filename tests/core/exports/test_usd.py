@@ -26,7 +26,7 @@ def states(gloss=False):
             state = state.retire([3])
         if frame >= BORN:
             born = Gaussians.of_points([[0.4, -1.0, 2.5 + 0.1 * frame]], 0.02, [0.9, 0.2, 0.1])
-            state = state.joined(born)
+            state = state.concatenate(born)
             state = state.replace(ids=np.append(state.ids[:-1], 77))
         yield state
 

@@ -143,7 +143,7 @@ def test_kept_rows_keep_their_moments_and_new_ones_have_none() -> None:
     before = fit.table
     assert before.statistics is not None
     assert before.statistics.rendered.max() == 2
-    assert (before.statistics.pull > 0).any()
+    assert (before.statistics.screen_gradients > 0).any()
     kept, added = np.array([5, 1, 7]), table(1)[:2]
     fit.replace_rows(kept, added, np.array([5, 5]))
     after = fit.table

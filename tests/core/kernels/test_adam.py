@@ -7,11 +7,11 @@ import pytest
 
 from scas4d_core.guards import GRADIENT_CEILING, MOMENT_FLOOR, GuardCounts, summed
 from scas4d_core.kernels import activation
-from scas4d_core.kernels.adam import ACTED, EVERY_ROW, adam
+from scas4d_core.kernels.adam import COUNTED_GUARDS, EVERY_ROW, adam
 
 
 @pytest.mark.parametrize(
-    ("given", "taken", "acted"),
+    ("given", "taken", "guard_counts"),
     [
         (np.nan, 0.0, [1, 0]),
         (np.inf, GRADIENT_CEILING, [1, 0]),
@@ -22,7 +22,7 @@ from scas4d_core.kernels.adam import ACTED, EVERY_ROW, adam
     ],
 )
 def test_a_number_that_a_guard_holds_is_counted_and_moves_no_other(
-    given: float, taken: float, acted: list[int]
+    given: float, taken: float, guard_counts: list[int]
 ) -> None:
     rng = np.random.default_rng(0)
     gradients = rng.normal(size=(1500, 3)).astype(np.float32)
@@ -34,7 +34,7 @@ def test_a_number_that_a_guard_holds_is_counted_and_moves_no_other(
     for step in (1, 2):
         given_now, clean_now = gradients.copy(), clean.copy()
         counted = adam(tables[0], given_now, *tables[1:3], rates, EVERY_ROW, np.float32(0.9), np.float32(0.999), step)
-        assert counted.tolist() == acted
+        assert counted.tolist() == guard_counts
         assert adam(
             tables[3], clean_now, *tables[4:], rates, EVERY_ROW, np.float32(0.9), np.float32(0.999), step
         ).tolist() == [0, 0]
@@ -62,9 +62,9 @@ def test_a_quaternion_without_direction_is_no_rotation_and_has_no_gradient() -> 
 
 
 def test_counts_are_told_by_name_and_begin_again() -> None:
-    counts = GuardCounts(*ACTED)
-    counts.add(ACTED, np.array([[1, 2], [3, 4]]))
-    counts.add(ACTED[1:], np.array([5]))
+    counts = GuardCounts(*COUNTED_GUARDS)
+    counts.add(COUNTED_GUARDS, np.array([[1, 2], [3, 4]]))
+    counts.add(COUNTED_GUARDS[1:], np.array([5]))
     assert dict(counts) == {"gradient_ceiling": 4, "moment_floor": 11}
     assert summed([counts, {"folded": 1, "moment_floor": 1}]) == {
         "gradient_ceiling": 4,

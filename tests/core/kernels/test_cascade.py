@@ -150,7 +150,7 @@ def test_layers_that_rest_are_applied_once_and_all_else_keeps_its_bits(kind: Lit
             table[:] = values
         model.forward()
         for going, resting in zip((0, 1, 2, 0), rests, strict=True):
-            model.rest(resting)
+            model.freeze_layers(resting)
             for table, values in zip(model.clusters[going:], more[going:], strict=True):
                 table += values
             model.forward()
@@ -168,4 +168,4 @@ def test_the_last_layer_does_not_rest() -> None:
     labels = np.zeros(5, np.int32)
     model = CpuDeformation(Hierarchy(np.arange(5), (labels,), (starts_of(labels),)), None, np.ones((5, 3)), "centred")
     with pytest.raises(ValueError, match="1 of 1 layers cannot rest"):
-        model.rest(1)
+        model.freeze_layers(1)

@@ -60,7 +60,7 @@ def test_exponentials_are_clamped_and_keep_what_is_no_number():
 
 @kernel
 def picks(array, rows, out):
-    lanes.put(out, rows, 16, 2, 1, lanes.pick(array, rows, 16, 3, 2))
+    lanes.scatter_column(out, rows, 16, 2, 1, lanes.gather_column(array, rows, 16, 3, 2))
 
 
 def test_columns_of_named_rows():
@@ -75,7 +75,7 @@ def test_columns_of_named_rows():
 
 @kernel
 def whole_rows(array, rows, sums, out):
-    taken = lanes.rows_at(array, rows, 0)
+    taken = lanes.gather_rows(array, rows, 0)
     for k in range(16):
         lanes.store(out, 16 * k, taken[k])
     columns = lanes.transposed(taken)

@@ -105,7 +105,7 @@ def pictures(found: dict[str, float]) -> None:
 
     for view in FACTORY.views(FRAME, {}):
         camera = CameraParams.of(RIG[view.name])
-        loss.evaluate(*state, view)
+        loss.forward_backward(*state, view)
         splats, drawn = loss.rasterizer.splats, loss.rasterizer.counts > 0
         projected = twin.project(given[0], given[1], camera)
         conics = torch.linalg.inv(projected.covariances).numpy()
@@ -205,7 +205,7 @@ def disturbed_motion() -> Motion:
     return Motion(
         turns=[0.02 * rng.normal(size=(size, 3)) for size in HIERARCHY.sizes],
         shifts=[0.005 * rng.normal(size=(size, 3)) for size in HIERARCHY.sizes],
-        rest=0.002 * rng.normal(size=(MOVING, 3)),
+        own_shifts=0.002 * rng.normal(size=(MOVING, 3)),
         own_turns=0.02 * rng.normal(size=(MOVING, 3)),
         seconds=1.0,
     )

@@ -35,10 +35,10 @@ FLOOR = (0.1, 1.0, 0.2, 0.05)
 PLAN = UpdatePlan(
     cameras=("0", "1", "2"), soft_colour=0.01, mask=3.0, axis_length=10.0, neighbour_terms=True, rigidity=4.0,
     isometry=2.0, rotation=4.0, floor=FLOOR, floor_weight=2.0, freedom=Freedom(True, True, True, True, True, True),
-    colours=ColourPlan(moving=True, standing=True), whole_pictures=True,
+    colours=ColourPlan(moving=True, static=True), full_images=True,
 )  # fmt: skip
 STEP = StepScalars(
-    resting=0, layers=(1.0, 1.0), own=1.0, colour=1.0, gloss=1.0, smooth_gloss=False, rigidity=4.0, sample=0,
+    frozen=0, layers=(1.0, 1.0), own=1.0, colour=1.0, gloss=1.0, smooth_gloss=False, rigidity=4.0, sample=0,
     keep_pictures=False,
 )  # fmt: skip
 WIDTH, HEIGHT = 16, 12

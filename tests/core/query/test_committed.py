@@ -182,12 +182,12 @@ def test_views_with_parts_where_gaussians_were_born_later() -> None:
     scene = committed(box)
     before = scene.render(camera, labels=np.zeros(len(box), np.int64))
     first = scene.history.indices[-1]
-    scene.history.append(first + 1, 1.0, box.joined(box.rows(np.arange(40))).retire(np.arange(MOVING)))
+    scene.history.append(first + 1, 1.0, box.concatenate(box.rows(np.arange(40))).retire(np.arange(MOVING)))
     after = scene.render(camera, first, labels=np.zeros(len(box) + 40, np.int64))
     np.testing.assert_array_equal(before.colour, after.colour)
     np.testing.assert_array_equal(before.parts, after.parts)
     gone = scene.render(camera)
     assert not np.array_equal(gone.alpha, after.alpha)
     there = scene.history.newest.present
-    alone = committed(box.joined(box.rows(np.arange(40))).rows(there)).render(camera)
+    alone = committed(box.concatenate(box.rows(np.arange(40))).rows(there)).render(camera)
     np.testing.assert_array_equal(gone.colour, alone.colour)

@@ -187,7 +187,7 @@ def test_gaussians_born_later_belong_to_the_part_of_their_founders():
         if t >= birth:
             there = state.rows(born)
             ids = np.full(len(born), -1) if t == birth else history.ids[count:]
-            state = state.joined(there).replace(ids=np.concatenate([state.ids, ids]))
+            state = state.concatenate(there).replace(ids=np.concatenate([state.ids, ids]))
             roots = extend_roots(history.roots(), state, parents) if t == birth else None
         given = {} if t != birth else {"parents": parents, "roots": roots}
         history.append(t, t / 30, state.retire([0, 1]) if t == whole.indices[-1] else state, **given)
@@ -207,7 +207,7 @@ def test_gaussians_born_without_a_founder_stay_where_they_were_born():
     for t in whole.indices:
         state = whole.gaussians(t)
         if t >= 2:
-            state = state.joined(state.rows([7]))
+            state = state.concatenate(state.rows([7]))
             state = state if t == 2 else state.replace(ids=history.ids)
         history.append(t, t / 30, state)
     positions, _ = module.motion(history, np.array([len(whole.newest)]), 4)

@@ -65,7 +65,7 @@ def test_light_is_lost_as_in_the_rendered_picture():
     rows, columns = np.mgrid[0:48, 0:64]
     uv = np.stack([columns.ravel(), rows.ravel()], axis=1) + 0.5
     _, covered = ray_depths(cloud, CAMERA, uv)
-    np.testing.assert_allclose(covered.reshape(48, 64), 1 - picture.rest, atol=2e-4)
+    np.testing.assert_allclose(covered.reshape(48, 64), 1 - picture.transmittance, atol=2e-4)
 
 
 def test_the_depth_lies_on_one_of_two_surfaces_never_between():

@@ -14,7 +14,7 @@ import pytest
 from scas4d_core.captures.frame import Frame
 from scas4d_core.frame_outcome import Alarm, AlarmKind, FrameOutcome
 from scas4d_core.robust import alarms, outliers
-from scas4d_core.robust.alarms import GAIN, SHARPNESS, TINT, Numbers, Watch, alarms_of, left_out_alarms
+from scas4d_core.robust.alarms import GAIN, SHARPNESS, TINT, CameraFigures, Numbers, alarms_of, left_out_alarms
 from scas4d_core.robust.outliers import LAST_DB, NEAR_DB, NEW_DB, Past
 from studies.hard_frames.footage import SyntheticFootage
 
@@ -160,9 +160,11 @@ def test_a_camera_that_was_left_out_has_that_alarm_alone(past: Past) -> None:
 def test_what_alarms_are_told_from_goes_through_arrays(past: Past) -> None:
     _, past = settled(past, same=["c1"], offsets={**NONE, "c3": NEAR_DB - 1}, sharp={**SHARP, "c4": nan})
     back = Past.of_arrays(past.arrays())
-    assert {name: Watch.of(back, name) for name in NAMES} == {name: Watch.of(past, name) for name in NAMES}
-    assert (Watch.of(back, "c1").same, Watch.of(back, "c3").misfit) == (1, 1)
-    assert len(Watch().row()) == outliers.WATCHED
+    assert {name: CameraFigures.of(back, name) for name in NAMES} == {
+        name: CameraFigures.of(past, name) for name in NAMES
+    }
+    assert (CameraFigures.of(back, "c1").same, CameraFigures.of(back, "c3").misfit) == (1, 1)
+    assert len(CameraFigures().row()) == outliers.CAMERA_FIGURES
 
 
 def test_sharpness_does_not_hang_on_how_much_is_seen() -> None:

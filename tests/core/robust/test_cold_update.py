@@ -31,15 +31,15 @@ def missed(one: Reconstruction, truth: np.ndarray) -> float:
 
 
 def test_the_first_update_is_longer_and_the_next_is_not() -> None:
-    short, longer = scene(cold_start_iterations=1.0), scene()
-    reports = [one.step(take_frame(1, 0.1, FAR, RIG)) for one in (short, longer)]
+    short, iteration_factor = scene(cold_start_iterations=1.0), scene()
+    reports = [one.step(take_frame(1, 0.1, FAR, RIG)) for one in (short, iteration_factor)]
     assert [report.attempts for report in reports] == [["as set"], ["as set, the best of 3 orders"]]
     assert [(report.iterations, report.outcome) for report in reports] == [
         (15, FrameOutcome.UPDATED),
         (45, FrameOutcome.UPDATED),
     ]
-    assert missed(longer, FAR.means) < 0.8 * missed(short, FAR.means)
-    assert longer.step(take_frame(2, 0.2, FURTHER, RIG)).iterations == 15
+    assert missed(iteration_factor, FAR.means) < 0.8 * missed(short, FAR.means)
+    assert iteration_factor.step(take_frame(2, 0.2, FURTHER, RIG)).iterations == 15
 
 
 def test_its_motion_is_gone_on_with() -> None:
@@ -67,7 +67,7 @@ def test_where_nothing_moves_there_is_nothing_to_go_on_with() -> None:
 def test_a_later_update_without_a_motion_is_longer_too() -> None:
     one = scene()
     one.step(take_frame(1, 0.1, FAR, RIG))
-    one._prepared = one._prepared.carry(motion=None)  # as where the motion that was found is not finite
+    one._prepared = one._prepared.with_carry_over(motion=None)  # as where the motion that was found is not finite
     assert one.step(take_frame(2, 0.2, FURTHER, RIG)).iterations == 45
 
 

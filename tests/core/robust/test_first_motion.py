@@ -37,8 +37,8 @@ def ends(*given: OrderResult) -> Any:
     """Runs that end so, and the seeds and factors that they were given."""
     asked: list[tuple[int, float]] = []
 
-    def run(seed: int, faster: float) -> OrderResult:
-        asked.append((seed, faster))
+    def run(seed: int, layer_rate_factor: float) -> OrderResult:
+        asked.append((seed, layer_rate_factor))
         return given[len(asked) - 1]
 
     return run, asked
@@ -135,5 +135,5 @@ def test_a_lost_order_is_not_what_a_scene_begins_with(monkeypatch: pytest.Monkey
 def test_a_scene_that_goes_on_without_its_carry_over_is_not_at_its_first_motion() -> None:
     one = scene()
     one.step(take_frame(1, 0.1, FAR, RIG))
-    one._prepared = one._prepared.carry(motion=None, past=Past())
+    one._prepared = one._prepared.with_carry_over(motion=None, past=Past())
     assert OTHER_ORDERS not in one.step(take_frame(2, 0.2, FURTHER, RIG)).seconds

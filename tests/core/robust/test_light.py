@@ -15,7 +15,7 @@ from scas4d_core.frame_outcome import Candidate, FrameOutcome
 from scas4d_core.frame_report import FrameReport
 from scas4d_core.metrics import psnr
 from scas4d_core.reconstruction import Reconstruction
-from scas4d_core.robust.checks import ALIKE, EXPOSURE, light_continues, noted, with_light
+from scas4d_core.robust.checks import ALIKE, EXPOSURE, light_continues, record_brightness, with_light
 from scas4d_core.robust.outliers import Past
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
@@ -157,9 +157,9 @@ def test_lights_that_flicker_or_jump_do_not_go_on() -> None:
         ([1, 0.96, 0.93, 0.9], [False, False, False]),  # each step is too small to be told from noise
         ([1, 0.9, 0.81, 0.73, 0.73], [False, True, True, False]),
     ):
-        past, found = noted(Past(), bright), []
+        past, found = record_brightness(Past(), bright), []
         for light in lights[1:]:
             pictures = {name: light * value for name, value in bright.items()}
             found.append(light_continues(past, pictures))
-            past = Past.of_arrays(noted(past, pictures).arrays())
+            past = Past.of_arrays(record_brightness(past, pictures).arrays())
         assert found == goes

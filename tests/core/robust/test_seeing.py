@@ -17,11 +17,11 @@ from scas4d_core.engines.cpu.renderer import CpuRenderer
 from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.robust.checks import compensate_exposure, gain_of, relit
-from scas4d_core.robust.relocation import find_jump, shifted
+from scas4d_core.robust.checks import compensate_exposure, measure_light_gain, with_light_gain
+from scas4d_core.robust.relocation import find_jump, shift_moving
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
-from scas4d_core.update.best_state import VIEWS, BestState, ProbeViews, by_size, mean_error, spread
+from scas4d_core.update.best_state import VIEWS, BestState, ProbeViews, label_by_size, mean_error, spread_cameras
 from scas4d_core.update.frame_update import FrameUpdate
 from scas4d_core.update.parts import PlanBuilder
 from scas4d_core.update.result import AttemptOptions
@@ -43,8 +43,8 @@ def updater(settings: UpdateSettings = SETTINGS, engine: CpuEngine | None = None
     return FrameUpdate(engine or CpuEngine(), built, None)
 
 
-def compared(iterations: int, enough: Mapping[str, float] | None = None) -> AttemptOptions:
-    return AttemptOptions(stopping=Stopping(iterations), compare=True, enough=enough)
+def compared(iterations: int, skip_below: Mapping[str, float] | None = None) -> AttemptOptions:
+    return AttemptOptions(stopping=Stopping(iterations), compare=True, skip_below=skip_below)
 
 
 def views(frame: Frame) -> list[TrainingView]:
@@ -63,14 +63,14 @@ def error(state: Gaussians, frame: Frame) -> float:
 
 def test_probe_views_are_spread_and_the_same_in_every_frame() -> None:
     names = list(FOOTAGE.rig.names)
-    chosen = spread(FACTORY.rig, names)
+    chosen = spread_cameras(FACTORY.rig, names)
     assert len(set(chosen)) == VIEWS
-    assert chosen == spread(FACTORY.rig, names)
+    assert chosen == spread_cameras(FACTORY.rig, names)
     centres = np.array([FACTORY.rig[name].centre for name in chosen])
     apart = np.linalg.norm(centres[:, None] - centres[None], axis=-1)[~np.eye(VIEWS, dtype=bool)]
     assert apart.min() > 1.0
-    assert spread(FACTORY.rig, []) == []
-    assert len(spread(FACTORY.rig, names[:2])) == 2
+    assert spread_cameras(FACTORY.rig, []) == []
+    assert len(spread_cameras(FACTORY.rig, names[:2])) == 2
 
 
 def test_probe_views_tell_the_nearer_of_two_states() -> None:
@@ -120,7 +120,7 @@ def test_a_coarse_layer_rests_where_the_motion_before_leads_near(known: bool, mo
         monkeypatch.setattr("scas4d_core.update.rates.NEAR", 10.0)
     moved = update.run(BEFORE, views(FOOTAGE.frame(1)), None, 0.1, 0, compared(60))
     errors = moved.trace.errors[Candidate.END]
-    usual = by_size(errors, moved.trace.whole) if known else None
+    reference_errors = label_by_size(errors, moved.trace.whole) if known else None
     inside, coarse = engine._deformation, list[np.ndarray]()
     forward = inside.forward
 
@@ -133,7 +133,7 @@ def test_a_coarse_layer_rests_where_the_motion_before_leads_near(known: bool, mo
     stopping = Stopping(20)
     monkeypatch.setattr(stopping, "planned", plan.__getitem__)
     monkeypatch.setattr(inside, "forward", record)
-    options = AttemptOptions(stopping=stopping, compare=True, usual=usual)
+    options = AttemptOptions(stopping=stopping, compare=True, reference_errors=reference_errors)
     found = update.run(moved.gaussians, views(frame), moved.motion, 0.1, 0, options)
     iterations = len(found.trace.losses)
     assert (iterations, found.trace.kept) == (16, Candidate.END)
@@ -145,18 +145,18 @@ def test_a_coarse_layer_rests_where_the_motion_before_leads_near(known: bool, mo
 def test_a_frame_that_stands_needs_no_iteration() -> None:
     update, frame = updater(), FOOTAGE.frame(0)
     settled = update.run(BEFORE, views(frame), None, 0.1, 0, compared(30))
-    enough = by_size(settled.trace.errors[settled.trace.kept], settled.trace.whole)
+    skip_below = label_by_size(settled.trace.errors[settled.trace.kept], settled.trace.whole)
     stands = update.run(
         settled.gaussians,
         views(frame),
         None,
         0.1,
         1,
-        compared(30, enough),
+        compared(30, skip_below),
     )
     assert (stands.trace.losses, stands.trace.kept) == ([], "previous")
     for later, expected in ((FOOTAGE.frame(1), 30), (frame, 30)):
-        asked = enough if expected and later is not frame else None
+        asked = skip_below if expected and later is not frame else None
         moves = update.run(
             settled.gaussians,
             views(later),
@@ -176,7 +176,7 @@ def test_cameras_that_were_left_out_have_no_say_in_what_is_best() -> None:
     engine.load_state(BEFORE)
     best = BestState(ProbeViews(FACTORY, engine, []), engine, hierarchy, None, 0.1, SETTINGS.momentum)
     best.start()
-    assert not best.stands({"c0": 9.0})
+    assert not best.can_skip({"c0": 9.0})
     assert best.errors == {}
 
 
@@ -187,11 +187,11 @@ def test_the_gain_of_the_light_is_found_and_taken_out(gain: float) -> None:
     sent = views(replace(frame, images=brighter))
     found, without, others = compensate_exposure(FACTORY, RENDERER, BEFORE, sent[2:], sent[:2])
     assert found == pytest.approx(gain, rel=0.03)
-    assert gain_of(RENDERER, BEFORE, sent) == pytest.approx(gain, rel=0.03)
-    for view, usual in zip([*others, *without], views(frame), strict=True):
-        assert view.name == usual.name
-        assert abs(float((view.target[:3] - usual.target[:3]).mean())) < 0.02
-        np.testing.assert_array_equal(view.target[3:], usual.target[3:])
+    assert measure_light_gain(RENDERER, BEFORE, sent) == pytest.approx(gain, rel=0.03)
+    for view, reference_errors in zip([*others, *without], views(frame), strict=True):
+        assert view.name == reference_errors.name
+        assert abs(float((view.target[:3] - reference_errors.target[:3]).mean())) < 0.02
+        np.testing.assert_array_equal(view.target[3:], reference_errors.target[3:])
 
 
 def test_pictures_that_are_not_brighter_stay_as_they_are() -> None:
@@ -205,13 +205,13 @@ def test_pictures_that_are_not_brighter_stay_as_they_are() -> None:
 def test_pictures_without_a_light_tell_of_none(value: int) -> None:
     frame = FOOTAGE.frame(0)
     filled = {name: np.full_like(picture, value) for name, picture in frame.images.items()}
-    assert gain_of(RENDERER, BEFORE, views(replace(frame, images=filled))) is None
+    assert measure_light_gain(RENDERER, BEFORE, views(replace(frame, images=filled))) is None
 
 
 def test_a_state_in_another_light_is_no_brighter_than_white() -> None:
     colours = np.array([[0.2, 0.8, 1.2]], np.float32).repeat(len(BEFORE), axis=0)
-    np.testing.assert_allclose(relit(BEFORE.replace(colours=colours), 2.0).colours[0], [0.4, 1.0, 1.2])
-    np.testing.assert_allclose(relit(BEFORE.replace(colours=colours), 0.5).colours[0], [0.1, 0.4, 0.6])
+    np.testing.assert_allclose(with_light_gain(BEFORE.replace(colours=colours), 2.0).colours[0], [0.4, 1.0, 1.2])
+    np.testing.assert_allclose(with_light_gain(BEFORE.replace(colours=colours), 0.5).colours[0], [0.1, 0.4, 0.6])
 
 
 @pytest.mark.parametrize("sizes", [0.5, 1.0, 2.0])
@@ -221,7 +221,7 @@ def test_a_jump_is_found(sizes: float) -> None:
     assert found is not None
     true = np.array([-0.8, 0.0, -0.6]) * sizes * 2 * BALL
     assert np.linalg.norm(found - true) < 0.4 * BALL
-    moved = shifted(BEFORE, found)
+    moved = shift_moving(BEFORE, found)
     np.testing.assert_allclose(moved.means[:GOES], BEFORE.means[:GOES] + found, atol=1e-6)
     np.testing.assert_array_equal(moved.means[GOES:], BEFORE.means[GOES:])
 

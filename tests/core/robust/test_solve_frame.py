@@ -25,7 +25,7 @@ from scas4d_core.settings import UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
 from scas4d_core.update.best_state import COMMITTED, CONFIRMING
 from scas4d_core.update.parts import NOTHING, Arrays
-from scas4d_core.update.result import AS_SET, AttemptOptions, UpdateResult, UpdateTrace, camera_fit
+from scas4d_core.update.result import AS_CONFIGURED, AttemptOptions, UpdateResult, UpdateTrace, camera_fit
 from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import Motion
 from studies.hard_frames.footage import SyntheticFootage
@@ -43,7 +43,7 @@ VIEWS = FACTORY.views(FRAME, {})
 RENDERER = CpuRenderer((0.0, 0.0, 0.0))
 SETTINGS = UpdateSettings(iterations=30, clusters=(2,), max_rejected_frames=3)
 LEVEL = 33.0
-PAST = judge.settle(Past(), dict.fromkeys(NAMES, LEVEL), BRIGHT, 1.0)
+PAST = judge.past_after_update(Past(), dict.fromkeys(NAMES, LEVEL), BRIGHT, 1.0)
 MOTION = Motion([np.zeros((1, 3))], [np.full((1, 3), 0.01)], np.zeros((1, 3)), np.zeros((1, 3)), 0.1)
 
 Answer = Callable[[Gaussians, AttemptOptions], tuple[Gaussians, float]]
@@ -66,7 +66,7 @@ class Fake:
         motion: Motion | None,
         seconds: float,
         seed: int,
-        options: AttemptOptions = AS_SET,
+        options: AttemptOptions = AS_CONFIGURED,
         carried: Mapping[str, Arrays] = NOTHING,
     ) -> UpdateResult:
         self.options.append(options)
@@ -179,33 +179,33 @@ def test_nothing_is_sought_from_what_may_not_be_committed() -> None:
 
 
 def test_a_motion_that_is_not_finite_is_not_carried_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(globals(), "MOTION", replace(MOTION, rest=np.full((1, 3), np.nan)))
+    monkeypatch.setitem(globals(), "MOTION", replace(MOTION, own_shifts=np.full((1, 3), np.nan)))
     assert solve(Fake(met()), given())[0].motion is None
 
 
 def test_a_frame_that_stands_says_nothing_of_its_cameras(monkeypatch: pytest.MonkeyPatch) -> None:
     suspect = NAMES[0]
-    past = replace(PAST, rejected=1, out={**PAST.out, suspect: 2})
+    past = replace(PAST, rejected=1, frames_left_out={**PAST.frames_left_out, suspect: 2})
     fake = Fake(met())
     changed(fake, monkeypatch, lambda trace: UpdateTrace(kept=Candidate.PREVIOUS, errors=trace.errors))
     asked = replace(given(past), views=VIEWS[1:], suspects=VIEWS[:1])
     outcome, after = solve(fake, asked)
     assert (outcome.outcome, outcome.reason) == (FrameOutcome.UNCHANGED, "")
     assert (outcome.gaussians is BEFORE, outcome.motion is MOTION) == (True, True)
-    assert after == replace(past, rejected=0, behind=1)
+    assert after == replace(past, rejected=0, lagging_frames=1)
 
 
 def test_frames_that_follow_others_are_not_sought_longer() -> None:
     fake = Fake(met(LEVEL - 3))
     _, after = solve(fake, given())
     assert names(fake) == ["as set"]
-    assert after.behind == 0
+    assert after.lagging_frames == 0
 
 
 @pytest.mark.parametrize(("left", "tries"), [(-0.01, 1), (0.01, 1), (60.0, 2)])
 def test_frames_are_not_sought_longer_than_their_budget(left: float, tries: int) -> None:
     fake = Fake(met(LEVEL - 3))
-    asked = replace(given(replace(PAST, rejected=1)), end=perf_counter() + left, each=0.01)
+    asked = replace(given(replace(PAST, rejected=1)), end=perf_counter() + left, iteration_seconds=0.01)
     solve(fake, asked)
     assert len(fake.options) == tries
 
@@ -213,7 +213,7 @@ def test_frames_are_not_sought_longer_than_their_budget(left: float, tries: int)
 @pytest.mark.parametrize(("left", "tries"), [(-0.01, 1), (0.01, 1), (60.0, 2)])
 def test_what_was_lost_is_not_sought_longer_than_the_budget(left: float, tries: int) -> None:
     fake = Fake(met(LEVEL - 20), met(LEVEL))
-    outcome, _ = solve(fake, replace(given(), end=perf_counter() + left, each=0.01))
+    outcome, _ = solve(fake, replace(given(), end=perf_counter() + left, iteration_seconds=0.01))
     assert len(fake.options) == tries
     assert (not outcome.outcome.rejected) == (tries > 1)
     assert any("the budget is spent" in attempt for attempt in outcome.attempts) == (tries == 1)
@@ -253,7 +253,7 @@ def test_after_a_held_frame_half_of_the_budget_is_kept_for_what_is_sought() -> N
     now = perf_counter()
     for past, ends in ((PAST, [60.0]), (replace(PAST, rejected=1), [30.0, 60.0])):
         fake = Fake(met(LEVEL - 3), met(LEVEL))
-        solve(fake, replace(given(past), end=now + 60.0, each=0.01))
+        solve(fake, replace(given(past), end=now + 60.0, iteration_seconds=0.01))
         found = [options.stopping.end for options in fake.options if options.stopping is not None]
         assert [end - now for end in found if end is not None] == pytest.approx(ends, abs=2.0)
 
@@ -262,11 +262,11 @@ def test_after_held_frames_the_level_waits_until_it_is_met_again_but_not_for_eve
     past = replace(PAST, rejected=2)
     for number in range(1, judge.CATCH_UP + 1):
         past = solve(Fake(met(LEVEL - 3)), given(past))[1]
-        assert (past.rejected, past.behind, past.level) == (0, number, LEVEL)
+        assert (past.rejected, past.lagging_frames, past.level) == (0, number, LEVEL)
     past = solve(Fake(met(LEVEL - 3)), given(past))[1]
-    assert past.behind == 0
+    assert past.lagging_frames == 0
     assert past.level < LEVEL
-    assert solve(Fake(met(LEVEL)), given(replace(PAST, rejected=2)))[1].behind == 0
+    assert solve(Fake(met(LEVEL)), given(replace(PAST, rejected=2)))[1].lagging_frames == 0
 
 
 def test_patience_ends_and_then_it_is_taken_as_it_is() -> None:
@@ -310,7 +310,7 @@ def test_darkness_costs_no_patience_and_what_comes_after_is_caught_up_with() -> 
     assert (past.rejected, past.level) == (0, LEVEL)
     outcome, after = solve(Fake(met(LEVEL - 20)), given(past))
     assert (outcome.outcome, after.rejected) == (FrameOutcome.REJECTED_MISFIT, 1)
-    assert solve(Fake(met(LEVEL - 3)), given(past))[1].behind == 2  # its level waits
+    assert solve(Fake(met(LEVEL - 3)), given(past))[1].lagging_frames == 2  # its level waits
 
 
 def test_a_held_frame_is_told_as_it_is() -> None:
@@ -358,12 +358,14 @@ def test_bounded_axes_are_counted() -> None:
 
 def test_suspects_come_back_once_they_fit() -> None:
     suspect = NAMES[0]
-    past = replace(PAST, out={**PAST.out, suspect: 2}, places={**PAST.places, suspect: -3.0})
+    past = replace(
+        PAST, frames_left_out={**PAST.frames_left_out, suspect: 2}, camera_levels={**PAST.camera_levels, suspect: -3.0}
+    )
     others = [view for view in VIEWS if view.name != suspect]
     level = float(np.median([_shown(view) for view in others]))
     asked = replace(given(past), views=others, suspects=[view for view in VIEWS if view.name == suspect])
     _, after = solve(Fake(met(level, FITTED)), replace(asked, past=replace(asked.past, level=level)))
-    assert after.out[suspect] == 0
+    assert after.frames_left_out[suspect] == 0
 
 
 FITTED = gone(BEFORE, 0.08)
@@ -379,7 +381,7 @@ def test_a_camera_that_was_rendered_long_before_the_end_is_looked_at_again(
     fake, past = Fake(met(level, end)), replace(PAST, updates=5, level=level)
     met_early = {NAMES[0]: camera_fit(level - 9)}
     changed(fake, monkeypatch, lambda trace: replace(trace, cameras={**trace.cameras, **met_early}))
-    assert solve(fake, given(past))[1].out[NAMES[0]] == out
+    assert solve(fake, given(past))[1].frames_left_out[NAMES[0]] == out
 
 
 def test_suspects_are_looked_at_in_the_light_that_the_colours_are_in() -> None:
@@ -388,11 +390,16 @@ def test_suspects_are_looked_at_in_the_light_that_the_colours_are_in() -> None:
     images = {name: (gain * picture).round().clip(0, 255).astype(np.uint8) for name, picture in FRAME.images.items()}
     bright = FACTORY.views(replace(FRAME, images=images), {})
     level = float(np.median([_shown(view) for view in VIEWS]))
-    past = replace(PAST, out={**PAST.out, suspect: 2}, places={**PAST.places, suspect: 0.0}, level=level)
+    past = replace(
+        PAST,
+        frames_left_out={**PAST.frames_left_out, suspect: 2},
+        camera_levels={**PAST.camera_levels, suspect: 0.0},
+        level=level,
+    )
     asked = replace(given(past, exposure=gain), views=bright[1:], suspects=bright[:1])
     outcome, after = solve(Fake(met(level, FITTED)), asked)
     assert outcome.exposure == pytest.approx(gain, rel=0.03)
-    assert after.out[suspect] == 0
+    assert after.frames_left_out[suspect] == 0
 
 
 def _shown(view: TrainingView) -> float:
@@ -425,10 +432,10 @@ def test_whole_pictures_confirm_that_a_frame_stands(monkeypatch: pytest.MonkeyPa
     _, past = solve(fake, given(views=still))
     for views, stands in ((still, True), (VIEWS, False)):
         solve(fake, given(views=views, past=past))
-        confirm = fake.options[-1].confirm
-        assert confirm is not None
-        assert confirm() is stands
+        confirm_skip = fake.options[-1].confirm_skip
+        assert confirm_skip is not None
+        assert confirm_skip() is stands
     solve(fake, given(views=still))
-    confirm = fake.options[-1].confirm
-    assert confirm is not None
-    assert not confirm()  # nothing is known of a state committed before
+    confirm_skip = fake.options[-1].confirm_skip
+    assert confirm_skip is not None
+    assert not confirm_skip()  # nothing is known of a state committed before

@@ -15,7 +15,17 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
 from scas4d_core.robust import timing
 from scas4d_core.robust.outliers import Past
-from scas4d_core.robust.timing import APART, CAMERAS, FARTHEST, MAX_ERROR, OFF, Look, Looks, astuple, measure_shift
+from scas4d_core.robust.timing import (
+    APART,
+    CAMERAS,
+    FARTHEST,
+    MAX_ERROR,
+    OFF,
+    CameraTimingSums,
+    PictureTiming,
+    astuple,
+    measure_shift,
+)
 from scas4d_core.storage.history import History
 from studies.constants import all_varied
 from studies.hard_frames.footage import SyntheticFootage
@@ -35,7 +45,7 @@ def shown(moment: float, speed: float = 3.0) -> np.ndarray:
     return np.stack([0.2 + (stripe - 0.2) * inside for stripe in stripes]).astype(np.float32)
 
 
-def look(target: np.ndarray, speed: float = 3.0) -> Look:
+def look(target: np.ndarray, speed: float = 3.0) -> PictureTiming:
     found = measure_shift(target, shown(0, speed), shown(0.5, speed), shown(-0.5, speed))
     assert found is not None
     return found
@@ -74,11 +84,13 @@ def test_what_noise_hides_is_uncertain() -> None:
     assert look((shown(0.2) + noise).astype(np.float32)).variance > 100 * look(shown(0.2)).variance
 
 
-def after(looks: Mapping[float, int], way: float = 0.1, frame: float = 0.1, start: Looks | None = None) -> Looks:
-    found = start or Looks()
+def after(
+    looks: Mapping[float, int], way: float = 0.1, frame: float = 0.1, start: CameraTimingSums | None = None
+) -> CameraTimingSums:
+    found = start or CameraTimingSums()
     for offset, times in looks.items():
         for _ in range(times):
-            found = found.with_look(Look(offset, 1e-4), way, frame)
+            found = found.with_picture(PictureTiming(offset, 1e-4), way, frame)
     return found
 
 
@@ -169,7 +181,7 @@ def test_a_scene_goes_on_with_its_looks(undisturbed: tuple[Reconstruction, list[
 def test_no_state_hangs_on_it(
     undisturbed: tuple[Reconstruction, list[FrameReport]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(timing, "noted", lambda past, *_: past)
+    monkeypatch.setattr(timing, "record_timing", lambda past, *_: past)
     without = FOOTAGE.start(tmp_path / "scene")
     assert play(without, range(1, 6), APART_BY)[-1].timing == {}
     here, there = (scene.history.gaussians(5).arrays() for scene in (without, undisturbed[0]))
@@ -177,11 +189,11 @@ def test_no_state_hangs_on_it(
 
 
 class Noted:
-    """The arguments of ``timing.noted`` in one frame, to be changed."""
+    """The arguments of ``timing.record_timing`` in one frame, to be changed."""
 
     def __init__(self, scene: Reconstruction, monkeypatch: pytest.MonkeyPatch) -> None:
-        looked, found = timing.noted, list[tuple]()
-        monkeypatch.setattr(timing, "noted", lambda *given: found.append(given) or looked(*given))
+        looked, found = timing.record_timing, list[tuple]()
+        monkeypatch.setattr(timing, "record_timing", lambda *given: found.append(given) or looked(*given))
         play(scene, range(1, 2), {})  # of that one nothing is told: no motion led it
         play(scene, range(2, 3), {})
         self.given, self.looked = found[-1], looked
@@ -194,7 +206,7 @@ class Noted:
 def test_frames_and_cameras_that_are_not_believed_say_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     noted = Noted(FOOTAGE.start(tmp_path / "scene"), monkeypatch)
     past, _, result = noted.given[:3]
-    seen = [name for name, row in noted.looks().timing.items() if Looks(*row).weight]
+    seen = [name for name, row in noted.looks().timing.items() if CameraTimingSums(*row).weight]
     assert len(seen) == 2  # 60 iterations
     assert noted.looks() is not past
     for silent in (
@@ -206,7 +218,7 @@ def test_frames_and_cameras_that_are_not_believed_say_nothing(tmp_path: Path, mo
         {"trace": replace(result.trace, shown={})},  # as on a GPU
     ):
         assert noted.looks(**silent) is past
-    out = replace(past, out={**past.out, seen[0]: 1})
+    out = replace(past, frames_left_out={**past.frames_left_out, seen[0]: 1})
     assert seen[0] not in noted.looks(out).timing
     left_out = replace(result.trace, left_out={seen[1]: "it does not fit"})
     assert seen[1] not in noted.looks(trace=left_out).timing
@@ -215,14 +227,14 @@ def test_frames_and_cameras_that_are_not_believed_say_nothing(tmp_path: Path, mo
 def test_others_are_looked_at_in_each_frame(undisturbed: tuple[Reconstruction, list[FrameReport]]) -> None:
     rows = undisturbed[0]._prepared.carried.past.timing
     assert rows.keys() == set(FOOTAGE.rig.names)
-    assert min(Looks(*row).last for row in rows.values()) >= 10
+    assert min(CameraTimingSums(*row).last for row in rows.values()) >= 10
 
 
 def test_moments_move_what_moves_alone() -> None:
     one = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1, colours=[1, 0, 0])
     before = one.replace(foreground=np.float32([1, 0]))
     now = before.replace(means=before.means + np.float32([[0.2, 0, 0], [0, 0, 0]]), factors=2 * before.factors)
-    ahead, back = timing.moments(before, now)
+    ahead, back = timing.half_frame_states(before, now)
     np.testing.assert_allclose(ahead.means[0], [0.3, 0, 2], atol=1e-6)
     np.testing.assert_allclose(back.means[0], [0.1, 0, 2], atol=1e-6)
     np.testing.assert_allclose(ahead.factors[0], 2.5 * before.factors[0], atol=1e-6)

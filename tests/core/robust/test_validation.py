@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.robust.checks import BRIGHTEST, FARTHEST, FEW, LONGEST, SHRUNK, STRETCHED, axis_lengths, validated
+from scas4d_core.robust.checks import (
+    BRIGHTEST,
+    FARTHEST,
+    FEW,
+    LONGEST,
+    SHRUNK,
+    STRETCHED,
+    axis_lengths,
+    check_plausible,
+)
 from scas4d_core.update.result import UpdateResult, UpdateTrace
 from studies.hard_frames.scene import first_state, gone
 
@@ -20,7 +29,7 @@ ROW = 17
 
 
 def checked(state: Gaussians, radius: float, first: np.ndarray | None = None) -> tuple[UpdateResult, str | None]:
-    return validated(BEFORE, UpdateResult(state, None, UpdateTrace()), ROWS, radius, first)
+    return check_plausible(BEFORE, UpdateResult(state, None, UpdateTrace()), ROWS, radius, first)
 
 
 Spoil = Callable[[Gaussians], None]

@@ -25,7 +25,7 @@ def grown(seed: int, before: Gaussians, born: int = 0) -> Gaussians:
     count = len(before)
     drawn = state(seed, count + born)
     now = before.replace(**{name: getattr(drawn, name)[:count] for name in ("means", "factors", "rotations")})
-    return now.joined(drawn.rows(np.arange(count, count + born))) if born else now
+    return now.concatenate(drawn.rows(np.arange(count, count + born))) if born else now
 
 
 def fill(history: History) -> History:
@@ -159,14 +159,14 @@ def test_the_born_go_back_as_their_founders_came() -> None:
         rotations=np.tile(quaternion, (7, 1)),
     )
     born = now.rows([2, 3])
-    roots = extend_roots(first, now.joined(born).retire([1]), np.array([4, -1]))
+    roots = extend_roots(first, now.concatenate(born).retire([1]), np.array([4, -1]))
     np.testing.assert_allclose(roots.means[7], first.means[2], atol=1e-5)
     np.testing.assert_allclose(roots.factors[7], first.factors[2], atol=1e-5)
     np.testing.assert_allclose(roots.rotations[7], [1, 0, 0, 0], atol=1e-6)
     np.testing.assert_array_equal(roots.means[8], now.means[3])
     assert np.flatnonzero(roots.retired).tolist() == [1]
     # Founders that were born themselves lead on to frame 0.
-    again = extend_roots(roots, now.joined(born).joined(born).retire([1]), np.array([7, 7]))
+    again = extend_roots(roots, now.concatenate(born).concatenate(born).retire([1]), np.array([7, 7]))
     np.testing.assert_allclose(again.means[9], first.means[2], atol=1e-5)
     np.testing.assert_allclose(again.means[10], first.means[3], atol=1e-5)
 

@@ -10,8 +10,8 @@ from box_scene import make_box, make_rig, take_frame
 
 from scas4d_core.effects.appearance import camera_gain, shadows
 from scas4d_core.effects.effect import effect
-from scas4d_core.effects.presence.entering import NOBODY
-from scas4d_core.effects.switches import kept_of
+from scas4d_core.effects.presence.entering import NO_NEWBORNS
+from scas4d_core.effects.switches import committed_arrays
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.recompute import recompute
@@ -122,6 +122,6 @@ def test_a_frame_without_effects_has_none() -> None:
 
 def test_what_is_large_is_not_committed_with_each_frame() -> None:
     left = {"frames": np.zeros(9), "share": np.array(0.3)}
-    kept = kept_of({"leaving": left, "shadows": {"c0": np.zeros(3)}, "entering": NOBODY})
-    assert {name: set(own) for name, own in kept.items()} == {"leaving": {"share"}, "entering": set(NOBODY)}
-    assert effect("shadows").kept == ()
+    kept = committed_arrays({"leaving": left, "shadows": {"c0": np.zeros(3)}, "entering": NO_NEWBORNS})
+    assert {name: set(own) for name, own in kept.items()} == {"leaving": {"share"}, "entering": set(NO_NEWBORNS)}
+    assert effect("shadows").committed_arrays == ()

@@ -37,7 +37,7 @@ def filled(folder: Path, count: int = COUNT) -> History:
         state = state.replace(means=state.means + rng.normal(0, 0.01, state.means.shape).astype(np.float32))
         if index == BORN_AT:
             born = Gaussians.of_points(rng.uniform(-1, 1, (20, 3)), 0.02)
-            state = state.joined(born.replace(ids=np.full(20, UNBORN)))
+            state = state.concatenate(born.replace(ids=np.full(20, UNBORN)))
         if index == RETIRED_AT:
             state = state.retire([4, 305])
         history.append(index, index / 10, state, report={"frame": index, "loss": [0.1 * index]})

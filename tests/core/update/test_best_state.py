@@ -49,7 +49,7 @@ class Probes:
     def errors(self, *, moved: bool, learnt: bool) -> dict[str, float]:
         return self._found(self._small, moved)
 
-    def whole_errors(self, *, moved: bool, learnt: bool) -> dict[str, float]:
+    def full_size_errors(self, *, moved: bool, learnt: bool) -> dict[str, float]:
         self.asked += 1
         return self._found(self._whole, moved)
 
@@ -66,7 +66,7 @@ def ended(probes: Probes, motion: Motion | None = None, at: float = WAY) -> tupl
     engine.load_state(BOX)
     best = BestState(probes, engine, HIERARCHY, motion, 1.0, 0.0)  # type: ignore[arg-type]
     best.start()
-    tables = Tables.still(HIERARCHY)
+    tables = Tables.identity(HIERARCHY)
     tables.clusters[0][:, 3] = at
     engine.set_tables(tables)
     return best, engine
@@ -111,20 +111,20 @@ def test_an_end_that_is_not_finite_is_left() -> None:
 
 
 @pytest.mark.parametrize(
-    ("enough", "confirmed", "stands"),
+    ("skip_below", "confirmed", "stands"),
     [(0.02, True, True), (0.02, False, False), (0.02, None, True), (0.001, True, False)],
 )
-def test_a_frame_stands_where_it_is_confirmed(enough: float, confirmed: bool | None, stands: bool) -> None:
+def test_a_frame_stands_where_it_is_confirmed(skip_below: float, confirmed: bool | None, stands: bool) -> None:
     asked = []
 
-    def confirm() -> bool:
+    def confirm_skip() -> bool:
         asked.append(True)
         return bool(confirmed)
 
     best, _ = ended(Probes(blind, sharp))
-    assert best.stands({"c0": enough}, None if confirmed is None else confirm) is stands
-    assert bool(asked) is (enough > 0.01 and confirmed is not None)  # whole pictures are rendered where it matters
-    assert not best.stands(None, confirm)
+    assert best.can_skip({"c0": skip_below}, None if confirmed is None else confirm_skip) is stands
+    assert bool(asked) is (skip_below > 0.01 and confirmed is not None)  # whole pictures are rendered where it matters
+    assert not best.can_skip(None, confirm_skip)
 
 
 def test_the_motion_before_is_taken_where_whole_pictures_prefer_it() -> None:

@@ -190,7 +190,7 @@ class Iteration:
             self.gradients.append(gradients.copy())
             optimizer._parameters[:] = self.parameters[table]
 
-        evaluate, neighbour_losses = CpuRenderer.evaluate, CpuDeformation.neighbour_losses
+        evaluate, neighbour_losses = CpuRenderer.forward_backward, CpuDeformation.neighbour_losses
 
         def rendered(loss: CpuRenderer, *given: Any) -> Any:
             seen.append(RIG.names.index(given[4].name))
@@ -201,7 +201,7 @@ class Iteration:
             return neighbour_losses(deformation, sample, *given)
 
         monkeypatch.setattr(Adam, "step", step)
-        monkeypatch.setattr(CpuRenderer, "evaluate", rendered)
+        monkeypatch.setattr(CpuRenderer, "forward_backward", rendered)
         monkeypatch.setattr(CpuDeformation, "neighbour_losses", looked_at)
         self.near = updater.plan.limits.near
         self.loss = updater.run(BEFORE, views, None, 1.0, seed=9).trace.losses[1]
@@ -309,7 +309,7 @@ def test_the_reported_loss_is_that_of_the_twin(masks: bool, views: int, monkeypa
 def test_several_views_are_a_mean_and_one_is_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     """The mean of a view and itself is that view to the last bit, and so is the whole update."""
     given: list[tuple[bool, float]] = []
-    inside, evaluate = CpuEngine._pictures, CpuRenderer.evaluate
+    inside, evaluate = CpuEngine._pictures, CpuRenderer.forward_backward
     last: list[Any] = []
 
     def rendered(picture: CpuRenderer, *arguments: Any) -> Any:
@@ -321,7 +321,7 @@ def test_several_views_are_a_mean_and_one_is_as_it_is(monkeypatch: pytest.Monkey
         given.append((gradients is last[0], loss - last[1]))
         return loss, gradients
 
-    monkeypatch.setattr(CpuRenderer, "evaluate", rendered)
+    monkeypatch.setattr(CpuRenderer, "forward_backward", rendered)
     monkeypatch.setattr(CpuEngine, "_pictures", pictures)
     found = []
     for count in (1, 2, 4):
@@ -411,7 +411,7 @@ def test_a_shift_of_everything_is_found_by_clusters() -> None:
     layers = zip(state.motion.shifts, updater.hierarchy.labels, strict=True)
     by_clusters = np.sum([shifts[labels] for shifts, labels in layers], axis=0)
     assert np.median(np.linalg.norm(by_clusters - SHIFT, axis=1)) < 0.15 * np.linalg.norm(SHIFT)
-    assert np.median(np.linalg.norm(state.motion.rest, axis=1)) < 0.1 * np.linalg.norm(SHIFT)
+    assert np.median(np.linalg.norm(state.motion.own_shifts, axis=1)) < 0.1 * np.linalg.norm(SHIFT)
 
 
 def test_deformation_starts_from_what_it_is_given() -> None:

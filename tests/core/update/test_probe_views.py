@@ -25,13 +25,13 @@ def probes(shown: Gaussians) -> tuple[ProbeViews, CpuEngine, list[int]]:
     factory, widths, built = ViewFactory(RIG), list[int](), register_effects(builder())
     engine = CpuEngine()
     engine.bind(built.plan, structure_of(built.hierarchy, None, BOX))
-    measure = engine.renderer.measure
+    measure = engine.renderer.forward
 
     def measured(*given: object) -> None:
         widths.append(given[-1].camera.width)  # type: ignore[attr-defined]
         measure(*given)  # type: ignore[arg-type]
 
-    engine.renderer.measure = measured  # type: ignore[method-assign]
+    engine.renderer.forward = measured  # type: ignore[method-assign]
     views = factory.views(take_frame(1, 1.0, shown, RIG, False), {})
     found = ProbeViews(factory, engine, views)
     engine.load_views(views, found.views)

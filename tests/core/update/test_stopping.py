@@ -9,7 +9,7 @@ from scas4d_core.update.schedule import (
     COOLING,
     FOR_BIRTHS,
     LOOK_EVERY,
-    MOST_TIMED,
+    MAX_TIMED,
     PROBE,
     RATE,
     Stopping,
@@ -34,8 +34,8 @@ def iterate(pace: Stopping, clock: Clock, each: float, falls: float = 1.0) -> in
         clock.now += each
         done += 1
         error *= falls
-        if pace.looks(done):
-            pace.saw(done, error)
+        if pace.needs_error(done):
+            pace.record_error(done, error)
     return done
 
 
@@ -51,7 +51,7 @@ def test_counted_is_told_once() -> None:
 def test_timed_ends_in_time_whatever_was_believed(each: float, believed: float | None) -> None:
     clock = Clock()
     end = clock.now + 1.0
-    count = iterate(Stopping(end=end, each=believed, clock=clock), clock, each)
+    count = iterate(Stopping(end=end, iteration_seconds=believed, clock=clock), clock, each)
     assert clock.now <= end + 1e-9
     if believed is None or believed <= 0.1:
         assert count >= 0.9 / each - 1
@@ -59,7 +59,7 @@ def test_timed_ends_in_time_whatever_was_believed(each: float, believed: float |
 
 def test_timed_slows_down_with_the_machine() -> None:
     clock = Clock()
-    pace, end, done = Stopping(end=clock.now + 1.0, each=0.01, clock=clock), clock.now + 1.0, 0
+    pace, end, done = Stopping(end=clock.now + 1.0, iteration_seconds=0.01, clock=clock), clock.now + 1.0, 0
     while done < pace.planned(done):
         clock.now += 0.01 if done < 30 else 0.04
         done += 1
@@ -69,8 +69,8 @@ def test_timed_slows_down_with_the_machine() -> None:
 
 def test_timed_takes_one_iteration_even_without_time_and_never_too_many() -> None:
     clock = Clock()
-    assert iterate(Stopping(end=clock.now - 5, each=0.01, clock=clock), clock, 0.01) == 1
-    assert Stopping(end=clock.now + 1e9, each=1e-6, clock=clock).planned(0) == MOST_TIMED
+    assert iterate(Stopping(end=clock.now - 5, iteration_seconds=0.01, clock=clock), clock, 0.01) == 1
+    assert Stopping(end=clock.now + 1e9, iteration_seconds=1e-6, clock=clock).planned(0) == MAX_TIMED
     assert PROBE >= 1
 
 
@@ -89,7 +89,7 @@ def test_until_met_waits_for_what_begins_late() -> None:
 
 def test_what_was_decided_is_told() -> None:
     clock = Clock()
-    pace = Stopping(end=clock.now + 1.0, each=0.02, gain=0.05, clock=clock)
+    pace = Stopping(end=clock.now + 1.0, iteration_seconds=0.02, gain=0.05, clock=clock)
     count = iterate(pace, clock, 0.013)
     assert [first for first, _ in pace.planned_so_far] == sorted({first for first, _ in pace.planned_so_far})
     assert pace.planned_so_far[-1][1] == count
@@ -99,28 +99,28 @@ def learn(
     budget: TimeBudget, iterations: int, each: float, start: float = 0.0, end: float = 0.0, commit: float = 0.02
 ) -> None:
     moments = [start + (k + 1) * each for k in range(iterations)]
-    budget.learn(moments, {"start": start, "end": end}, commit)
+    budget.record_frame(moments, {"start": start, "end": end}, commit)
 
 
 def test_a_budget_learns_what_an_iteration_and_the_end_take() -> None:
     budget = TimeBudget(500.0)
     assert budget.end(10.0) == pytest.approx(10.5 - AFTER_S)
     learn(budget, 20, 0.01, start=0.1, end=0.03, commit=0.02)
-    assert budget.each == pytest.approx(0.01)
+    assert budget.iteration_seconds == pytest.approx(0.01)
     assert budget.after == pytest.approx(0.05)
     learn(budget, 20, 0.02, start=0.1, end=0.03, commit=0.12)
-    assert budget.each == pytest.approx(0.01 + RATE * 0.01)
+    assert budget.iteration_seconds == pytest.approx(0.01 + RATE * 0.01)
     assert budget.after == pytest.approx(0.05 + RATE * 0.10)
-    before = (budget.each, budget.after)
+    before = (budget.iteration_seconds, budget.after)
     learn(budget, 0, 0.0, commit=9.0)
-    assert (budget.each, budget.after) == before
+    assert (budget.iteration_seconds, budget.after) == before
 
 
 def test_one_slow_frame_costs_the_next_one_its_iterations_but_no_more() -> None:
     budget = TimeBudget(500.0)
     for each in (0.01, 30.0, 0.01):
         learn(budget, 20, each, commit=0.02)
-    assert budget.each == pytest.approx(0.01)
+    assert budget.iteration_seconds == pytest.approx(0.01)
 
 
 def test_without_a_budget_there_is_no_end() -> None:

@@ -28,7 +28,7 @@ class Planned(Effect):
     def add_and_retire_gaussians(self, seen: FrameObservation) -> UpdateResult:
         return type(self).plan(seen)
 
-    def join(self, builder: object) -> None:
+    def register(self, builder: object) -> None:
         """It has no part."""
 
 
@@ -60,7 +60,7 @@ def plan(
             rows, parents = (births or {})[seen.index]
             born = state.rows(rows)
             born = born.replace(means=born.means + np.float32([0.01, 0, 0]))
-            state, parents = state.joined(born), np.array(parents, np.int64)
+            state, parents = state.concatenate(born), np.array(parents, np.int64)
         if seen.index in (retired or {}):
             state = state.retire((retired or {})[seen.index])
         if seen.index in (revived or {}):

@@ -69,7 +69,7 @@ def scene(*things: Gaussians, hole: float = 0.0) -> Gaussians:
     """The floor with some things, ids in order."""
     state = floor(hole)
     for thing in things:
-        state = state.joined(thing)
+        state = state.concatenate(thing)
     return state.replace(ids=np.arange(len(state)))
 
 

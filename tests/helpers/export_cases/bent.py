@@ -34,7 +34,7 @@ def states(seed=3):
             state = _bent(state, draw)
         if number == 2:
             more = Gaussians.of_points(draw.normal(size=(LATER, 3)) * 0.4, radius=0.05)
-            state = state.joined(more)
+            state = state.concatenate(more)
             state = state.replace(ids=np.arange(len(state), dtype=np.int64) * 3)
         elif not number:
             state = state.replace(ids=np.arange(len(state), dtype=np.int64) * 3)

@@ -23,7 +23,7 @@ def renderer(tmp_path):
     history = History(tmp_path / "states")
     first = state(0, 40)
     history.append(0, 0.0, first.replace(foreground=np.ones(40, np.float32)))
-    history.append(3, 0.1, history.newest.joined(history.newest.rows([4, 5])).retire([7]))
+    history.append(3, 0.1, history.newest.concatenate(history.newest.rows([4, 5])).retire([7]))
     history.append(5, 0.2, history.newest.revive([7]).retire([41]))
     return Renderer(SceneSpec(SceneFolder(tmp_path), make_rig(), Settings()))
 

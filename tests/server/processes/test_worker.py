@@ -29,7 +29,7 @@ def test_kernels_are_compiled_before_they_are_called(tmp_path, monkeypatch, poin
         asked.append((set(wanted), set(then)))
         on_progress(1, 2)
 
-    monkeypatch.setattr("scas4d_core.warm_up.warm_up_elsewhere", elsewhere)
+    monkeypatch.setattr("scas4d_core.warm_up.compile_in_processes", elsewhere)
     monkeypatch.setattr("scas4d_core.reconstruction.Reconstruction", fakes.FakeReconstruction)
     settings = preset("scas4d", {"update": {"covariance": covariance}})
     spec = SceneSpec(SceneFolder(tmp_path), make_rig(), settings)

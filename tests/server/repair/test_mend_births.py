@@ -16,7 +16,7 @@ from server.repair.repairs import mend, mend_at_start
 def history(tmp_path):
     history = History(tmp_path)
     history.append(0, 0.0, state(0))
-    history.append(1, 0.1, history.newest.joined(state(1, 2)))
+    history.append(1, 0.1, history.newest.concatenate(state(1, 2)))
     history.append(2, 0.2, history.newest)
     return history
 

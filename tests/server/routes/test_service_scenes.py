@@ -64,7 +64,7 @@ def test_the_status_has_the_effects_before_any_frame(http):
         "rotation": (True, False),
         "floor": (False, False),
     }
-    assert effects["floor"]["says"].endswith(".")
+    assert effects["floor"]["description"].endswith(".")
     http.delete(created.headers["Location"])
 
 

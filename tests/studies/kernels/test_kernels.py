@@ -30,7 +30,7 @@ def test_pairs_are_those_that_the_rasterizer_blends():
             box.means, box.factors, box.opacities, features, CameraArrays.of(camera), np.zeros(4, np.float32)
         )
         pairs, lanes, light = blended_pairs(rasterizer.splats, rasterizer.counts, camera.width, camera.height)
-        np.testing.assert_allclose(light, picture.rest, atol=1e-6)
+        np.testing.assert_allclose(light, picture.transmittance, atol=1e-6)
 
         y, x = np.mgrid[: camera.height, : camera.width]
         left, finished, expected = np.ones(x.shape), np.zeros(x.shape, bool), 0

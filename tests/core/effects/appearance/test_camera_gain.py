@@ -10,10 +10,10 @@ from box_scene import make_box, make_rig, moved, take_frame
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.captures.frame import Frame
-from scas4d_core.effects.appearance.camera_gain import NAME, POWER, known_gains
+from scas4d_core.effects.appearance.camera_gain import NAME, POWER, current_exposures
 from scas4d_core.effects.switches import register_effects
 from scas4d_core.engines.cpu.engine import CpuEngine
-from scas4d_core.engines.exposure import FOOT, exposure_of, measured_gain
+from scas4d_core.engines.exposure import FOOT, gain_to_exposure, measured_gain
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.preparation import SMALLEST_CLUSTER
 from scas4d_core.reconstruction import Reconstruction
@@ -58,7 +58,7 @@ def started(mode: str, gains: np.ndarray = GAINS, told: bool = False) -> Reconst
     """The box before any update; ``told``: frame 0 has found the gains, about."""
     settings = Settings.model_validate({"update": {"clusters": (2, 12), "iterations": 40}, "effects": {NAME: mode}})
     about = np.round(gains ** (1 / POWER), 1).astype(np.float32) + np.float32(0.01)
-    exposures = {name: exposure_of(gain) for name, gain in zip(RIG.names, about, strict=True)} if told else {}
+    exposures = {name: gain_to_exposure(gain) for name, gain in zip(RIG.names, about, strict=True)} if told else {}
     return Reconstruction.start(RIG, shot(0, gains), settings, static=StaticResult(BOX, exposures, []))
 
 
@@ -111,8 +111,8 @@ def test_off_changes_no_bit() -> None:
 
 def test_gains_that_were_found_are_those_of_the_pictures() -> None:
     given = {"c0": np.array([[1.1, 0.0]] * 3, np.float32)}
-    assert known_gains(given, {}, RIG.names) is given
-    exposures = known_gains(given, {NAME: {"gains": np.full((6, 3), 1.05, np.float32)}}, RIG.names)
+    assert current_exposures(given, {}, RIG.names) is given
+    exposures = current_exposures(given, {NAME: {"gains": np.full((6, 3), 1.05, np.float32)}}, RIG.names)
     assert exposures["c3"] == pytest.approx(np.array([[1.05, 0.05 * FOOT]] * 3), abs=1e-6)
 
 
@@ -135,7 +135,7 @@ def test_an_attempt_starts_from_the_exposures_of_the_frame_and_not_from_those_of
     assert all((view.exposure[:3] == [1, 0]).all() for view in views)
     np.testing.assert_array_equal(first.carried[NAME]["gains"], second.carried[NAME]["gains"])
     for view, gain in zip(first.views, first.carried[NAME]["gains"], strict=True):
-        np.testing.assert_array_equal(view.exposure[:3], exposure_of(gain))
+        np.testing.assert_array_equal(view.exposure[:3], gain_to_exposure(gain))
         assert not (view.exposure[:3] == [1, 0]).all()
 
 

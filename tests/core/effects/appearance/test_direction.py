@@ -107,7 +107,7 @@ def test_the_surface_of_a_rough_body_in_a_haze_is_the_haze(monkeypatch: pytest.M
     depth = np.random.default_rng(2).uniform(0.8, 0.98, (COUNT, 1)).astype(np.float32)
     body = ball.replace(means=depth * ball.means, factors=np.tile(np.float32(0.012) * np.eye(3), (COUNT, 1, 1)))
     haze = ball.replace(opacities=np.full(COUNT, 0.15, np.float32))
-    state = body.replace(factors=body.factors.astype(np.float32)).joined(haze)
+    state = body.replace(factors=body.factors.astype(np.float32)).concatenate(haze)
     views = ViewFactory(rig()).views(frame(state), {})
 
     def median_angle() -> float:
@@ -149,7 +149,7 @@ def test_normals_turn_as_fast_whatever_the_strength_that_frame_0_came_out_with()
         gloss, environment = np.float32(factor) * state.gloss, state.environment.copy()
         environment[: CELLS + 1] /= np.float32(factor)  # the sheen as well
         shading = GlossShading.fresh(gloss.copy(), state.means, environment)
-        shading.saw(state.means, without_turn(COUNT), 0 * state.colours, camera, pull.copy())
+        shading.shade_backward(state.means, without_turn(COUNT), 0 * state.colours, camera, pull.copy())
         shading.step()
         turned.append((shading.gloss - gloss) / factor)
     assert gloss_rate(1e-3, GLOSS * state.means / RADIUS) == pytest.approx(1e-3)
@@ -164,7 +164,7 @@ def test_what_is_seen_from_everywhere_is_colour_and_not_environment() -> None:
     shading, camera = GlossShading.fresh(state.gloss.copy(), state.means), CameraArrays.of(rig().cameras[0])
     for _ in range(5):
         pull = rng.normal(1, 1, (COUNT, 4)).astype(np.float32)
-        shading.saw(state.means, without_turn(COUNT), state.colours, camera, pull)
+        shading.shade_backward(state.means, without_turn(COUNT), state.colours, camera, pull)
         shading.step()
     cells = shading.environment[:CELLS]
     assert np.abs(cells).max() > 0.01
@@ -248,7 +248,7 @@ def test_splat_files_have_harmonics_of_it(tmp_path: Path) -> None:
 
 def test_those_born_later_are_dull() -> None:
     state = sphere()
-    grown = state.joined(Gaussians.of_points(np.zeros((3, 3)), 0.02))
+    grown = state.concatenate(Gaussians.of_points(np.zeros((3, 3)), 0.02))
     assert grown.gloss is not None
     assert len(grown.gloss) == COUNT
     seen = colours_seen(grown, CameraArrays.of(rig().cameras[0]))

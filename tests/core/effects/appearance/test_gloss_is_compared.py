@@ -7,8 +7,8 @@ import pytest
 from effect_cases.glossy_ball import COUNT, frame, rig, sphere
 
 from scas4d_core.effects.evidence import FitTime
-from scas4d_core.effects.presence.growing import settled
-from scas4d_core.effects.presence.novelty import novelties
+from scas4d_core.effects.presence.newborn_fit import refine_newborns
+from scas4d_core.effects.presence.novelty import measure_novelty
 from scas4d_core.effects.switches import register_effects
 from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.cpu.renderer import CpuRenderer
@@ -17,8 +17,8 @@ from scas4d_core.engines.views import TrainingView
 from scas4d_core.frame_outcome import Candidate
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.preparation import SMALLEST_CLUSTER
-from scas4d_core.robust.checks import gain_of
-from scas4d_core.robust.relocation import find_jump, shifted
+from scas4d_core.robust.checks import measure_light_gain
+from scas4d_core.robust.relocation import find_jump, shift_moving
 from scas4d_core.robust.solve_frame import FrameSolver
 from scas4d_core.settings import SceneSettings, UpdateSettings
 from scas4d_core.structure.hierarchy import build_hierarchy
@@ -92,7 +92,7 @@ def test_a_candidate_is_seen_with_its_normals_turned() -> None:
     best = BestState(probes, engine, hierarchy, None, 1.0, 0.5)
     best.start()
     still = best.error()
-    tables = Tables.still(hierarchy)
+    tables = Tables.identity(hierarchy)
     tables.clusters[0][:, :3] = [0.0, 0.4, 0.0]
     engine.set_tables(tables)
     turned = best.error()
@@ -104,37 +104,37 @@ def test_a_candidate_is_seen_with_its_normals_turned() -> None:
 
 def test_cameras_that_are_looked_at_again_see_the_gloss() -> None:
     solver = FrameSolver(None, FACTORY, RENDERER, SETTINGS)  # type: ignore[arg-type]
-    seen, plain = solver._measured(views(), BALL), solver._measured(views(), PLAIN)
+    seen, plain = solver._psnr_by_camera(views(), BALL), solver._psnr_by_camera(views(), PLAIN)
     assert min(seen.values()) > max(plain.values())
     assert min(seen.values()) > 40
 
 
 def test_the_light_is_not_brighter_by_what_is_mirrored() -> None:
-    assert gain_of(RENDERER, BALL, views()) == pytest.approx(1.0, abs=0.005)
-    assert gain_of(RENDERER, PLAIN, views()) != pytest.approx(1.0, abs=0.02)
+    assert measure_light_gain(RENDERER, BALL, views()) == pytest.approx(1.0, abs=0.005)
+    assert measure_light_gain(RENDERER, PLAIN, views()) != pytest.approx(1.0, abs=0.02)
 
 
 def test_what_stands_is_not_taken_for_what_jumped_by_its_gloss() -> None:
     """A dull thing jumps above a glossy one that stands, whose highlights are no pixels that differ."""
     thing = Gaussians.of_points(0.1 * PLAIN.means[::10] + np.float32([0, -0.32, 0]), 0.02, [0.2, 0.9, 0.2])
-    state = BALL.replace(foreground=np.zeros(COUNT, np.float32)).joined(thing)
+    state = BALL.replace(foreground=np.zeros(COUNT, np.float32)).concatenate(thing)
     way = np.array([0.1, 0.0, 0.05])
-    jumped = find_jump(state, views(shifted(state, way)), RENDERER, rig())
+    jumped = find_jump(state, views(shift_moving(state, way)), RENDERER, rig())
     assert jumped is not None
     np.testing.assert_allclose(jumped, way, atol=0.02)
 
 
 def test_a_glossy_thing_has_nothing_new() -> None:
-    said = novelties(BALL.replace(foreground=np.zeros(COUNT, np.float32)), BALL.colours, views(), rig(), RENDERER)
+    said = measure_novelty(BALL.replace(foreground=np.zeros(COUNT, np.float32)), BALL.colours, views(), rig(), RENDERER)
     assert sum(int(one.new.sum()) for one in said) == 0
     assert max(float(one.error.max()) for one in said) < 3e-3
 
 
 def test_what_is_glossy_and_came_back_is_not_settled() -> None:
-    grown = BALL.joined(Gaussians.of_points(BALL.means[:5] + np.float32(0.02), 0.01))
+    grown = BALL.concatenate(Gaussians.of_points(BALL.means[:5] + np.float32(0.02), 0.01))
     rng = np.random.default_rng(0)
     rows = np.array([3, 4, COUNT + 1])
-    after = settled(grown, rows, views(), rig(), RENDERER, rng, FitTime())
+    after = refine_newborns(grown, rows, views(), rig(), RENDERER, rng, FitTime())
     assert np.array_equal(after.means[:COUNT], grown.means[:COUNT])
     assert not np.array_equal(after.means[COUNT + 1], grown.means[COUNT + 1])
-    assert settled(grown, rows[:2], views(), rig(), RENDERER, rng, FitTime()) is grown
+    assert refine_newborns(grown, rows[:2], views(), rig(), RENDERER, rng, FitTime()) is grown

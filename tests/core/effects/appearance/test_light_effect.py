@@ -8,7 +8,7 @@ from box_scene import MOVING, make_box, make_rig, take_frame
 from effect_cases import builder, same, updated
 
 from scas4d_core.effects.appearance.light import change_of_light, orientation_and_place
-from scas4d_core.effects.switches import contradictions, first_switches, names_on, register_effects
+from scas4d_core.effects.switches import find_contradictions, first_switches, names_on, register_effects
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.reconstruction import Reconstruction
@@ -51,18 +51,18 @@ def test_colours_are_freer_while_the_light_changes() -> None:
     colours = register_effects(builder(), ["moving_colour", "static_colour", "light"]).plan.colours
     rates = Rates.of(UpdateSettings(rate_colour=0.002, rate_static_colour=0.01), 2, 4.0)
     assert colours is not None
-    assert rates.of_colours(colours) == (FASTER_IN_CHANGING_LIGHT * 0.01, FASTER_IN_CHANGING_LIGHT * 0.01)
+    assert rates.colour_rates(colours) == (FASTER_IN_CHANGING_LIGHT * 0.01, FASTER_IN_CHANGING_LIGHT * 0.01)
     colours.changing_light = False
-    assert rates.of_colours(colours) == (0.002, 0.01)
+    assert rates.colour_rates(colours) == (0.002, 0.01)
     colours.moving = False
-    assert rates.of_colours(colours) == (0.0, 0.01)
+    assert rates.colour_rates(colours) == (0.0, 0.01)
 
 
 def test_it_frees_no_colours_that_are_held() -> None:
     usual = [name for name in names_on(first_switches(Settings(), 0)) if "colour" not in name and name != "shading"]
     assert same(updated(usual), updated([*usual, "light"]))
     settings = Settings.model_validate({"update": {"rate_colour": 0}, "effects": {"light": "on"}})
-    assert [name for name, *_ in contradictions(settings)] == ["light"]
+    assert [name for name, *_ in find_contradictions(settings)] == ["light"]
 
 
 def followed(mode: str, lamp: float) -> tuple[float, Reconstruction]:

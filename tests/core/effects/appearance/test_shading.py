@@ -58,13 +58,13 @@ def test_what_turns_out_of_the_light_is_followed_and_its_motion_is_no_worse() ->
 
 
 def test_it_is_on_unless_it_is_pinned_or_the_colours_are_held() -> None:
-    from scas4d_core.effects.switches import contradictions, first_switches
+    from scas4d_core.effects.switches import find_contradictions, first_switches
 
     assert first_switches(Settings(), 0)["shading"].on
     held = Settings.model_validate({"update": {"rate_colour": 0}})
     assert not first_switches(held, 0)["shading"].on
     pinned = Settings.model_validate({"update": {"rate_colour": 0}, "effects": {"shading": "on"}})
-    assert [name for name, *_ in contradictions(pinned)] == ["shading"]
+    assert [name for name, *_ in find_contradictions(pinned)] == ["shading"]
 
 
 @pytest.mark.parametrize(

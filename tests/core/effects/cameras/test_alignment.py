@@ -11,15 +11,15 @@ from scipy.linalg import expm
 from scas4d_core.cameras import Camera
 from scas4d_core.effects.cameras.alignment import (
     adjoint,
+    align_pixels,
     equations,
     flow,
-    in_pixels,
-    motion_of,
-    offset_of,
-    pictures,
-    solved,
+    pixel_offset,
+    solve_twist,
     turn_equations,
+    turn_from_pixels,
     twist_equations,
+    twist_to_matrix,
 )
 
 LENS = np.array([210.0, 190.0, 60.0, 50.0, 120.0, 96.0], np.float32)
@@ -49,7 +49,9 @@ def test_the_flow_is_the_derivative_of_the_projection() -> None:
     for number in range(6):
         way = np.zeros(6)
         way[number] = 1e-6
-        ahead, back = (replace(CAMERA, world_to_camera=motion_of(sign * way)).project(points)[0] for sign in (1, -1))
+        ahead, back = (
+            replace(CAMERA, world_to_camera=twist_to_matrix(sign * way)).project(points)[0] for sign in (1, -1)
+        )
         np.testing.assert_allclose(told[:, number], (ahead - back).T / 2e-6, rtol=1e-6, atol=1e-5)
 
 
@@ -59,8 +61,8 @@ def test_minus_slope_times_flow_is_the_derivative_of_the_picture(number: int) ->
     shown, depth = seen_by(np.eye(4))
     way = np.zeros(6)
     way[number] = 1e-5
-    change = (seen_by(motion_of(way))[0] - seen_by(motion_of(-way))[0]) / 2e-5
-    told = pictures(shown.astype(np.float32), shown.astype(np.float32))
+    change = (seen_by(twist_to_matrix(way))[0] - seen_by(twist_to_matrix(-way))[0]) / 2e-5
+    told = align_pixels(shown.astype(np.float32), shown.astype(np.float32))
     assert told is not None
     one = told._replace(target=change.reshape(3, -1)[:, told.pixels] * 1e-4, shown=np.zeros_like(told.shown))
     moved = flow(LENS, told.places, depth.reshape(-1)[told.pixels])
@@ -71,13 +73,13 @@ def test_minus_slope_times_flow_is_the_derivative_of_the_picture(number: int) ->
 
 def test_a_twist_is_found() -> None:
     twist = np.array([0.008, -0.005, 0.01, 0.004, -0.006, 0.01])
-    target, _ = seen_by(motion_of(twist))
+    target, _ = seen_by(twist_to_matrix(twist))
     found = np.zeros(6)
     for _ in range(6):
-        shown, depth = seen_by(motion_of(found))
-        told = pictures(target.astype(np.float32), shown.astype(np.float32))
+        shown, depth = seen_by(twist_to_matrix(found))
+        told = align_pixels(target.astype(np.float32), shown.astype(np.float32))
         assert told is not None
-        found = found + solved(twist_equations(LENS, told, depth.astype(np.float32)), LENS, found)
+        found = found + solve_twist(twist_equations(LENS, told, depth.astype(np.float32)), LENS, found)
     corners = flow(LENS, np.array([[10, 60, 110.0], [80, 50, 5.0]]), 3.0)
     off = np.einsum("dkp,k->dp", corners, found - twist)
     assert np.abs(np.einsum("dkp,k->dp", corners, twist)).max() > 1  # pixels
@@ -87,10 +89,10 @@ def test_a_twist_is_found() -> None:
 @pytest.mark.parametrize("every", [1, 2])
 def test_a_turn_is_found_from_a_thinned_rendering_and_without_depth(every: int) -> None:
     pixels = np.array([0.4, -0.3, 0.25])
-    twist = np.concatenate([np.zeros(3), in_pixels(LENS) @ pixels])
-    np.testing.assert_allclose(offset_of(LENS, twist, 3.0), pixels, atol=0.02)
-    target, shown = (seen_by(motion_of(way))[0].astype(np.float32) for way in (twist, np.zeros(6)))
-    told = pictures(target, shown[:, ::every, ::every], every)
+    twist = np.concatenate([np.zeros(3), turn_from_pixels(LENS) @ pixels])
+    np.testing.assert_allclose(pixel_offset(LENS, twist, 3.0), pixels, atol=0.02)
+    target, shown = (seen_by(twist_to_matrix(way))[0].astype(np.float32) for way in (twist, np.zeros(6)))
+    told = align_pixels(target, shown[:, ::every, ::every], every)
     assert told is not None
     one = turn_equations(LENS, told)
     np.testing.assert_allclose(np.linalg.solve(one.matrix, one.vector), pixels, atol=0.04)
@@ -98,13 +100,15 @@ def test_a_turn_is_found_from_a_thinned_rendering_and_without_depth(every: int) 
 
 def test_a_bare_wall_tells_nothing() -> None:
     wall = np.full((3, 40, 40), 0.5, np.float32)
-    assert pictures(wall, wall) is None
+    assert align_pixels(wall, wall) is None
 
 
 def test_a_thing_in_the_way_weighs_little() -> None:
-    target, shown = (seen_by(motion_of(np.array([0, 0, 0, 0, way, 0])))[0].astype(np.float32) for way in (0.002, 0))
+    target, shown = (
+        seen_by(twist_to_matrix(np.array([0, 0, 0, 0, way, 0])))[0].astype(np.float32) for way in (0.002, 0)
+    )
     target[:, 30:50, 40:70] = 1.0
-    told = pictures(target, shown)
+    told = align_pixels(target, shown)
     assert told is not None
     one = turn_equations(LENS, told)
     np.testing.assert_allclose(np.linalg.solve(one.matrix, one.vector), [0.42, 0, 0], atol=0.06)
@@ -116,9 +120,9 @@ def test_the_exponential_is_that_of_the_matrix(size: float) -> None:
     generator = np.zeros((4, 4))
     x, y, z = twist[3:]
     generator[:3, :3], generator[:3, 3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]], twist[:3]
-    np.testing.assert_allclose(motion_of(twist), expm(generator), atol=1e-12)
+    np.testing.assert_allclose(twist_to_matrix(twist), expm(generator), atol=1e-12)
 
 
 def test_the_adjoint_carries_a_twist_through_a_pose() -> None:
-    pose, twist = motion_of(RNG.normal(size=6)), RNG.normal(size=6)
-    np.testing.assert_allclose(motion_of(adjoint(pose) @ twist) @ pose, pose @ motion_of(twist), atol=1e-12)
+    pose, twist = twist_to_matrix(RNG.normal(size=6)), RNG.normal(size=6)
+    np.testing.assert_allclose(twist_to_matrix(adjoint(pose) @ twist) @ pose, pose @ twist_to_matrix(twist), atol=1e-12)

@@ -13,10 +13,26 @@ from box_scene import make_box, make_rig, moved, take_frame
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Rig
-from scas4d_core.effects.cameras.alignment import Equations, adjoint, in_pixels, motion_of, of_the_world, offset_of
-from scas4d_core.effects.cameras.pose_drift import LEAST, NAME, TURN, Poses, bounded, centred, posed, stepped
+from scas4d_core.effects.cameras.alignment import (
+    Equations,
+    adjoint,
+    pixel_offset,
+    to_camera_twist,
+    turn_from_pixels,
+    twist_to_matrix,
+)
+from scas4d_core.effects.cameras.pose_drift import (
+    LEAST,
+    NAME,
+    TURN,
+    Poses,
+    limit_twist,
+    remove_common_motion,
+    rig_with_drift,
+    step_twists,
+)
 from scas4d_core.effects.effect import effect
-from scas4d_core.effects.switches import IDLE, kept_of
+from scas4d_core.effects.switches import IDLE, committed_arrays
 from scas4d_core.engines.views import CameraArrays
 from scas4d_core.first_frame.static_result import StaticResult
 from scas4d_core.reconstruction import Reconstruction
@@ -32,8 +48,8 @@ OFF = {"c2": np.array([0.8, -0.4, 0.0])}
 
 def knocked(offsets: dict[str, np.ndarray]) -> Rig:
     """The rig with some cameras turned."""
-    twists = {name: np.concatenate([np.zeros(3), in_pixels(LENS) @ offset]) for name, offset in offsets.items()}
-    turned = {name: motion_of(twist) @ RIG[name].world_to_camera for name, twist in twists.items()}
+    twists = {name: np.concatenate([np.zeros(3), turn_from_pixels(LENS) @ offset]) for name, offset in offsets.items()}
+    turned = {name: twist_to_matrix(twist) @ RIG[name].world_to_camera for name, twist in twists.items()}
     return Rig(
         tuple(
             replace(camera, world_to_camera=turned.get(camera.name, camera.world_to_camera)) for camera in RIG.cameras
@@ -65,7 +81,7 @@ def arrays(scene: Reconstruction) -> dict[str, Any]:
 def off_by(scene: Reconstruction, name: str) -> np.ndarray:
     """[3] pixels by which a camera is posed otherwise than calibrated."""
     twist = arrays(scene)["twists"][RIG.names.index(name)]
-    return offset_of(LENS, twist, 1.3)
+    return pixel_offset(LENS, twist, 1.3)
 
 
 def same(one: Reconstruction, other: Reconstruction) -> bool:
@@ -90,7 +106,7 @@ def test_it_is_worth_it_for_what_that_camera_sees() -> None:
 
 
 def out(scene: Reconstruction) -> bool:
-    return scene._prepared.carried.past.is_out("c2")
+    return scene._prepared.carried.past.is_left_out("c2")
 
 
 def test_a_camera_that_was_set_aside_is_looked_at_and_comes_back() -> None:
@@ -114,13 +130,13 @@ def test_a_camera_that_was_moved_further_stays_set_aside() -> None:
 
 def test_a_camera_that_is_shifted_is_followed() -> None:
     twist = np.array([0.016, 0, 0, 0, 0, 0])
-    there = replace(RIG["c2"], world_to_camera=motion_of(twist) @ RIG["c2"].world_to_camera)
+    there = replace(RIG["c2"], world_to_camera=twist_to_matrix(twist) @ RIG["c2"].world_to_camera)
     rig = Rig(tuple(there if camera.name == "c2" else camera for camera in RIG.cameras))
     scene = started("on")
     for index in range(1, 15):
         box = moved(BOX, Rotation.from_rotvec([0, 0.02 * index, 0]), np.array([0.004 * index, 0, 0]))
         scene.step(take_frame(index, index / 30, box, rig))
-    np.testing.assert_allclose(off_by(scene, "c2"), offset_of(LENS, twist, 1.3), atol=0.25)
+    np.testing.assert_allclose(off_by(scene, "c2"), pixel_offset(LENS, twist, 1.3), atol=0.25)
 
 
 def test_a_drift_is_followed_a_frame_late() -> None:
@@ -151,9 +167,9 @@ def test_the_poses_go_on_with_the_same_bits(tmp_path: Path) -> None:
 
 def test_twists_alone_are_committed() -> None:
     poses = Poses.of({}, 6)
-    assert kept_of({NAME: poses.arrays()}) == {}
+    assert committed_arrays({NAME: poses.arrays()}) == {}
     poses.twists[1, 4] = 0.01
-    assert list(kept_of({NAME: poses.arrays()})[NAME]) == ["twists"]
+    assert list(committed_arrays({NAME: poses.arrays()})[NAME]) == ["twists"]
 
 
 def test_what_all_cameras_share_is_motion_of_the_scene() -> None:
@@ -162,13 +178,15 @@ def test_what_all_cameras_share_is_motion_of_the_scene() -> None:
     for row, camera in enumerate(RIG.cameras):
         root = RNG.normal(size=(6, 40)) * 300
         one = Equations(root @ root.T, np.zeros(6), 1.0, 1.3)
-        told = one.matrix @ of_the_world(one, camera.world_to_camera) @ motion
+        told = one.matrix @ to_camera_twist(one, camera.world_to_camera) @ motion
         aligned[row] = (one._replace(vector=told), camera, LENS)
-    alone = stepped(np.zeros((6, 6)), {0: aligned[0]} | {row: aligned[row] for row in range(1, 6)}, np.arange(6) == 0)
+    alone = step_twists(
+        np.zeros((6, 6)), {0: aligned[0]} | {row: aligned[row] for row in range(1, 6)}, np.arange(6) == 0
+    )
     assert np.abs(alone).max() < 1e-4
     one, camera, lens = aligned[0]
     more = one._replace(vector=one.vector + one.matrix @ np.array([0, 0, 0, 0, 0.01, 0]))
-    found = stepped(np.zeros((6, 6)), {**aligned, 0: (more, camera, lens)}, np.arange(6) == 0)
+    found = step_twists(np.zeros((6, 6)), {**aligned, 0: (more, camera, lens)}, np.arange(6) == 0)
     np.testing.assert_allclose(found[0], [0, 0, 0, 0, 0.005, 0], atol=2e-4)  # half of the way
     assert not found[1:].any()
 
@@ -177,13 +195,13 @@ def test_the_median_twist_is_nothing() -> None:
     shared = RNG.normal(size=6) * 0.01
     everywhere = np.array([adjoint(camera.world_to_camera) @ shared for camera in RIG.cameras])
     believed = np.ones(6, np.bool_)
-    np.testing.assert_allclose(centred(everywhere, RIG, believed), 0, atol=1e-12)
+    np.testing.assert_allclose(remove_common_motion(everywhere, RIG, believed), 0, atol=1e-12)
     own = np.zeros((6, 6))
     own[3] = RNG.normal(size=6) * 0.01
-    np.testing.assert_allclose(centred(everywhere + own, RIG, believed), own, atol=1e-12)
-    assert centred(own, RIG, believed) is own  # most have none
+    np.testing.assert_allclose(remove_common_motion(everywhere + own, RIG, believed), own, atol=1e-12)
+    assert remove_common_motion(own, RIG, believed) is own  # most have none
     drifting = RNG.normal(size=(6, 6)) * 0.01
-    after = centred(drifting, RIG, believed)
+    after = remove_common_motion(drifting, RIG, believed)
     worlds = [
         np.linalg.solve(adjoint(camera.world_to_camera), twist)
         for camera, twist in zip(RIG.cameras, after, strict=True)
@@ -193,11 +211,11 @@ def test_the_median_twist_is_nothing() -> None:
 
 def test_a_pose_is_moved_by_so_much_at_most() -> None:
     far = np.array([0.5, 0, 0, 0, 0.3, 0])
-    less = bounded(far, LENS, 1.3)
-    assert np.linalg.norm(offset_of(LENS, less, 1.3)[:2]) == pytest.approx(0.02 * 48)
-    assert np.linalg.norm(bounded(np.array([0, 0, 0, 0, 0, 1.0]), LENS, 1.3)) == pytest.approx(TURN)
+    less = limit_twist(far, LENS, 1.3)
+    assert np.linalg.norm(pixel_offset(LENS, less, 1.3)[:2]) == pytest.approx(0.02 * 48)
+    assert np.linalg.norm(limit_twist(np.array([0, 0, 0, 0, 0, 1.0]), LENS, 1.3)) == pytest.approx(TURN)
     near = np.array([0, 0, 0, 0, 0.001, 0])
-    assert (bounded(near, LENS, 1.3) == near).all()
+    assert (limit_twist(near, LENS, 1.3) == near).all()
 
 
 def test_evidence_waits_for_frames_that_agree() -> None:
@@ -205,15 +223,15 @@ def test_evidence_waits_for_frames_that_agree() -> None:
     here = Equations(400 * np.eye(3), 400 * np.array([0.8, 0, 0]), 400.0, 1.0)
     there = here._replace(vector=-here.vector)
     for told in (here, there, here, there):  # a thing that swings
-        poses.look(2, told)
+        poses.record_offset(2, told)
         assert poses.shares[2] < effect(NAME).off_below
     nothing = here._replace(vector=np.zeros(3))
     for _ in range(4):
-        poses.look(4, here)
+        poses.record_offset(4, here)
         for row in (0, 1, 3, 5):
-            poses.look(row, nothing)
+            poses.record_offset(row, nothing)
     assert poses.shares[4] > 0.5
-    assert poses.off().tolist() == [False] * 4 + [True, False]
+    assert poses.drifted().tolist() == [False] * 4 + [True, False]
     assert np.linalg.norm(poses.offsets[4]) == pytest.approx(0.8, abs=0.01)
 
 
@@ -222,9 +240,9 @@ def test_where_most_cameras_seem_to_be_off_none_is() -> None:
     for _ in range(4):
         for row in range(6):
             way = np.array([0.5 + 0.1 * row, 0, 0])
-            poses.look(row, Equations(400 * np.eye(3), 400 * way, 400.0, 1.0))
+            poses.record_offset(row, Equations(400 * np.eye(3), 400 * way, 400.0, 1.0))
     assert poses.shares.min() > 0.2
-    assert not poses.off().any()
+    assert not poses.drifted().any()
     seen: Any = SimpleNamespace(result=SimpleNamespace(carried={NAME: poses.arrays()}), rig=RIG, views=[*RIG.names])
     found = effect(NAME).evidence(seen)
     assert found is not None
@@ -236,7 +254,7 @@ def test_residuals_that_are_told_of_a_pose_in_use_count_from_the_calibration() -
     poses.moved[0] = [1.0, 0, 0]
     nothing_left = Equations(400 * np.eye(3), np.zeros(3), 40.0, 1.0)
     for _ in range(6):
-        poses.look(0, nothing_left)
+        poses.record_offset(0, nothing_left)
     np.testing.assert_allclose(poses.offsets[0], [1, 0, 0], atol=1e-6)
     assert poses.shares[0] > 0.8  # without the pose there would be ten times as much
 
@@ -261,8 +279,8 @@ def test_evidence_of_nothing() -> None:
 
 
 def test_poses_that_are_not_known_are_those_of_the_calibration() -> None:
-    assert posed(RIG, {}) is RIG
-    assert posed(RIG, {NAME: Poses.of({}, 6).arrays()}) is RIG
+    assert rig_with_drift(RIG, {}) is RIG
+    assert rig_with_drift(RIG, {NAME: Poses.of({}, 6).arrays()}) is RIG
 
 
 def test_a_few_cameras_teach_nothing() -> None:

@@ -12,8 +12,8 @@ from effect_cases import RIG as BOX_RIG
 from scipy.spatial.transform import Rotation
 
 from scas4d_core.cameras import Rig
-from scas4d_core.effects.coherence.bending import EFFECT, PATCH, bend, turns_of
-from scas4d_core.effects.switches import contradictions, first_switches, names_on, register_effects
+from scas4d_core.effects.coherence.bending import EFFECT, PATCH, measure_bending, patch_rotations
+from scas4d_core.effects.switches import find_contradictions, first_switches, names_on, register_effects
 from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.engine import StepScalars
 from scas4d_core.first_frame.static_result import StaticResult
@@ -78,21 +78,21 @@ def shown(height: float, turn: Rotation | None = None) -> Gaussians:
 def test_turns_of_patches() -> None:
     patches = np.random.default_rng(0).normal(size=(5, 30, 3))
     turns = Rotation.from_rotvec(np.random.default_rng(1).normal(size=(5, 3))).as_matrix()
-    found, rest = turns_of(patches, patches @ np.swapaxes(turns, 1, 2) + [1.0, 2.0, 3.0])
+    found, rest = patch_rotations(patches, patches @ np.swapaxes(turns, 1, 2) + [1.0, 2.0, 3.0])
     np.testing.assert_allclose(found, turns, atol=1e-12)
     assert (rest < 1e-6).all()
     flat = patches * [1, 1, 0]  # a patch of a surface: its own mirror image is as near
-    found, rest = turns_of(flat, flat @ np.swapaxes(turns, 1, 2))
+    found, rest = patch_rotations(flat, flat @ np.swapaxes(turns, 1, 2))
     np.testing.assert_allclose(found, turns, atol=1e-12)
     grown = 1.1 * patches @ np.swapaxes(turns, 1, 2)
-    found, rest = turns_of(patches, grown)
+    found, rest = patch_rotations(patches, grown)
     np.testing.assert_allclose(found, turns, atol=1e-12)
     np.testing.assert_allclose(rest, 0.1, atol=1e-12)
 
 
 def test_cloth_bends_and_what_is_rigid_or_jointed_does_not() -> None:
     still = state(sheet())
-    swings = bend(still, state(TURN.apply(swung(1.0)) + SHIFT))
+    swings = measure_bending(still, state(TURN.apply(swung(1.0)) + SHIFT))
     assert swings is not None
     assert swings > 2 * EFFECT.on_above
     rng = np.random.default_rng(2)
@@ -102,7 +102,7 @@ def test_cloth_bends_and_what_is_rigid_or_jointed_does_not() -> None:
         1.05 * sheet(),
         sheet() + rng.normal(0, 0.005, (4900, 3)),
     ):
-        found = bend(still, state(other))
+        found = measure_bending(still, state(other))
         assert found is not None
         assert found < EFFECT.off_below
 
@@ -112,7 +112,7 @@ def test_a_patch_is_a_share_of_the_thing() -> None:
     for count in (4000, 30_000):
         flat = np.random.default_rng(1).uniform(0, 1, (count, 3)) * [1, 1, 0]
         swings = flat + np.outer(0.025 * np.sin(4 * np.pi * flat[:, 0]), [0, 0, 1])
-        found.append(bend(state(flat), state(swings)))
+        found.append(measure_bending(state(flat), state(swings)))
     few, many = found
     assert few is not None
     assert many is not None
@@ -122,13 +122,13 @@ def test_a_patch_is_a_share_of_the_thing() -> None:
 
 def test_too_little_says_nothing_and_what_is_not_finite_is_left_out() -> None:
     still = state(sheet())
-    assert bend(still, state(sheet() + 1e-3 * SHIFT)) is None
+    assert measure_bending(still, state(sheet() + 1e-3 * SHIFT)) is None
     few = state(sheet()[:PATCH])
-    assert bend(few, few) is None
-    assert bend(few.replace(foreground=np.zeros(PATCH, np.float32)), few) is None
+    assert measure_bending(few, few) is None
+    assert measure_bending(few.replace(foreground=np.zeros(PATCH, np.float32)), few) is None
     broken = swung(1.0)
     broken[np.random.default_rng(1).permutation(len(broken))[:500]] = np.nan
-    found = bend(state(sheet()), state(broken))
+    found = measure_bending(state(sheet()), state(broken))
     assert found is not None
     assert found > EFFECT.on_above
 
@@ -138,7 +138,7 @@ def test_a_pin_of_rotation_is_kept(pin: str) -> None:
     settings = Settings.model_validate({"effects": {"rotation": pin}})
     assert EFFECT.refusal(settings) is not None
     both = Settings.model_validate({"effects": {"rotation": pin, "bending": "on"}})
-    assert [name for name, *_ in contradictions(both)] == ["bending"]
+    assert [name for name, *_ in find_contradictions(both)] == ["bending"]
     assert EFFECT.refusal(Settings.model_validate({"update": {"weights": {"rotation": 0}}})) is not None
     assert EFFECT.refusal(Settings()) is None
 

@@ -22,7 +22,7 @@ from scas4d_core.frame_outcome import Candidate
 from scas4d_core.presets import SettingError, preset
 from scas4d_core.settings import Settings, UpdateSettings
 from scas4d_core.update.frame_update import FrameUpdate
-from scas4d_core.update.result import AS_SET, AttemptOptions, UpdateResult
+from scas4d_core.update.result import AS_CONFIGURED, AttemptOptions, UpdateResult
 from scas4d_core.update.warm_start import Motion
 
 COLUMNS = {
@@ -48,7 +48,7 @@ def updater(effects: Sequence[str], update: UpdateSettings = UPDATE, engine: Upd
     return updater_of(register_effects(builder(update=update), effects), engine)
 
 
-def run(made: FrameUpdate, motion: Motion | None = None, options: AttemptOptions = AS_SET) -> UpdateResult:
+def run(made: FrameUpdate, motion: Motion | None = None, options: AttemptOptions = AS_CONFIGURED) -> UpdateResult:
     views = builder().factory.views(take_frame(1, 1.0, moved(BEFORE), RIG, True), {})
     return made.run(BEFORE, views, motion, 1.0, seed=3, options=options)
 

@@ -11,8 +11,8 @@ import pytest
 from scas4d_core.effects.evidence import FitTime, FrameObservation
 from scas4d_core.effects.presence import entering
 from scas4d_core.effects.presence.carving import carve_new
-from scas4d_core.effects.presence.entering import EFFECT, NOBODY, SETTLED, entered
-from scas4d_core.effects.presence.novelty import novelties, said
+from scas4d_core.effects.presence.entering import EFFECT, NO_NEWBORNS, SETTLED, find_entered
+from scas4d_core.effects.presence.novelty import measure_novelty, novelty_of_views
 from scas4d_core.update.result import UpdateResult
 from scas4d_core.update.schedule import Stopping
 from tests.helpers.effect_cases.visited_room import BALL, CENTRE, known, psnr, scene, seen, sphere, visitor
@@ -20,11 +20,11 @@ from tests.helpers.effect_cases.visited_room import BALL, CENTRE, known, psnr, s
 
 @pytest.fixture(autouse=True)
 def _small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scas4d_core.effects.presence.growing.ITERATIONS", 120)
+    monkeypatch.setattr("scas4d_core.effects.presence.newborn_fit.ITERATIONS", 120)
 
 
 def test_a_thing_that_is_new_is_found_where_it_is() -> None:
-    found = entered(seen(scene(known()), scene(known(), visitor())))
+    found = find_entered(seen(scene(known()), scene(known(), visitor())))
     assert found is not None
     assert found.cameras >= 8
     assert found.share > 0.5
@@ -46,7 +46,7 @@ def test_what_is_born_shows_it() -> None:
     assert psnr(result.gaussians, frame) > psnr(before, frame) + 8
     for name in ("means", "colours", "factors", "ids"):  # the others stay as they are
         assert np.array_equal(getattr(result.gaussians, name)[: len(before)], getattr(before, name))
-    again = entered(seen(result.gaussians, scene(known(), visitor())))
+    again = find_entered(seen(result.gaussians, scene(known(), visitor())))
     assert again is None  # nothing is left that would be born twice
 
 
@@ -59,7 +59,7 @@ def test_the_same_frame_bears_the_same_bits() -> None:
 def test_nothing_enters_where_the_state_shows_the_frame() -> None:
     state = scene(known(), visitor())
     frame = seen(state, state)
-    assert entered(frame) is None
+    assert find_entered(frame) is None
     assert EFFECT.add_and_retire_gaussians(frame) is frame.result
     assert EFFECT.evidence(frame) == entering.Evidence(0.0, "")
 
@@ -67,13 +67,13 @@ def test_nothing_enters_where_the_state_shows_the_frame() -> None:
 def test_what_moved_without_being_followed_has_not_entered() -> None:
     moved = visitor(CENTRE + np.array([0.0, 0.0, -0.35]))
     frame = seen(scene(known(), visitor()), scene(known(), moved))
-    assert any(one.new.any() and one.stale.any() for one in said(frame, frame.views))
-    assert entered(frame) is None
+    assert any(one.new.any() and one.stale.any() for one in novelty_of_views(frame, frame.views))
+    assert find_entered(frame) is None
 
 
 def test_without_masks_the_colours_tell() -> None:
     state = scene(known())
-    found = entered(seen(state, scene(known(), visitor()), masks=False))
+    found = find_entered(seen(state, scene(known(), visitor()), masks=False))
     assert found is not None
     assert np.abs(found.hull.points.mean(axis=0) - CENTRE).max() < 0.04
 
@@ -109,7 +109,7 @@ def test_the_young_are_settled_and_then_left_alone() -> None:
 def test_no_voxel_is_free_to_a_camera() -> None:
     state = scene(known())
     frame = seen(state, scene(known(), visitor()))
-    says = novelties(state, state.colours, frame.views, frame.rig, frame.renderer)
+    says = measure_novelty(state, state.colours, frame.views, frame.rig, frame.renderer)
     hull = carve_new(says)
     for one in says:
         uv, _ = one.camera.project(hull.points)
@@ -139,7 +139,7 @@ def test_another_thing_is_not_taken_for_what_has_left() -> None:
 
 def test_what_no_camera_confirms_is_retired() -> None:
     count, state = len(scene(known())), scene(known(), visitor())
-    carried = {"entering": NOBODY | {"rows": np.arange(count, len(state)), "age": np.full(300, SETTLED)}}
+    carried = {"entering": NO_NEWBORNS | {"rows": np.arange(count, len(state)), "age": np.full(300, SETTLED)}}
     gone = EFFECT.add_and_retire_gaussians(seen(state, scene(known()), 9, carried=carried)).gaussians
     assert gone.retired[count:].mean() > 0.8
     assert not gone.retired[:count].any()
@@ -160,7 +160,7 @@ def timed(monkeypatch: pytest.MonkeyPatch, end: float) -> tuple[FrameObservation
     """A frame with a thing that is new and what comes of it, by a clock that ticks."""
     clock = Ticks()
     monkeypatch.setattr("scas4d_core.update.schedule.Stopping", partial(Stopping, clock=clock))
-    monkeypatch.setattr("scas4d_core.effects.presence.growing.perf_counter", clock)
+    monkeypatch.setattr("scas4d_core.effects.presence.newborn_fit.perf_counter", clock)
     frame = replace(seen(scene(known()), scene(known(), visitor())), time=FitTime(end))
     return frame, EFFECT.add_and_retire_gaussians(frame)
 
@@ -169,13 +169,13 @@ def test_what_there_is_no_time_for_is_not_born_and_the_frame_says_so(monkeypatch
     for end in (0.5, 25.0):  # of 120 iterations none, or some twenty
         frame, result = timed(monkeypatch, end)
         assert result is frame.result
-        assert len(frame.time.put_off) == 1
-        assert "Gaussians that move were not born" in frame.time.put_off[0]
+        assert len(frame.time.postponed) == 1
+        assert "Gaussians that move were not born" in frame.time.postponed[0]
 
 
 def test_with_some_time_it_is_fitted_in_fewer_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
     frame, result = timed(monkeypatch, 60.0)
-    assert frame.time.put_off == []
+    assert frame.time.postponed == []
     assert frame.time.spent == pytest.approx(60, abs=3)
     assert psnr(result.gaussians, frame) > psnr(frame.result.gaussians, frame) + 3
     assert frame.time.end is not None
@@ -184,7 +184,7 @@ def test_with_some_time_it_is_fitted_in_fewer_iterations(monkeypatch: pytest.Mon
 def test_without_time_the_young_stay_as_they_are() -> None:
     true = scene(known(), visitor())
     rows = np.arange(len(scene(known())), len(true))
-    carried = {"entering": NOBODY | {"rows": rows, "age": np.zeros(len(rows), np.int64)}}
+    carried = {"entering": NO_NEWBORNS | {"rows": rows, "age": np.zeros(len(rows), np.int64)}}
     frame = replace(seen(true, true, 6, carried=carried), time=FitTime(0.0))
     assert EFFECT.add_and_retire_gaussians(frame).gaussians is true
-    assert frame.time.put_off == [f"{len(rows)} newborn Gaussians were not settled"]
+    assert frame.time.postponed == [f"{len(rows)} newborn Gaussians were not settled"]

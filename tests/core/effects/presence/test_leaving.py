@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from scas4d_core.effects.presence.leaving import EFFECT, FRAMES, outside
+from scas4d_core.effects.presence.leaving import EFFECT, FRAMES, outside_all_views
 from tests.helpers.effect_cases.visited_room import known, make_rig, scene, seen, visitor
 
 AWAY = np.array([0.0, -4.0, 0.0])
@@ -12,7 +12,7 @@ AWAY = np.array([0.0, -4.0, 0.0])
 
 def test_only_what_moves_and_is_in_no_picture_is_outside() -> None:
     state = scene(known(), visitor(AWAY))
-    out = outside(state, make_rig())
+    out = outside_all_views(state, make_rig())
     assert np.flatnonzero(out).tolist() == list(range(len(state) - 300, len(state)))
 
 
@@ -37,7 +37,7 @@ def test_what_came_back_in_time_is_not_retired() -> None:
 
 def test_a_thing_that_is_half_in_view_keeps_its_other_half() -> None:
     state = scene(known(), visitor(np.array([0.0, -0.7, 0.0])))
-    out = outside(state, make_rig())
+    out = outside_all_views(state, make_rig())
     assert 0 < out.sum() < 300
     carried = {"leaving": {"frames": np.where(out, FRAMES, 0), "share": np.array(0.0)}}
     gone = EFFECT.add_and_retire_gaussians(seen(state, state, 3, carried=carried)).gaussians.retired

@@ -121,10 +121,10 @@ def test_pictures_that_are_met_much_worse_are_no_rest() -> None:
 def test_labels_are_learnt_of_enough(moving: int, new: int, learnt: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     found = np.zeros(10_000, np.bool_)
     found[moving : moving + new] = True
-    monkeypatch.setattr(motion_mask, "moving_between", lambda *_: found)
+    monkeypatch.setattr(motion_mask, "find_moving", lambda *_: found)
     many = Gaussians.of_points(np.zeros((10_000, 3)), radius=0.1)
     known = np.arange(10_000) < moving if moving else None
-    labels = motion_mask.labels_learnt(many, known, (), (), CpuRenderer((0, 0, 0)))
+    labels = motion_mask.learn_labels_from_motion(many, known, (), (), CpuRenderer((0, 0, 0)))
     assert (labels is not None) == learnt
     assert labels is None or labels.sum() == moving + new
 

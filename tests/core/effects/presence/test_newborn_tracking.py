@@ -24,7 +24,7 @@ WAY = np.array([-0.05, -0.12, 0.08])
 
 @pytest.fixture(autouse=True)
 def _small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("scas4d_core.effects.presence.growing.ITERATIONS", 60)
+    monkeypatch.setattr("scas4d_core.effects.presence.newborn_fit.ITERATIONS", 60)
 
 
 def test_an_attempt_from_where_another_ended_moves_it_no_second_time() -> None:
@@ -37,7 +37,7 @@ def test_an_attempt_from_where_another_ended_moves_it_no_second_time() -> None:
 
     def caught(start: Gaussians) -> np.ndarray:
         """[Y, 3] where the start of an attempt from a state puts the newborn."""
-        engine, still = CpuEngine(), Tables.still(hierarchy)
+        engine, still = CpuEngine(), Tables.identity(hierarchy)
         engine.bind(builder.plan, structure_of(hierarchy, None, state))
         engine.load_state(start)
         rates, carried = Rates.of(builder.update, len(hierarchy.sizes), now.rig.reach), dict(result.carried)

@@ -14,7 +14,7 @@ from scas4d_core.effects.switches import register_effects
 from scas4d_core.engines.cpu import changed_pixels
 from scas4d_core.engines.cpu import engine as cpu_engine
 from scas4d_core.engines.cpu.blocks import as_blocks, as_grid
-from scas4d_core.engines.cpu.changed_pixels import ChangedPixels, taken
+from scas4d_core.engines.cpu.changed_pixels import ChangedPixels, take_rows
 from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.cpu.rasterizer import CpuRasterizer
 from scas4d_core.engines.cpu.renderer import CpuRenderer, blocks_of
@@ -160,8 +160,8 @@ def test_a_view_in_which_nothing_moves_has_no_gradient() -> None:
     features = np.concatenate([state.colours, state.foreground[:, None]], axis=1)
     given = (state.means, state.factors, state.opacities, features)
     view = factory.views(take_frame(0, 0.0, BOX, RIG), {})[0]
-    assert not any(array.any() for array in picture.evaluate(*given, view))
-    whole.evaluate(*given, view)
+    assert not any(array.any() for array in picture.forward_backward(*given, view))
+    whole.forward_backward(*given, view)
     assert picture.psnr == pytest.approx(whole.psnr)
     assert picture.image_part == pytest.approx(whole.image_part)
 
@@ -169,7 +169,7 @@ def test_a_view_in_which_nothing_moves_has_no_gradient() -> None:
 def test_blocks_and_their_grid_are_the_same() -> None:
     camera = ViewFactory(RIG).views(take_frame(0, 0.0, BOX, RIG), {})[0].camera
     state = (BOX.means, BOX.factors, BOX.opacities, np.zeros((len(BOX), 4), np.float32))
-    blocks = blocks_of(CpuRasterizer(), *taken(state, np.arange(MOVES)), camera)
+    blocks = blocks_of(CpuRasterizer(), *take_rows(state, np.arange(MOVES)), camera)
     grid = as_grid(blocks, camera)
     np.testing.assert_array_equal(as_blocks(grid, camera), blocks)
     alone = [array[:MOVES] for array in (BOX.means, BOX.factors, BOX.opacities)]
@@ -206,7 +206,7 @@ def test_losses_of_the_box_and_around_it_are_those_of_the_whole_picture(seed: in
 
     all_of, box = (slice(height), slice(width)), changed_pixels._box(shown)
     near = image_loss.near(shown[box])
-    rest, _ = found(before, all_of, changed_pixels._around(box, near, height, width))
+    rest, _ = found(before, all_of, changed_pixels._outside_region(box, near, height, width))
     changed, gradient = found(after, box, near)
     whole, wanted = found(after, all_of, image_loss.EVERYWHERE)
     np.testing.assert_allclose(rest + changed, whole, rtol=1e-5)

@@ -33,5 +33,5 @@ def test_a_gaussian_nearer_than_that_hides_nothing(near: float, drawn: bool) -> 
         np.array([[0, 0, 0.4]], np.float32), 0.1 * np.eye(3, dtype=np.float32)[None], np.array([0.9], np.float32),
         np.ones((1, 4), np.float32), camera, np.zeros(4, np.float32),
     )  # fmt: skip
-    assert (picture.rest[8, 8] < 0.2) == drawn
-    assert (picture.rest == 1).all() != drawn
+    assert (picture.transmittance[8, 8] < 0.2) == drawn
+    assert (picture.transmittance == 1).all() != drawn

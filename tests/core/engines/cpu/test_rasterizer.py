@@ -119,7 +119,7 @@ def render(
     picture = rasterizer.forward(
         *scene[:3], features, CameraArrays.of(camera), scene.background, depth_channel=depth_channel
     )
-    return rasterizer, np.moveaxis(picture.features, 0, -1).copy(), 1 - picture.rest
+    return rasterizer, np.moveaxis(picture.features, 0, -1).copy(), 1 - picture.transmittance
 
 
 def pull(rasterizer: CpuRasterizer, g_image: np.ndarray, g_alpha: np.ndarray) -> list[np.ndarray]:
@@ -379,10 +379,10 @@ def test_a_narrow_drawing_draws_the_blocks_that_are_reached() -> None:
     wanted, seen = whole.features.copy(), np.flatnonzero(rasterizer.counts)
     tiles_x, everywhere = 4, np.full(12, 2**64 - 1, np.uint64)
     learnt[seen[:3]] = 1
-    drawing = Drawing(everywhere, learnt, narrow=True)
+    drawing = Drawing(everywhere, learnt, mask_to_region=True)
     planes = rasterizer.forward(*scene[:3], scene.features, arrays, scene.background, drawing=drawing).features
     drawn = rasterizer.drawn.copy()
-    assert not rasterizer.escaped
+    assert not rasterizer.outside_region
     assert drawn.any()
     assert (drawn != everywhere).any()
     shown = np.zeros((90, 100), bool)
@@ -394,11 +394,11 @@ def test_a_narrow_drawing_draws_the_blocks_that_are_reached() -> None:
     here = (slice(None), slice(3, 83), slice(10, 99))
     base = np.random.default_rng(1).random((4, 90, 100), np.float32)
     part, shifts = np.empty((4, 80, 89), np.float32), np.zeros(4)
-    tiles.take_blocks(rasterizer.planes, base, drawn, tiles_x, box, part, shifts)
+    tiles.compose_box(rasterizer.planes, base, drawn, tiles_x, box, part, shifts)
     np.testing.assert_array_equal(part, np.where(shown, planes, base)[here])
     np.testing.assert_allclose(shifts, (part.astype(np.float64) - base[here]).sum(axis=(1, 2)), rtol=1e-5)
     out = np.zeros((4, 96, 128), np.float32)
-    tiles.put_blocks(part, drawn, tiles_x, box, out)
+    tiles.write_blocks(part, drawn, tiles_x, box, out)
     box_alone = np.zeros_like(shown)
     box_alone[here[1:]] = shown[here[1:]]
     np.testing.assert_array_equal(out[:, :90, :100], np.where(box_alone, planes, 0))
@@ -406,4 +406,4 @@ def test_a_narrow_drawing_draws_the_blocks_that_are_reached() -> None:
     rasterizer.forward(
         *scene[:3], scene.features, arrays, scene.background, drawing=Drawing(np.zeros(12, np.uint64), learnt, True)
     )
-    assert rasterizer.escaped
+    assert rasterizer.outside_region

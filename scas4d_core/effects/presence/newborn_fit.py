@@ -60,7 +60,7 @@ BETA1, BETA2 = np.float32(0.8), np.float32(0.95)
 """Of Adam: those of the update, whose iterations are as few."""
 
 
-def seeds(seen: Sequence[Novelty], hull: Hull, limit: int, rng: np.random.Generator) -> tuple[Float, Array]:
+def sample_seeds(seen: Sequence[Novelty], hull: Hull, limit: int, rng: np.random.Generator) -> tuple[Float, Array]:
     """Points [P, 3] on the hull's surface with their colours [P, 3]; at most ``limit``, drawn at random."""
     points = hull.points[hull.surface]
     colours, count = colours_of(seen, points, hull)
@@ -70,7 +70,7 @@ def seeds(seen: Sequence[Novelty], hull: Hull, limit: int, rng: np.random.Genera
     return points[fine], colours[fine]
 
 
-def grown(
+def fit_newborns(
     state: Gaussians,
     points: Float,
     colours: Array,
@@ -94,11 +94,11 @@ def grown(
     parameters[:, LABEL] = logit(np.array(float(moves)))
     born = _fit_crops(state, parameters, views, rig, renderer, rng, time, iterations=ITERATIONS)
     if born is None:
-        time.put_off.append(f"{len(points)} Gaussians that {'move' if moves else 'stand'} were not born")
+        time.postponed.append(f"{len(points)} Gaussians that {'move' if moves else 'stand'} were not born")
     return born
 
 
-def settled(
+def refine_newborns(
     state: Gaussians,
     rows: Int,
     views: Sequence[TrainingView],
@@ -133,7 +133,7 @@ def settled(
     given = views, rig, renderer, rng, time
     fitted = _fit_crops(others, parameters, *given, iterations=SETTLING, opacities=False)
     if fitted is None:
-        time.put_off.append(f"{len(rows)} newborn Gaussians were not settled")
+        time.postponed.append(f"{len(rows)} newborn Gaussians were not settled")
         return state
     means, factors, colours = state.means.copy(), state.factors.copy(), state.colours.copy()
     means[rows], colours[rows] = fitted.means, fitted.colours

@@ -13,7 +13,7 @@ from effect_cases import BEFORE, RIG, UPDATE, builder, updater_of
 
 from scas4d_core.effects.evidence import FrameObservation
 from scas4d_core.effects.presence import entering, novelty, uncovered
-from scas4d_core.effects.presence.novelty import GLANCE, glance
+from scas4d_core.effects.presence.novelty import SCREENED_CAMERAS, screen_novelty
 from scas4d_core.effects.switches import register_effects
 from scas4d_core.engines.cpu.engine import CpuEngine
 from scas4d_core.engines.cpu.renderer import CpuRenderer
@@ -35,7 +35,7 @@ def shown(frame: FrameObservation, kept: Candidate = Candidate.END, most: int = 
         frame.renderer.compare(state, frame.views[number])
         log.keep(number, Thinned.of(*frame.renderer.shown(frame.views[number])))  # type: ignore[attr-defined]
     trace = UpdateTrace(kept=kept)
-    trace.take(log, frame.views)
+    trace.load_log(log, frame.views)
     return replace(frame, result=replace(frame.result, trace=trace))
 
 
@@ -69,8 +69,8 @@ def test_where_nothing_is_new_nothing_is_rendered(rendered: list[str], masks: bo
 @pytest.mark.parametrize("masks", [True, False])
 def test_what_enters_is_found_by_the_cameras_that_see_it(rendered: list[str], masks: bool) -> None:
     plain, frame = (seen(scene(known()), scene(known(), visitor()), masks=masks) for _ in range(2))
-    said = glance(shown(frame), entering.GLANCED, new=entering.SMALLEST)
-    assert len(said) > entering.GLANCED
+    said = screen_novelty(shown(frame), entering.MIN_CAMERAS, new=entering.SMALLEST)
+    assert len(said) > entering.MIN_CAMERAS
     assert {one.view.name for one in said} == set(rendered)
     assert all(one.surplus >= entering.SMALLEST * one.new.size for one in said)
     found, wanted = entering.EFFECT.evidence(shown(frame)), entering.EFFECT.evidence(plain)
@@ -90,53 +90,58 @@ def test_what_is_uncovered_is_found(rendered: list[str]) -> None:
 
 def test_fewer_cameras_than_are_asked_for_render_nothing(rendered: list[str]) -> None:
     frame = shown(seen(scene(known()), scene(known())))
-    assert glance(frame, 2, new=entering.SMALLEST) == []
+    assert screen_novelty(frame, 2, new=entering.SMALLEST) == []
     assert rendered == []
 
 
 def test_too_few_renderings_say_nothing_and_cameras_are_looked_at(rendered: list[str]) -> None:
-    frame = shown(seen(scene(known()), scene(known(), visitor())), most=GLANCE - 1)
-    assert len(glance(frame, 2, new=entering.SMALLEST)) == GLANCE
-    assert len(rendered) == GLANCE
+    frame = shown(seen(scene(known()), scene(known(), visitor())), most=SCREENED_CAMERAS - 1)
+    assert len(screen_novelty(frame, 2, new=entering.SMALLEST)) == SCREENED_CAMERAS
+    assert len(rendered) == SCREENED_CAMERAS
 
 
 def test_without_renderings_of_what_was_kept_some_cameras_are_looked_at(rendered: list[str]) -> None:
-    assert len(glance(seen(scene(known()), scene(known())), 2, new=entering.SMALLEST)) == GLANCE  # as on another device
-    assert len(glance(shown(seen(scene(known()), scene(known())), Candidate.WARM), 2, new=entering.SMALLEST)) == GLANCE
-    assert len(rendered) == 2 * GLANCE
+    assert (
+        len(screen_novelty(seen(scene(known()), scene(known())), 2, new=entering.SMALLEST)) == SCREENED_CAMERAS
+    )  # as on another device
+    assert (
+        len(screen_novelty(shown(seen(scene(known()), scene(known())), Candidate.WARM), 2, new=entering.SMALLEST))
+        == SCREENED_CAMERAS
+    )
+    assert len(rendered) == 2 * SCREENED_CAMERAS
 
 
 def test_a_region_counts_without_its_rims() -> None:
     frame = shown(seen(scene(known()), scene(known(), visitor())))
-    said = {one.view.name: one for one in novelty.said(frame, frame.views)}
-    for one in novelty._glimpses(frame):
+    said = {one.view.name: one for one in novelty.novelty_of_views(frame, frame.views)}
+    for one in novelty._coarse_novelties(frame):
         share = float(said[one.view.name].new.mean())
-        assert novelty.SEEMS * share <= one.new <= share
+        assert novelty.COARSE_SHARE * share <= one.new <= share
 
 
 def test_a_trace_keeps_the_last_views_and_thins_large_pictures() -> None:
     frame = seen(scene(known()), scene(known()))
     log, state = IterationLog(), frame.result.gaussians
     trace = UpdateTrace()
-    trace.take(log, frame.views)
+    trace.load_log(log, frame.views)
     assert trace.shown == {}
 
     def drawn(number: int) -> Picture:
-        features, rest = frame.renderer.render(state, frame.views[number].camera)
-        return Picture(features.copy(), rest.copy())
+        features, transmittance = frame.renderer.render(state, frame.views[number].camera)
+        return Picture(features.copy(), transmittance.copy())
 
     for number in [*range(10), 1]:  # more than are kept, and one of them again
         log.keep(number, Thinned.of(*drawn(number)))
-    trace.take(log, frame.views)
+    trace.load_log(log, frame.views)
     assert list(trace.shown) == [frame.views[number].name for number in (3, 4, 5, 6, 7, 8, 9, 1)]
     every, planes = trace.shown[frame.views[1].name]
     assert every == 1
     large = drawn(1)
     np.testing.assert_array_equal(planes[:4], large.features)
-    np.testing.assert_array_equal(planes[4], large.rest)
-    tiled = Picture(np.tile(large.features, (1, 6, 8)), np.tile(large.rest, (6, 8)))
+    np.testing.assert_array_equal(planes[4], large.transmittance)
+    tiled = Picture(np.tile(large.features, (1, 6, 8)), np.tile(large.transmittance, (6, 8)))
     log.keep(1, Thinned.of(*tiled))
-    trace.take(log, frame.views)
+    trace.load_log(log, frame.views)
     every, planes = trace.shown[frame.views[1].name]
     assert every == 480 // KEPT_ROWS == 3
     assert planes.shape == (5, 160, 214)

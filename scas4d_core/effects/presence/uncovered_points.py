@@ -42,7 +42,7 @@ APART = 1.3
 
 
 @dataclass(frozen=True, eq=False)
-class Uncovered:
+class UncoveredPoints:
     """Points on what was uncovered.
 
     Attributes:
@@ -54,7 +54,7 @@ class Uncovered:
     spacing: float
 
 
-def uncovered(seen: Sequence[Novelty], state: Gaussians, renderer: Renderer) -> Uncovered:
+def find_uncovered_points(seen: Sequence[Novelty], state: Gaussians, renderer: Renderer) -> UncoveredPoints:
     """Points in the bare regions of all cameras.
 
     Args:
@@ -64,7 +64,7 @@ def uncovered(seen: Sequence[Novelty], state: Gaussians, renderer: Renderer) -> 
     clouds = [_points(one, standing, renderer) for one in seen if one.bare.any()]
     points = np.concatenate(clouds) if clouds else np.zeros((0, 3))
     if not len(points):
-        return Uncovered(points, np.zeros((0, 3), np.float32), 0.0)
+        return UncoveredPoints(points, np.zeros((0, 3), np.float32), 0.0)
     pixel = np.full(len(points), np.inf)
     for one in seen:
         _, _, depth, inside = pixels_inside(one.camera, points)
@@ -73,7 +73,7 @@ def uncovered(seen: Sequence[Novelty], state: Gaussians, renderer: Renderer) -> 
     _, kept = np.unique(np.round(points / cell).astype(np.int64), axis=0, return_index=True)
     points = points[np.sort(kept)]
     colours, agreed = _agreed(seen, points)
-    return Uncovered(points[agreed], colours[agreed], cell)
+    return UncoveredPoints(points[agreed], colours[agreed], cell)
 
 
 def _points(one: Novelty, standing: Gaussians, renderer: Renderer) -> Float:
