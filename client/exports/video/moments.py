@@ -55,7 +55,7 @@ def interpolated(a: Gaussians, b: Gaussians, share: float) -> Gaussians:
     there in one state alone stays where it is there, and fades.
 
     >>> a = Gaussians.of_points([[0, 0, 2]], radius=0.1)
-    >>> b = a.joined(Gaussians.of_points([[0, 1, 2]], radius=0.1))
+    >>> b = a.concatenate(Gaussians.of_points([[0, 1, 2]], radius=0.1))
     >>> interpolated(a, b, 0.5).opacities
     array([0.9 , 0.45], dtype=float32)
     """
