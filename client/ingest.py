@@ -19,7 +19,7 @@ from client.calls import Call
 from client.errors import ServiceError, error_of
 from client.retries import Retries
 from client.sdk import Client
-from client.wire import FrameReceipt, IngestAnswer, PartReceipt, frame_chunks
+from client.wire import CameraReceipt, FrameReceipt, IngestAnswer, frame_chunks
 
 ANSWER_S = 130.0
 """How long an acknowledgement may take."""
@@ -29,7 +29,7 @@ class IngestSocket:
     """One sender's connection to a scene. Close it, or use it in a `with`. Not to be shared by threads.
 
     Args:
-        client: whose service, token, patience and `on_retry` are used.
+        client: whose service, token, busy timeout and `on_retry` are used.
         scene: id.
 
     >>> n = client.scene(open_scene).next_frame
@@ -72,35 +72,35 @@ class IngestSocket:
 
     def put_camera(
         self, index: int, camera: str, image: bytes, mask: bytes | None = None, time: float | None = None
-    ) -> PartReceipt:
+    ) -> CameraReceipt:
         """As `Client.put_camera`."""
         masks = {} if mask is None else {camera: mask}
         receipt = self._send(frame_chunks(index, {camera: image}, masks, time, part=True))
-        assert isinstance(receipt, PartReceipt)
+        assert isinstance(receipt, CameraReceipt)
         return receipt
 
-    def _send(self, chunks: list[bytes]) -> FrameReceipt | PartReceipt:
+    def _send(self, chunks: list[bytes]) -> FrameReceipt | CameraReceipt:
         call: Call[Any] = Call("PUT", self._address, lambda response: None)
         client = self._client
-        retries = Retries(call, client.url, busy=client.patience, outage=client.outage, on_retry=client.on_retry)
+        retries = Retries(call, client.url, busy=client.busy_timeout, outage=client.outage, on_retry=client.on_retry)
         while True:
             wait: float | None
             try:
                 answer = self._exchange(chunks)
             except InvalidStatus as error:
                 refusal = error.response
-                wait = retries.after_answer(
+                wait = retries.after_response(
                     httpx.Response(
                         refusal.status_code, headers=dict(refusal.headers.raw_items()), content=bytes(refusal.body)
                     )
                 )
             except (OSError, TimeoutError, ConnectionClosed, InvalidHandshake) as error:
                 self.close()
-                wait = retries.after_break(httpx.ReadError(str(error)))
+                wait = retries.after_connection_error(httpx.ReadError(str(error)))
             else:
                 if answer.receipt is not None:
                     return answer.receipt
-                wait = retries.after_answer(_as_response(answer))
+                wait = retries.after_response(_as_response(answer))
             if wait is None:
                 raise ServiceError(error_of(_as_response(answer)).problem)
             time.sleep(wait)

@@ -34,13 +34,13 @@ def psnr(truth: Picture, render: Picture) -> float:
     return float(10 * np.log10(255**2 / error)) if error > 0 else float("inf")
 
 
-def coloured(labels: NDArray[np.uint8]) -> Picture:
+def colour_labels(labels: NDArray[np.uint8]) -> Picture:
     """Labels [H, W], one more than the part's and 0 for none, as [H, W, 3]: the service's colours, black for none."""
     palette = [(0, 0, 0), *(part_colour(label) for label in range(int(labels.max(initial=0))))]
     return np.array(palette, np.uint8)[labels]
 
 
-def brightness(depth: NDArray[np.floating]) -> Picture:
+def depth_to_grey(depth: NDArray[np.floating]) -> Picture:
     """Depth [H, W] as grey [H, W, 3], near is bright; black where there is none."""
     met = np.isfinite(depth)
     if not met.any():

@@ -77,7 +77,7 @@ class Retries:
         self._failures = 0
         self._lost = False
 
-    def after_break(self, error: httpx.TransportError) -> float:
+    def after_connection_error(self, error: httpx.TransportError) -> float:
         """Seconds to wait after no answer came.
 
         Raises:
@@ -94,7 +94,7 @@ class Retries:
         self._lost = self._lost or not unsent
         return wait
 
-    def after_answer(self, response: httpx.Response) -> float | None:
+    def after_response(self, response: httpx.Response) -> float | None:
         """Seconds to wait after an answer; None: it stands.
 
         Raises:
@@ -104,7 +104,7 @@ class Retries:
             return None
         wait = None
         if self.call.repeatable:
-            asked = seconds_asked(response.headers.get("Retry-After", ""))
+            asked = retry_after_seconds(response.headers.get("Retry-After", ""))
             if response.status_code == 429:
                 wait = self._busy_wait(asked, response)
             elif response.status_code in OUTAGE_STATUSES:
@@ -126,7 +126,7 @@ class Retries:
         wait = min(wait, self._busy_left)
         self._busy_left -= wait
         self._failed_at, self._failures = None, 0  # it answers
-        return self._tell(Retry("busy", wait, problem.detail))
+        return self._notify(Retry("busy", wait, problem.detail))
 
     def _outage_wait(self, asked: float, detail: str) -> float | None:
         now = time.monotonic()
@@ -138,15 +138,15 @@ class Retries:
         # 2**n of a day without an answer would overflow a float.
         grown = FIRST_WAIT_S * 2.0 ** min(self._failures - 1, 16)
         wait = max(min(grown, LONGEST_WAIT_S) * random.uniform(0.5, 1.0), asked)
-        return self._tell(Retry("outage", min(wait, left), detail))
+        return self._notify(Retry("outage", min(wait, left), detail))
 
-    def _tell(self, retry: Retry) -> float:
+    def _notify(self, retry: Retry) -> float:
         if self._on_retry is not None:
             self._on_retry(retry)
         return retry.seconds
 
 
-def seconds_asked(header: str) -> float | None:
+def retry_after_seconds(header: str) -> float | None:
     """Seconds that a Retry-After header asks for, a number or a date; None where it cannot be read."""
     if header.strip().isdigit():
         return float(header)

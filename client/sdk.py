@@ -32,7 +32,7 @@ TIMEOUT_S = 130.0
 """How long an answer may take: the service itself gives up on a render after 120 s."""
 
 
-def _signed(method: Callable[..., R], build: Callable[..., Any]) -> Callable[..., R]:
+def _with_signature(method: Callable[..., R], build: Callable[..., Any]) -> Callable[..., R]:
     """Gives a method the signature of its call, for `help` and editors."""
     signature = inspect.signature(build)
     self = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
@@ -47,7 +47,7 @@ def _sends(build: Callable[P, Call[T]]) -> Callable[Concatenate[Client, P], T]:
     def method(self: Client, /, *args: P.args, **kwargs: P.kwargs) -> T:
         return self.send(build(*args, **kwargs))
 
-    return _signed(method, build)
+    return _with_signature(method, build)
 
 
 def _sends_async(build: Callable[P, Call[T]]) -> Callable[Concatenate[AsyncClient, P], Coroutine[Any, Any, T]]:
@@ -55,24 +55,28 @@ def _sends_async(build: Callable[P, Call[T]]) -> Callable[Concatenate[AsyncClien
     async def method(self: AsyncClient, /, *args: P.args, **kwargs: P.kwargs) -> T:
         return await self.send(build(*args, **kwargs))
 
-    return _signed(method, build)
+    return _with_signature(method, build)
 
 
 class _ClientBase:
-    """Address, token and patience of both clients."""
+    """Address, token and timeouts of both clients."""
 
-    def __init__(self, url: str, token: str | None, patience: float, outage: float, on_retry: OnRetry | None) -> None:
+    def __init__(
+        self, url: str, token: str | None, busy_timeout: float, outage: float, on_retry: OnRetry | None
+    ) -> None:
         if not url.startswith(("http://", "https://")):
-            raise ValueError(f"url {url!r} is no address of a service; write http://{url.partition('://')[2] or url}")
+            raise ValueError(
+                f"url {url!r} is not the address of a service; write http://{url.partition('://')[2] or url}"
+            )
         self.url, self.token = url.rstrip("/"), token
-        self.patience, self.outage, self.on_retry = patience, outage, on_retry
+        self.busy_timeout, self.outage, self.on_retry = busy_timeout, outage, on_retry
 
     def _http_arguments(self) -> dict[str, Any]:
         headers = {} if self.token is None else {"Authorization": f"Bearer {self.token}"}
         return {"base_url": self.url, "timeout": httpx.Timeout(TIMEOUT_S, connect=10.0), "headers": headers}
 
     def _retries(self, call: Call[Any]) -> Retries:
-        return Retries(call, self.url, busy=self.patience, outage=self.outage, on_retry=self.on_retry)
+        return Retries(call, self.url, busy=self.busy_timeout, outage=self.outage, on_retry=self.on_retry)
 
 
 class Client(_ClientBase):
@@ -81,7 +85,7 @@ class Client(_ClientBase):
     Args:
         url: of the service.
         token: of a service that asks for one.
-        patience: seconds that a full queue (429) is waited for, in one call.
+        busy_timeout: seconds to wait for room in a full queue (429), per call.
         outage: seconds that a service that does not answer is waited for, in one call.
         on_retry: hears why and how long a call waits before it is sent again.
         transport: of httpx, instead of the network.
@@ -90,7 +94,7 @@ class Client(_ClientBase):
         ServiceError: the service refused; see `client.errors` for the kinds.
         ServiceUnreachable: nobody answered.
 
-    >>> with Client(url, patience=60) as client:
+    >>> with Client(url, busy_timeout=60) as client:
     ...     new = client.create_scene(rig)
     ...     receipt = client.put_frame(new.id, 0, pictures)
     ...     report = client.wait(new.id, 0)
@@ -105,12 +109,12 @@ class Client(_ClientBase):
         url: str = DEFAULT_URL,
         *,
         token: str | None = None,
-        patience: float = BUSY_S,
+        busy_timeout: float = BUSY_S,
         outage: float = OUTAGE_S,
         on_retry: OnRetry | None = None,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
-        super().__init__(url, token, patience, outage, on_retry)
+        super().__init__(url, token, busy_timeout, outage, on_retry)
         self._http = httpx.Client(transport=transport, **self._http_arguments())
 
     def __enter__(self) -> Client:
@@ -139,9 +143,9 @@ class Client(_ClientBase):
             try:
                 response = self._http.request(call.method, call.path, **call.arguments)
             except httpx.TransportError as error:
-                wait = retries.after_break(error)
+                wait = retries.after_connection_error(error)
             else:
-                wait = retries.after_answer(response)
+                wait = retries.after_response(response)
                 if wait is None:
                     return call.parse(response)
             time.sleep(wait)
@@ -205,10 +209,10 @@ class Client(_ClientBase):
         while True:
             status = self.scene(id)
             yield status
-            if _over(status, self.frame(id, index)):
+            if _is_finished(status, self.frame(id, index)):
                 return
             if time.monotonic() > until:
-                raise _too_long(id, index, seconds)
+                raise _timeout_error(id, index, seconds)
             time.sleep(every)
 
     def wait(self, id: str, index: int, *, seconds: float = BUSY_S, every: float = 0.2) -> FrameReportModel:
@@ -241,12 +245,12 @@ class AsyncClient(_ClientBase):
         url: str = DEFAULT_URL,
         *,
         token: str | None = None,
-        patience: float = BUSY_S,
+        busy_timeout: float = BUSY_S,
         outage: float = OUTAGE_S,
         on_retry: OnRetry | None = None,
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
-        super().__init__(url, token, patience, outage, on_retry)
+        super().__init__(url, token, busy_timeout, outage, on_retry)
         self._http = httpx.AsyncClient(transport=transport, **self._http_arguments())
 
     async def __aenter__(self) -> AsyncClient:
@@ -267,9 +271,9 @@ class AsyncClient(_ClientBase):
             try:
                 response = await self._http.request(call.method, call.path, **call.arguments)
             except httpx.TransportError as error:
-                wait = retries.after_break(error)
+                wait = retries.after_connection_error(error)
             else:
-                wait = retries.after_answer(response)
+                wait = retries.after_response(response)
                 if wait is None:
                     return call.parse(response)
             await asyncio.sleep(wait)
@@ -328,10 +332,10 @@ class AsyncClient(_ClientBase):
         while True:
             status = await self.scene(id)
             yield status
-            if _over(status, await self.frame(id, index)):
+            if _is_finished(status, await self.frame(id, index)):
                 return
             if time.monotonic() > until:
-                raise _too_long(id, index, seconds)
+                raise _timeout_error(id, index, seconds)
             await asyncio.sleep(every)
 
     async def wait(self, id: str, index: int, *, seconds: float = BUSY_S, every: float = 0.2) -> FrameReportModel:
@@ -341,9 +345,9 @@ class AsyncClient(_ClientBase):
         return await self.frame(id, index)
 
 
-def _over(status: SceneStatus, frame: FrameReportModel) -> bool:
+def _is_finished(status: SceneStatus, frame: FrameReportModel) -> bool:
     return frame.state in FINISHED or status.state == SceneState.FAILED
 
 
-def _too_long(id: str, index: int, seconds: float) -> TimeoutError:
+def _timeout_error(id: str, index: int, seconds: float) -> TimeoutError:
     return TimeoutError(f"scene {id}: frame {index} was not finished within {seconds:g} s")

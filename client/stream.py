@@ -68,7 +68,7 @@ __all__ = [
 ]
 
 
-BROKEN = (OSError, ConnectionClosed, InvalidHandshake, EOFError)
+CONNECTION_ERRORS = (OSError, ConnectionClosed, InvalidHandshake, EOFError)
 
 
 class Stream:
@@ -164,7 +164,7 @@ class Stream:
                 )
                 for subscription in session.subscriptions.values():
                     connection.send(subscription.model_dump_json())
-            except BROKEN as error:
+            except CONNECTION_ERRORS as error:
                 time.sleep(session.wait_after(error))
                 continue
             session.connected()
@@ -251,7 +251,7 @@ class AsyncStream:
                 connection = await connect_async(session.address, **session.arguments)
                 for subscription in session.subscriptions.values():
                     await connection.send(subscription.model_dump_json())
-            except BROKEN as error:
+            except CONNECTION_ERRORS as error:
                 await asyncio.sleep(session.wait_after(error))
                 continue
             session.connected()

@@ -23,7 +23,7 @@ from client.wire.base import Model
 from client.wire.stream import (
     SERVER_MESSAGE,
     STREAM_PROTOCOL,
-    BulkHead,
+    BinaryHead,
     FrameMessage,
     NoRequest,
     PartsSubscription,
@@ -47,7 +47,7 @@ RETRIED_STATUSES = (429, 502, 503, 504)
 
 
 @dataclass(frozen=True)
-class Bulk:
+class BinaryEvent:
     """A binary message of a subscription.
 
     Attributes:
@@ -70,7 +70,7 @@ class Bulk:
 
 
 @dataclass(frozen=True)
-class ViewEvent(Bulk):
+class ViewEvent(BinaryEvent):
     """A rendered view."""
 
     def picture(self) -> NDArray[Any]:
@@ -80,7 +80,7 @@ class ViewEvent(Bulk):
 
 
 @dataclass(frozen=True)
-class TracksEvent(Bulk):
+class TracksEvent(BinaryEvent):
     """Trajectories over the frames `first` to `frame`, which go on where the message before ended."""
 
     first: int
@@ -91,7 +91,7 @@ class TracksEvent(Bulk):
 
 
 @dataclass(frozen=True)
-class PartsEvent(Bulk):
+class PartsEvent(BinaryEvent):
     """Part labels of all Gaussians."""
 
     def model(self) -> PartsModel:
@@ -201,7 +201,7 @@ def parts(count: int | None = None, *, every: int = 1) -> SubscriptionRequest:
     return SubscriptionRequest(Topic.PARTS, PartsSubscription(count=count, every=every))
 
 
-def event_of(head: BulkHead, body: bytes) -> ViewEvent | TracksEvent | PartsEvent:
+def event_of(head: BinaryHead, body: bytes) -> ViewEvent | TracksEvent | PartsEvent:
     """The event of a binary message."""
     given = (head.id, head.tag, head.missed, head.frame, head.media_type, head.headers, body)
     if head.type == "tracks":

@@ -1,7 +1,7 @@
-"""The SCas4D method: arrays in, arrays out; no HTTP, no processes."""
+"""The SCas4D method as a library of array functions, without HTTP and without process management."""
 
 import os
 
-# OpenMP reads this once, when the first library that uses it (torch, scikit-learn, Numba) loads it. Waiting threads
-# must sleep: spinning ones cost multiples as soon as anything else wants their core.
+# OpenMP reads this variable once, when the first library that uses it (torch, scikit-learn, Numba) is loaded. Waiting
+# threads must sleep: spinning threads slow everything down several times when another process needs their core.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")

@@ -1,7 +1,7 @@
-"""Cameras, rigs, and the similarity to the inside world. Numpy only.
+"""Cameras, rigs and the similarity transform to the internal world frame. NumPy only.
 
-Axes are OpenCV's: x right, y down, z forward; ``X_cam = R X_world + t``; ``u = fx x/z + cx``.
-Pixel (column i, row j) covers [i, i+1) x [j, j+1); its centre is (i + 0.5, j + 0.5).
+Axes follow OpenCV: x right, y down, z forward; ``X_cam = R X_world + t``; ``u = fx x/z + cx``.
+Pixel (column i, row j) covers [i, i+1) x [j, j+1), and its centre is (i + 0.5, j + 0.5).
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from scas4d_core.errors import InputError
 Float = NDArray[np.float64]
 
 CAMERA_NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}$"
-"""The names that captures and the service take: files are named after them, and none leads out of a folder."""
+"""Pattern of valid camera names. Names are used as file names, so path separators are not allowed."""
 ROTATION_TOLERANCE = 1e-3
-"""Largest entry of R Rᵀ − I that still counts as a rotation: calibration files round to 4–6 digits."""
+"""Largest entry of R Rᵀ − I that is accepted as a rotation; calibration files round to 4–6 digits."""
 
 
 class CameraError(InputError):
-    """An impossible camera; the message names the camera, the field, the value and the remedy."""
+    """An invalid camera. The message gives the camera, the field, the value and the remedy."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,13 +32,14 @@ class Camera:
     """A pinhole camera without distortion.
 
     Attributes:
-        name: identifies the camera within its rig.
+        name: unique name of the camera within its rig.
         intrinsics: [3, 3] float64 in pixels, ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``.
         world_to_camera: [4, 4] float64, OpenCV axes.
-        width, height: picture size in pixels.
+        width, height: image size in pixels.
 
     Raises:
-        CameraError: not finite, focal length not positive, skew, no rotation, or empty picture.
+        CameraError: a value is not finite, a focal length is not positive, the intrinsics have skew, the rotation is
+            invalid, or the image is empty.
 
     >>> lens = [[100, 0, 32], [0, 100, 24], [0, 0, 1]]
     >>> camera = Camera("front", lens, np.eye(4), width=64, height=48)
@@ -66,7 +67,7 @@ class Camera:
                 raise CameraError(f"camera {self.name!r}: {field} holds NaN or infinity", "give finite numbers")
             value.setflags(write=False)
             object.__setattr__(self, field, value)
-        with np.errstate(over="ignore", invalid="ignore"):  # numbers near the largest are no rotation either
+        with np.errstate(over="ignore", invalid="ignore"):  # values that overflow fail the checks below
             self._check()
 
     def _check(self) -> None:
@@ -90,7 +91,7 @@ class Camera:
             )
         if not turns:
             raise CameraError(
-                f"camera {self.name!r}: world_to_camera[:3,:3] is no rotation (determinant {np.linalg.det(r):.4g})",
+                f"camera {self.name!r}: world_to_camera[:3,:3] is not a rotation (determinant {np.linalg.det(r):.4g})",
                 "give the rotation of world-to-camera with OpenCV axes",
             )
         if not np.allclose(self.world_to_camera[3], (0, 0, 0, 1)):
@@ -114,34 +115,34 @@ class Camera:
 
     @property
     def cx(self) -> float:
-        """Principal point, pixels from the left edge of the picture."""
+        """Principal point in pixels from the left edge of the image."""
         return float(self.intrinsics[0, 2])
 
     @property
     def cy(self) -> float:
-        """Principal point, pixels from the upper edge of the picture."""
+        """Principal point in pixels from the top edge of the image."""
         return float(self.intrinsics[1, 2])
 
     @property
     def rotation(self) -> Float:
-        """[3, 3] world to camera."""
+        """[3, 3] rotation from world to camera."""
         return self.world_to_camera[:3, :3]
 
     @property
     def translation(self) -> Float:
-        """[3] world to camera."""
+        """[3] translation from world to camera."""
         return self.world_to_camera[:3, 3]
 
     @property
     def centre(self) -> Float:
-        """[3] centre of projection in the world."""
+        """[3] centre of projection in world coordinates."""
         centre: Float = -self.rotation.T @ self.translation
         return centre
 
     def scaled(self, image_scale: float) -> Camera:
-        """The camera for pictures resized by ``image_scale``; sizes round to whole pixels.
+        """Returns the camera for images resized by ``image_scale``; sizes are rounded to whole pixels.
 
-        With pixel centres at +0.5 a resize multiplies u, v (and so fx, fy, cx, cy) by the exact ratio of the sizes.
+        With pixel centres at +0.5, resizing multiplies u, v (and therefore fx, fy, cx, cy) by the exact size ratio.
         """
         width = max(1, round(self.width * image_scale))
         height = max(1, round(self.height * image_scale))
@@ -149,12 +150,12 @@ class Camera:
         return Camera(self.name, self.intrinsics * ratio, self.world_to_camera, width, height)
 
     def to_camera(self, points: ArrayLike) -> Float:
-        """[..., 3] world points in camera axes."""
+        """Transforms world points [..., 3] to camera coordinates."""
         result: Float = np.asarray(points, dtype=np.float64) @ self.rotation.T + self.translation
         return result
 
     def project(self, points: ArrayLike) -> tuple[Float, Float]:
-        """[..., 3] world points to pixels [..., 2] and depths [...]; behind the camera (depth <= 0) pixels are NaN."""
+        """Projects world points [..., 3] to pixels [..., 2] and depths [...]; pixels are NaN if depth <= 0."""
         seen = self.to_camera(points)
         depth = seen[..., 2]
         safe = np.where(depth > 0, depth, np.nan)
@@ -162,7 +163,7 @@ class Camera:
         return uv, depth
 
     def unproject(self, uv: ArrayLike, depth: ArrayLike) -> Float:
-        """Pixels [..., 2] at depths [...] (along z, not along the ray) to world points [..., 3]."""
+        """Lifts pixels [..., 2] at depths [...] (along z, not along the ray) to world points [..., 3]."""
         uv = np.asarray(uv, dtype=np.float64)
         z = np.asarray(depth, dtype=np.float64)
         x = (uv[..., 0] - self.cx) / self.fx * z
@@ -173,13 +174,13 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class WorldFrame:
-    """The similarity from the user's world to the inside world: ``inside = (user − origin) · metres_per_unit``.
+    """The similarity from the user's world to the internal world: ``inside = (user − origin) · metres_per_unit``.
 
     Attributes:
         origin: [3] float64, in the user's units.
-        metres_per_unit: metres in one of the user's units.
+        metres_per_unit: metres per user unit.
 
-    >>> world = WorldFrame(origin=np.array([10.0, 0, 0]), metres_per_unit=0.01)  # of centimetres
+    >>> world = WorldFrame(origin=np.array([10.0, 0, 0]), metres_per_unit=0.01)  # the user's unit is 1 cm
     >>> world.to_inside([110.0, 0, 0])
     array([1., 0., 0.])
     >>> world.to_user([1.0, 0, 0])
@@ -190,34 +191,35 @@ class WorldFrame:
     metres_per_unit: float = 1.0
 
     def to_inside(self, points: ArrayLike) -> Float:
-        """[..., 3] user's units to metres about the origin."""
+        """Converts points [..., 3] from user units to metres relative to the origin."""
         result: Float = (np.asarray(points, dtype=np.float64) - self.origin) * self.metres_per_unit
         return result
 
     def to_user(self, points: ArrayLike) -> Float:
-        """[..., 3] metres about the origin to the user's units."""
+        """Converts points [..., 3] from metres relative to the origin to user units."""
         result: Float = np.asarray(points, dtype=np.float64) / self.metres_per_unit + self.origin
         return result
 
     def camera_to_inside(self, camera: Camera) -> Camera:
-        """The camera in the inside world; rotation and intrinsics stay."""
+        """Returns the camera in the internal world; its rotation and intrinsics do not change."""
         pose = camera.world_to_camera.copy()
         pose[:3, 3] = (camera.rotation @ self.origin + camera.translation) * self.metres_per_unit
         return Camera(camera.name, camera.intrinsics, pose, camera.width, camera.height)
 
 
 AUTO_RIG_RADIUS_M = 3.0
-"""``metres_per_unit="auto"`` takes the rig's radius for this many metres: a room-sized stage."""
+"""Rig radius in metres that ``metres_per_unit="auto"`` assumes, as for a room-sized stage."""
 ONE_PLACE = 1e-8
-"""User's units, or metres: a rig with a smaller radius is at one place; what is left is rounding of the poses."""
+"""Rig radius, in user units or metres, below which all cameras count as being at one place.
+"""
 
 LONG_LENS = 2.0
-"""Focal length over the longer side of the picture, from which a lens is long: one of 72 mm before film of 36 mm."""
+"""Ratio of focal length to the longer image side above which a lens counts as long: 72 mm on 36 mm film."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """Cameras that look at one scene; names are unique.
+    """An ordered set of cameras that observe the same scene; names are unique.
 
     >>> lens, pose = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4)
     >>> beside = pose.copy()
@@ -225,7 +227,7 @@ class Rig:
     >>> rig = Rig((Camera("left", lens, pose, 64, 48), Camera("right", lens, beside, 64, 48)))
     >>> rig.names, rig["right"].centre, rig.radius
     (('left', 'right'), array([2., 0., 0.]), 1.1)
-    >>> rig.world_frame("auto").metres_per_unit  # the rig's radius is taken for 3 m
+    >>> rig.world_frame("auto").metres_per_unit  # assumes a rig radius of 3 m
     2.727272727272727
     """
 
@@ -252,37 +254,38 @@ class Rig:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Camera names in the rig's order."""
+        """Camera names in rig order."""
         return tuple(camera.name for camera in self.cameras)
 
     @cached_property
     def centre(self) -> Float:
-        """[3] mean of the camera centres; not to be written to."""
+        """[3] mean of the camera centres; read-only."""
         centre: Float = np.mean([camera.centre for camera in self.cameras], axis=0)
         centre.setflags(write=False)
         return centre
 
     @property
     def radius(self) -> float:
-        """1.1 x the largest distance of a camera centre from their mean: the scene radius of Dynamic3DGaussians.
+        """1.1 x the largest distance of a camera centre from the mean centre: the scene radius of Dynamic3DGaussians.
 
-        One camera, or several at one place, do not determine the size of a scene, and with radius 0 nothing would move:
-        the radius is ``AUTO_RIG_RADIUS_M`` then, in the unit of the cameras.
+        A single camera, or several at one place, cannot determine the scene size, and a radius of 0 would give learning
+        rates of 0. In this case the radius is ``AUTO_RIG_RADIUS_M`` in the unit of the cameras.
         """
         return AUTO_RIG_RADIUS_M if self.at_one_place else self._spread
 
     @property
     def reach(self) -> float:
-        """The radius, less where most lenses are longer than ``LONG_LENS``: what they show is a part of the scene.
+        """The radius, reduced if the median focal ratio exceeds ``LONG_LENS``: long lenses show only part of the scene.
 
-        Rates of positions go by it: a step that is a pixel before a usual lens is ten before one ten times as long.
+        Position learning rates scale with it. A step that moves a point by one pixel in a normal lens moves it by ten
+        pixels in a lens that is ten times as long.
         """
         lens = float(np.median([camera.intrinsics[0, 0] / max(camera.width, camera.height) for camera in self.cameras]))
         return self.radius * min(1.0, LONG_LENS / lens)
 
     @property
     def at_one_place(self) -> bool:
-        """True where the cameras have no extent by which the scene could be measured."""
+        """True if the camera centres have no extent that could determine the scene scale."""
         return self._spread < ONE_PLACE
 
     @cached_property
@@ -290,13 +293,13 @@ class Rig:
         return float(1.1 * max(np.linalg.norm(camera.centre - self.centre) for camera in self.cameras))
 
     def world_frame(self, metres_per_unit: float | str = 1.0) -> WorldFrame:
-        """The similarity to the inside world, which is recentred on the rig.
+        """Returns the similarity to the internal world, which is centred on the rig.
 
         Args:
-            metres_per_unit: metres in one unit of the calibration, or "auto" to take the rig's radius for 3 m.
+            metres_per_unit: metres per calibration unit, or "auto" to assume a rig radius of 3 m.
 
         Raises:
-            CameraError: not a positive number, "auto" for cameras at one place, or poses too far away for numbers.
+            CameraError: the value is not positive, "auto" is used with all cameras at one place, or the poses overflow.
         """
         with np.errstate(over="ignore", invalid="ignore"):
             far = not np.isfinite(self._spread)
@@ -305,8 +308,8 @@ class Rig:
         if metres_per_unit == "auto":
             if self.at_one_place:
                 raise CameraError(
-                    f"metres_per_unit 'auto' goes by how far apart the cameras are, and {len(self)} camera(s) are at "
-                    f"one place",
+                    f"metres_per_unit 'auto' depends on the distances between cameras, and {len(self)} camera(s) are "
+                    "at one place",
                     f"give metres_per_unit as a number, such that what they see is about {AUTO_RIG_RADIUS_M:g} m away",
                 )
             metres = AUTO_RIG_RADIUS_M / self.radius
@@ -317,12 +320,12 @@ class Rig:
         return WorldFrame(self.centre, metres)
 
     def scaled(self, image_scale: float) -> Rig:
-        """The rig for pictures resized by ``image_scale``."""
+        """Returns the rig for images resized by ``image_scale``."""
         return Rig(tuple(camera.scaled(image_scale) for camera in self.cameras))
 
 
 def rig_inside(frame: WorldFrame, cameras: Sequence[Camera]) -> Rig:
-    """The rig of cameras moved to the inside world.
+    """Returns a rig of the cameras, transformed to the internal world.
 
     >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
     >>> rig_inside(WorldFrame(np.array([0.0, 0, 2]), 0.1), [camera])["front"].centre
@@ -332,7 +335,7 @@ def rig_inside(frame: WorldFrame, cameras: Sequence[Camera]) -> Rig:
 
 
 def farthest_first(centres: NDArray[np.floating], count: int) -> list[int]:
-    """So many of the points [N, 3], from the first on: each next one is the farthest from those taken.
+    """Returns indices of ``count`` of the points [N, 3] by farthest-point sampling, starting with the first point.
 
     >>> farthest_first(np.array([[0, 0, 0], [1, 0, 0], [5, 0, 0]]), 2)
     [0, 2]

@@ -1,12 +1,12 @@
-"""Checkpoints: the state of an update beside Θ_{t−1}, on disk, and the commit from which a scene is resumed.
+"""Checkpoints of the update state that is not part of Θ_{t−1}, and the commit from which a scene is resumed.
 
-A scene whose process died goes on with the same bits.
+After a crash, a scene continues with bit-identical results.
 
-Beside the frames of a ``History`` lies one ``checkpoint_<index>.npz`` for each of its newest commits. It is written,
-synced and renamed *before* the frame's own rename, which is the commit: a committed frame has its checkpoint, and a
-checkpoint without its frame does not count. The checkpoint before the newest is kept as well, in case the newest state
-or checkpoint is damaged. Facts that never change (exposures, presence of masks) are in the report of the first frame;
-clusters and neighbours are built again from the first frame, and a digest shows whether they changed.
+Each of the newest commits of a ``History`` has a file ``checkpoint_<index>.npz`` next to its frame. The file is
+written, synced and renamed *before* the frame itself is renamed, which is the commit. Every committed frame therefore
+has a checkpoint, and a checkpoint without a frame is ignored. The second newest checkpoint is kept in case the newest
+state or checkpoint is damaged. Constant data (exposures, presence of masks) is in the report of the first frame.
+Clusters and neighbours are rebuilt from the first frame, and a digest shows whether they changed.
 """
 
 from __future__ import annotations
@@ -36,22 +36,25 @@ from scas4d_core.update.warm_start import Motion
 
 
 class CheckpointError(ValueError):
-    """A checkpoint that is missing or damaged: the message names the file and the fault."""
+    """A missing or damaged checkpoint. The message gives the file and the fault."""
 
 
 @dataclass(frozen=True, eq=False)
 class CarryOver:
-    """The state that one update passes to the next beside Θ.
+    """The state, in addition to Θ, that one update passes to the next.
 
     Attributes:
-        motion: the motion found, or None where the next update starts cold.
-        labels: [N] the Gaussians that have been seen to move, in scenes without masks; None until some have.
-        seen: views of the last frame that was not held, in scenes without masks; the next are compared with them. While
-            frames stand as nothing was seen to move, those of the first that was looked at.
+        motion: motion of the last update; None if the next update is a cold start.
+        labels: [N] true for Gaussians that have been seen to move, in scenes without masks; None before the first
+            motion.
+        seen: views of the last accepted frame in scenes without masks; the views of the next frame are compared with
+            them. Until the first motion is detected, they stay those of the first frame, so that slow motion
+            accumulates.
         structure: digest of the clusters and neighbours that the motion belongs to.
         past: usual values of the scene and its cameras.
-        shown: fingerprint of each picture of the last frame that was not held (``checks``).
-        switches: of the effects, for the next update. effects: arrays that they left, by effect.
+        shown: fingerprint of each image of the last accepted frame (``checks``).
+        switches: on/off states of the effects for the next update. effects: arrays that the effects carry over, by
+            effect.
     """
 
     motion: Motion | None = None
@@ -71,11 +74,11 @@ class CarryOver:
         views: Sequence[TrainingView] | None,
         shown: Mapping[str, int],
     ) -> CarryOver:
-        """The carry-over of the next frame; of pictures that were not believed nothing is kept.
+        """Returns the carry-over for the next frame; the images of a rejected frame are not kept.
 
         Args:
-            result: of that frame. past: after it. time: its, seconds.
-            views: that it was updated with, or None in scenes with masks. shown: fingerprints of its pictures.
+            result: of the current frame. past: usual values after the frame. time: of the frame, in seconds.
+            views: used by the update, or None in scenes with masks. shown: fingerprints of the frame's images.
         """
         carried = replace(
             self,
@@ -85,7 +88,8 @@ class CarryOver:
         )
         if result.outcome.rejected:
             return carried
-        # A change of another light is no motion; a motion too small to be seen between two frames adds up.
+        # A lighting change is not motion. Motion that is too small between two frames adds up if the reference views
+        # are kept.
         resting = self.labels is None and result.outcome is FrameOutcome.UNCHANGED and bool(self.seen)
         if views is not None and result.exposure == 1.0 and not resting:
             carried = replace(carried, seen=[view for view in views if view.name not in result.trace.left_out])
@@ -93,13 +97,13 @@ class CarryOver:
 
 
 class Checkpoints:
-    """Writes and reads the checkpoints in the directory of a history; for the process that appends to it.
+    """Writes and reads the checkpoints in a history directory; used by the process that appends to the history.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
     ...     checkpoints = Checkpoints(Path(folder))
     ...     checkpoints.save(4, CarryOver(labels=np.array([True, False])))
-    ...     checkpoints.load(4, factory=None).labels  # without pictures no view is made
+    ...     checkpoints.load(4, factory=None).labels  # no factory is needed, because no images are stored
     ...     checkpoints.indices()
     array([ True, False])
     [4]
@@ -109,9 +113,9 @@ class Checkpoints:
         self.directory = directory
 
     def save(self, index: int, carry_over: CarryOver) -> None:
-        """Writes the state that frame ``index`` passes to the next; before the frame is committed.
+        """Writes the state that frame ``index`` passes to the next frame; call it before the frame is committed.
 
-        Without masks that includes the pictures of the frame, 3 bytes a pixel.
+        In scenes without masks, the file includes the frame's images at 3 bytes per pixel.
         """
         arrays: dict[str, Any] = {"structure": np.int64(carry_over.structure)}
         if carry_over.motion is not None:
@@ -128,20 +132,20 @@ class Checkpoints:
         for name, given in carry_over.effects.items():
             arrays |= {f"effect.{name}.{key}": array for key, array in given.items()}
         for view in carry_over.seen:
-            levels = np.rint(255 * view.target[:3]).astype(np.uint8)  # they were 8 bit: exact
+            levels = np.rint(255 * view.target[:3]).astype(np.uint8)  # exact: the source images are 8 bit
             arrays[f"seen.{view.name}"] = np.moveaxis(levels, 0, -1)
-        # An array lost by damage must not read as one that was never written.
+        # The list of names distinguishes an array that was lost from one that was never written.
         arrays["names"] = np.array(sorted(arrays))
         write_npz(self._file(index), arrays)
 
     def load(self, index: int, factory: ViewFactory) -> CarryOver:
-        """Reads the state that frame ``index`` passed on.
+        """Reads the state that frame ``index`` passed to the next frame.
 
         Args:
-            factory: of the scene's views; makes views of the pictures.
+            factory: creates views from the stored images.
 
         Raises:
-            CheckpointError: it is not there, or damaged.
+            CheckpointError: the checkpoint is missing or damaged.
         """
         file = self._file(index)
         try:
@@ -164,10 +168,10 @@ class Checkpoints:
             raise CheckpointError(message_of(error)) from error
 
     def clean(self, committed: Sequence[int]) -> None:
-        """Removes the checkpoints of all but the newest commits; after a commit.
+        """Removes all checkpoints except those of the newest commits; call it after a commit.
 
         Args:
-            committed: indices of the frames committed, rising.
+            committed: indices of the committed frames, ascending.
         """
         kept = set(committed[-NEWEST_KEPT:])
         for index in self.indices():
@@ -175,7 +179,7 @@ class Checkpoints:
                 self._file(index).unlink(missing_ok=True)
 
     def indices(self) -> list[int]:
-        """Frames that have a checkpoint, rising."""
+        """Returns the indices of frames that have a checkpoint, ascending."""
         listed = (checkpoint_of(file.name) for file in self.directory.iterdir())
         return sorted(index for index in listed if index is not None)
 
@@ -184,7 +188,7 @@ class Checkpoints:
 
 
 def _packed(motion: Motion) -> dict[str, Any]:
-    """The fields of a motion as arrays: numbers, arrays, and lists of arrays."""
+    """Returns the fields of a motion as named arrays: numbers, arrays and lists of arrays."""
     packed: dict[str, Any] = {}
     for item in fields(motion):
         value = getattr(motion, item.name)
@@ -197,7 +201,7 @@ def _packed(motion: Motion) -> dict[str, Any]:
 
 
 def _by_effect(arrays: Mapping[str, NDArray[Any]]) -> dict[str, Arrays]:
-    """The arrays of effects, by effect and name, of those in a file."""
+    """Returns the effects' arrays in a checkpoint, by effect and array name."""
     effects: dict[str, Arrays] = {}
     for key, array in arrays.items():
         kind, _, rest = key.partition(".")
@@ -220,7 +224,7 @@ def _unpacked(arrays: dict[str, NDArray[Any]]) -> Motion:
 
 
 def cold_start(history: History, index: int, masked: bool) -> CarryOver:
-    """The carry-over of a committed frame as far as the history has it: labels learnt, switches, arrays of effects.
+    """Returns the carry-over that can be rebuilt from a committed frame: learnt labels, switches and effect arrays.
 
     Args:
         masked: whether the scene has masks.
@@ -239,7 +243,7 @@ def cold_start(history: History, index: int, masked: bool) -> CarryOver:
 
 
 class ResumeError(ValueError):
-    """A history from which no scene can be resumed; the message names the damage."""
+    """A history from which no scene can be resumed. The message describes the damage."""
 
 
 @dataclass(frozen=True)
@@ -248,10 +252,10 @@ class ResumePoint:
 
     Attributes:
         index: of the commit.
-        undone: committed frames after it that were taken back; each has to be given again, or is lost.
-        faults: a sentence for each file that could not be used; empty after an ordinary end.
-        cold: true where the state is whole and its checkpoint is not: the next update starts without a motion, and the
-            scene is no longer bit-identical to one that was not disturbed.
+        undone: indices of later committed frames that were rolled back; each must be sent again or is lost.
+        faults: one sentence per file that could not be used; empty after a normal shutdown.
+        cold: true if the state is intact but its checkpoint is not. The next update then starts without motion, and the
+            results are no longer bit-identical to those of an undisturbed scene.
     """
 
     index: int
@@ -263,11 +267,14 @@ class ResumePoint:
 def find_commit(
     history: History, checkpoints: Checkpoints, factory: ViewFactory, held: Callable[[int], bool]
 ) -> tuple[int, CarryOver | None, list[str]]:
-    """Finds the commit to resume from: its index, its checkpoint (None: a cold start), and the damage that was found.
+    """Finds the commit to resume from.
 
     Args:
-        history, checkpoints: of the scene. factory: of its views.
-        held: true for a committed frame whose pictures can be given again.
+        history, checkpoints: of the scene. factory: creates its views.
+        held: returns true for a committed frame whose images can be sent again.
+
+    Returns:
+        The index of the commit, its carry-over (None for a cold start), and a description of each damage found.
 
     Raises:
         ResumeError: no state can be read.
@@ -285,7 +292,7 @@ def find_commit(
         except (HistoryError, CheckpointError) as error:
             faults.append(str(error))
             if index not in checkpoints.indices() and whole:
-                break  # too old to have a checkpoint: no commit before it has one either
+                break  # older commits have no checkpoint
     if not whole:
         raise ResumeError("no state can be read: " + "; ".join(faults))
     later = sorted({*history.indices, *history.damaged})

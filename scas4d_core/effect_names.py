@@ -1,7 +1,7 @@
-"""Names of all effects with the module of each, and the modes that settings can pin them to.
+"""Names and modules of all effects, and the modes that settings can give them.
 
-Adding an effect is a file in ``effects/`` and a line here. Nothing is imported here: settings check names with it, and
-the module of an effect is imported when the effect is first asked for (``effects.effect.effect``).
+To add an effect, add a file in ``effects/`` and an entry here. This module imports no effect: settings validate names
+with it, and ``effects.effect.effect`` imports an effect's module on first use.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Literal
 
 Mode = Literal["auto", "on", "off"]
-"""Left to the evidence, pinned on, pinned off."""
+""""auto" decides from the evidence in the images; "on" and "off" are fixed."""
 
 EFFECTS = {
     "cluster_rotation": "scas4d_core.effects.motion.cluster_rotation",
@@ -39,4 +39,4 @@ EFFECTS = {
     "entering": "scas4d_core.effects.presence.entering",
     "leaving": "scas4d_core.effects.presence.leaving",
 }
-"""The module of each effect, by its name; in the order in which they take part in an iteration."""
+"""Maps the name of each effect to its module, in the order in which the effects run in an iteration."""

@@ -1,4 +1,4 @@
-"""Errors with a fault and a remedy, and errors as text without paths of this machine. Standard library only."""
+"""Errors with a fault and a remedy, and error messages without local paths. Standard library only."""
 
 from __future__ import annotations
 
@@ -6,14 +6,16 @@ import os
 import re
 
 _PATH = re.compile(r"(?<![\w.:/])/(?:[^\s'\"<>|:;,()\[\]]+/)*[^\s'\"<>|:;,()\[\]/]*")
-"""An absolute path within a sentence; addresses as ``http://…`` do not begin with a slash."""
+"""Matches an absolute path within a sentence. URLs such as ``http://…`` do not match because they do not begin with a
+slash.
+"""
 
 
 class InputError(ValueError):
-    """Something that was given cannot be used; the text is "fault; remedy".
+    """An unusable input. The message is "fault; remedy".
 
     Attributes:
-        fault: what is wrong, with the value. remedy: what to give instead, or "".
+        fault: what is wrong, including the value. remedy: what to give instead, or "".
     """
 
     def __init__(self, fault: str, remedy: str = "") -> None:
@@ -22,7 +24,7 @@ class InputError(ValueError):
 
 
 def without_paths(text: str) -> str:
-    """Shortens every absolute path that may be one of this machine to its last part; ``/v1/scenes`` stays.
+    """Shortens each absolute path on this machine to its last component; ``/v1/scenes`` is unchanged.
 
     >>> without_paths("cannot read /usr/share/scenes/a.npz of /v1/scenes/a")
     'cannot read a.npz of /v1/scenes/a'
@@ -31,7 +33,7 @@ def without_paths(text: str) -> str:
 
 
 def message_of(error: BaseException) -> str:
-    """The message of an error without paths; of an ``OSError`` the system's text, because its own names the file.
+    """Returns an error's message without paths; an ``OSError`` gives only the system's text.
 
     >>> message_of(OSError(28, "No space left on device", "/usr/share/a.npz"))
     'No space left on device'
@@ -52,4 +54,4 @@ def _last_part(found: re.Match[str]) -> str:
 
 
 class StepError(ValueError):
-    """A frame that cannot be stepped to; the state is as it was."""
+    """A frame that cannot be processed; the state is unchanged."""

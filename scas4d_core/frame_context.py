@@ -1,4 +1,4 @@
-"""One frame on its way through ``Reconstruction.step``: what each stage adds, from its pictures to the commit."""
+"""The data of one frame during ``Reconstruction.step``; each stage adds its results."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from scas4d_core.update.result import Stopwatch, UpdateResult
 
 @dataclass(frozen=True, eq=False)
 class FrameInput:
-    """What the pictures of a frame say before any update.
+    """The measurements taken from a frame's images before its update.
 
     Attributes:
-        seconds: since the last committed frame. views: of all its cameras.
-        bright: by camera, mean of the picture, 0…1. fingerprints: by camera, of the picture.
-        exposure: times that the frame is brighter than usual. left_out: cameras whose pictures are not believed, with
-            the reason. unusable: why the frame cannot be used, or None (``robust.checks.check_brightness``).
-        light_changes: whether the light goes on changing from frame to frame.
-        past: usual figures of the scene, with this frame's brightness.
+        seconds: since the last committed frame. views: of all cameras that have an image.
+        bright: mean brightness of each camera's image, 0…1. fingerprints: of each camera's image.
+        exposure: brightness of the frame relative to the usual brightness. left_out: excluded cameras, with the reason.
+            unusable: why the frame cannot be used, or None (``robust.checks.check_brightness``).
+        light_changes: whether the lighting changes from frame to frame.
+        past: usual values of the scene, including this frame's brightness.
     """
 
     seconds: float
@@ -40,25 +40,25 @@ class FrameInput:
 
     @property
     def believed(self) -> list[TrainingView]:
-        """The views to learn from."""
+        """The views that the update learns from."""
         return [view for view in self.views if view.name not in self.left_out]
 
     @property
     def steady(self) -> bool:
-        """True where differences of the pictures to those before are motion, and not light."""
+        """True if image differences from the previous frame are due to motion and not to lighting."""
         return self.unusable is None and self.exposure == 1.0
 
 
 @dataclass(eq=False)
 class FrameContext:
-    """One frame on its way; each stage of ``Reconstruction.step`` fills in what it adds.
+    """A frame during processing; each stage of ``Reconstruction.step`` fills in its fields.
 
     Attributes:
-        frame: with its pictures decoded. watch: times the stages. dropped: cameras that the caller has left out, with
-            the reason. notes: further facts to commit, as JSON.
-        frame_input: by "observe". prepared, update_input: the updater and its input, by "prepare".
-        result, past: of the update, by "solve". check_seconds: seconds that checks took beside it.
-        birth_fit_time: time for Gaussians that are born, by "populate".
+        frame: with decoded images. watch: times the stages. dropped: cameras excluded by the caller, with the reason.
+            notes: additional data to commit, as JSON.
+        frame_input: set by the "observe" stage. prepared, update_input: the updater and its input, set by "prepare".
+        result, past: of the update, set by "solve". check_seconds: time of the checks outside the update, in seconds.
+        birth_fit_time: time for fitting added Gaussians, spent by "populate".
     """
 
     frame: Frame

@@ -1,4 +1,4 @@
-"""Outcomes of a frame, as enums: light enough for every process, with the texts that people read in one place."""
+"""Frame outcomes and alarms as enums, and their texts for people; imports are light enough for every process."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from enum import StrEnum
 from typing import Any, TypedDict
 
 REJECTED_TEXT = "previous state kept: "
-"""The beginning of the text for a frame whose state is the one before."""
+"""Prefix of the text for a frame that keeps the previous state."""
 
 
 OTHER_ORDERS = "other orders"
-"""Stage of a report: the time that a first update took in orders of its views that were not kept."""
+"""Report stage: time that a first update spent on view orders that were discarded."""
 
 
 class Candidate(StrEnum):
-    """A state that may become Θ_t; the better one on the probe views does. The values are those on disk."""
+    """A candidate for Θ_t; the one with the smallest error on the probe views is kept. Values are stored on disk."""
 
     END = "end"
-    """The end of the update."""
+    """The state at the end of the update."""
     PREVIOUS = "previous"
-    """Θ_{t−1}, not moved."""
+    """Θ_{t−1}, unchanged."""
     WARM = "warm"
-    """Θ_{t−1} moved on by the warm start alone."""
+    """Θ_{t−1} moved by the warm start only."""
 
 
 class FrameOutcome(StrEnum):
@@ -34,89 +34,92 @@ class FrameOutcome(StrEnum):
     """
 
     UPDATED = "updated"
-    """The update went as it should."""
+    """The update succeeded."""
     UNCHANGED = "unchanged"
-    """Θ_{t−1} shows the frame already; no iteration was needed, and nothing was learnt."""
+    """Θ_{t−1} already matches the frame; no iteration was needed and nothing was learnt."""
     RETRIED = "retried"
-    """Committed by a later attempt, with smaller steps or rigid layers: those before gave no plausible state."""
+    """Committed by a later attempt, with smaller steps or rigid layers, because the first attempts gave no plausible
+    state.
+    """
     RELOCATED = "relocated"
-    """Committed after a longer search: the update as set had not met the frame."""
+    """Committed after a longer search, because the regular update did not match the frame."""
     ACCEPTED = "accepted"
-    """Committed although it is not met: as many frames as the patience allows were held before it."""
+    """Committed although it does not match the images, because `max_rejected_frames` frames were rejected before it."""
     REJECTED_UNUSABLE = "rejected_unusable"
-    """Θ_{t−1} stays: the pictures are too dark or too bright to learn from."""
+    """Θ_{t−1} is kept: the images are too dark or too bright to learn from."""
     REJECTED_IMPLAUSIBLE = "rejected_implausible"
-    """Θ_{t−1} stays: no attempt gave a finite, bounded and plausible state."""
+    """Θ_{t−1} is kept: no attempt gave a finite, bounded and plausible state."""
     REJECTED_MISFIT = "rejected_misfit"
-    """Θ_{t−1} stays: no state was found that shows the frame."""
+    """Θ_{t−1} is kept: no state was found that matches the frame."""
 
     @property
     def rejected(self) -> bool:
-        """True where the state of the frame before stays, because the frame was not believed."""
+        """True if the frame was rejected and the previous state is kept."""
         return self in (self.REJECTED_UNUSABLE, self.REJECTED_IMPLAUSIBLE, self.REJECTED_MISFIT)
 
     @property
     def degraded(self) -> bool:
-        """True where the state is not the frame's, or only in part."""
+        """True for every outcome except UPDATED and UNCHANGED."""
         return self not in (self.UPDATED, self.UNCHANGED)
 
     @property
     def learnt(self) -> bool:
-        """True where the state was updated to the frame's pictures."""
+        """True if the state was updated to the frame's images."""
         return not self.rejected and self is not self.UNCHANGED
 
 
 class AlarmKind(StrEnum):
-    """Subject of an alarm. The values are those on disk and on the wire; ``robust/alarms.py`` says when."""
+    """Subject of an alarm. The values are used on disk and in messages; see ``robust/alarms.py`` for the conditions."""
 
     CAMERA_LEFT_OUT = "camera_left_out"
-    """Nothing was learnt from the camera: no picture came, or it was not believed."""
+    """Nothing was learnt from the camera: its image is missing or was excluded."""
     CAMERA_MISFIT = "camera_misfit"
-    """The camera's picture fits worse than usual beside the others: moved, dirty, late."""
+    """The camera's image fits worse than usual, compared with the other cameras: moved, dirty or late."""
     CAMERA_COLOURS = "camera_colours"
-    """The camera's colours are off against its own past and the other cameras: exposure, white balance."""
+    """The camera's colours differ from its own past and from the other cameras: exposure or white balance."""
     CAMERA_SHARPNESS = "camera_sharpness"
-    """The camera's picture is less sharp, or noisier, against its own past and the other cameras."""
+    """The camera's image is blurrier or noisier than its own past and the other cameras."""
     CAMERA_FROZEN = "camera_frozen"
-    """The camera sends the same picture again, bit by bit, while the others go on."""
+    """The camera repeats a bit-identical image while the other cameras change."""
     LIGHT = "light"
-    """All cameras see another light than the colours are in."""
+    """All cameras see a lighting change relative to the scene's colours."""
     FRAME_REPEATED = "frame_repeated"
-    """All cameras send the same pictures again, bit by bit."""
+    """All cameras repeat bit-identical images."""
     FRAME_IN_PART = "frame_in_part"
     """The frame was committed in part, or after a longer search."""
     FRAME_REJECTED = "frame_rejected"
-    """The frame was not believed, and the state of the frame before stays."""
+    """The frame was rejected, and the previous state is kept."""
 
 
 @dataclass(frozen=True)
 class Alarm:
-    """Something that a person should look at; an entry of the report of a frame.
+    """A condition that needs a person's attention; an entry of a frame's report.
 
     Attributes:
-        what: it is about. camera: that it is about, or None. evidence: for people, with figures.
+        kind: subject of the alarm. camera: affected camera, or None. evidence: text for people, with figures.
     """
 
-    what: AlarmKind
+    kind: AlarmKind
     camera: str | None
     evidence: str
 
 
 class CameraTiming(TypedDict):
-    """The moment at which a camera's pictures seem to be taken; a row of the report, as it is on disk.
+    """The estimated capture time of a camera relative to the others; a row of the report on disk.
 
     Keys:
-        frames: after the others' (+) or before them (−), whose median is 0. error: of that, a standard error.
-        off: whether the camera is clearly out of step.
+        frames: delay in frames after (+) or before (−) the median of the cameras, which is 0. error: its standard
+            error.
+        out_of_step: whether the camera is clearly out of step.
     """
 
     frames: float
     error: float
-    off: bool
+    out_of_step: bool
 
 
 def degraded_text(outcome: FrameOutcome, reason: str) -> str | None:
-    """The sentence of a report for people; None of a frame that went as it should.
+    """Returns the report's sentence for people; None if the frame is not degraded.
 
     >>> degraded_text(FrameOutcome.REJECTED_MISFIT, "the pictures are met at 12.0 dB")
     'previous state kept: the pictures are met at 12.0 dB'
@@ -127,15 +130,16 @@ def degraded_text(outcome: FrameOutcome, reason: str) -> str | None:
 
 
 COVERS_LITTLE = 0.25
-"""Share of the pictures up to which the points of frame 0 that cameras agree on cover little: from
-it on the surest ways to points are enough (``first_frame.initial_points``)."""
+"""Minimum share of the images that the initial points confirmed by several cameras cover. Below it, frame 0 is partly a
+guess; above it, no other methods are needed (``first_frame.initial_points``).
+"""
 
 
 def cloud_warnings(cloud: Mapping[str, Any] | None) -> list[str]:
-    """Sentences that say how unsure frame 0 is, for what its first points were made from; none where it is sure.
+    """Returns sentences on how uncertain frame 0 is because of its initial points; empty if it is certain.
 
     Args:
-        cloud: record of a ``FirstCloud``; None: of a frame that is not the first.
+        cloud: record of a ``FirstCloud``; None for any frame but the first.
 
     >>> cloud_warnings({"method": "agreement", "points": 9000, "coverage": 0.9})
     []
@@ -157,7 +161,7 @@ def cloud_warnings(cloud: Mapping[str, Any] | None) -> list[str]:
 
 
 def time_warnings(shortened: Sequence[str]) -> list[str]:
-    """The sentence on what the time of frame 0 was too short for; none where it was enough.
+    """Returns a sentence on the steps that frame 0 had no time for; empty if the time was sufficient.
 
     >>> time_warnings(["no stereo", "1500 of 3000 iterations"])[0][:75]
     'frame 0 had too little time: no stereo; 1500 of 3000 iterations; if its vie'
@@ -169,10 +173,10 @@ def time_warnings(shortened: Sequence[str]) -> list[str]:
 
 
 def grey_warnings(grey: Sequence[str]) -> list[str]:
-    """The sentence on grey cameras beside colour ones; none where there are none.
+    """Returns a sentence on grayscale cameras mixed with colour cameras; empty if there are none.
 
     Args:
-        grey: names of them.
+        grey: names of the grayscale cameras.
 
     >>> grey_warnings(["left"])[0][:41]
     'grey cameras beside colour ones: left; th'
@@ -186,7 +190,7 @@ def grey_warnings(grey: Sequence[str]) -> list[str]:
 
 
 def first_warnings(record: Mapping[str, Any]) -> list[str]:
-    """Warnings of the report of the first frame, a sentence each.
+    """Returns the warnings in the report of the first frame, one sentence each.
 
     Args:
         record: the report as JSON, or its ``cloud``, ``calibration``, ``shortened`` and ``grey`` alone.
@@ -203,19 +207,20 @@ def first_warnings(record: Mapping[str, Any]) -> list[str]:
 
 
 def timing_warnings(timing: Mapping[str, CameraTiming] | None) -> list[str]:
-    """A sentence on the cameras that are clearly out of step; none where none is.
+    """Returns a sentence on the cameras that are clearly out of step; empty if there are none.
 
-    It is a lasting fault of a rig, and no news in each frame: the status of a scene has it for as long as it is so, in
-    the same words; the figures, which change from frame to frame, are in the report.
+    This is a lasting fault of the rig, not news of a frame. The scene status shows it in constant words while it lasts;
+    the figures, which change from frame to frame, are in the report.
 
     Args:
-        timing: of the newest report; None: it has none.
+        timing: of the newest report; None if it has none.
 
-    >>> in_step, late = {"frames": 0.02, "error": 0.03, "off": False}, {"frames": 0.41, "error": 0.03, "off": True}
+    >>> in_step = {"frames": 0.02, "error": 0.03, "out_of_step": False}
+    >>> late = {"frames": 0.41, "error": 0.03, "out_of_step": True}
     >>> timing_warnings({"a": late, "b": in_step})
     ["cameras are out of step: 'a' is late; check their trigger or genlock"]
     """
-    off = {name: one["frames"] for name, one in sorted((timing or {}).items()) if one["off"]}
+    off = {name: one["frames"] for name, one in sorted((timing or {}).items()) if one["out_of_step"]}
     if not off:
         return []
     cameras = ", ".join(f"{name!r} is {'late' if way > 0 else 'early'}" for name, way in off.items())

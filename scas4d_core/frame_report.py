@@ -1,4 +1,4 @@
-"""Report of frame 0, or of the update of a frame: it is committed beside the state."""
+"""Report of frame 0 or of an update; it is committed together with the state."""
 
 from __future__ import annotations
 
@@ -32,19 +32,19 @@ from scas4d_core.update.best_state import mean_error
 from scas4d_core.update.result import CameraFit, Stopwatch, UpdateResult
 
 REPORTED_ITERATIONS = 24
-"""The report's training loss is a mean over this many last iterations: about one round of a rig's cameras."""
+"""Number of final iterations over which the report averages PSNR: about one pass over the rig's cameras."""
 REPORTED_LOSSES = 100
-"""Of frame 0's thousands of losses the report keeps so many means at most."""
+"""Maximum number of averaged losses that the report keeps from the thousands of frame 0."""
 CHECKPOINTS = 10
-"""Points of the curve of an update at most."""
+"""Maximum number of points on an update's curve."""
 
 
 class CurvePoint(TypedDict):
-    """A point of an update's curve, as it is on disk.
+    """A point on an update's loss curve, as stored on disk.
 
     Keys:
-        iterations: done. milliseconds: since the update began; decoding is before it. loss: mean training loss of the
-        iterations since the point before.
+        iterations: completed so far. milliseconds: since the update began, without decoding. loss: mean training loss
+            since the previous point.
     """
 
     iterations: int
@@ -54,33 +54,39 @@ class CurvePoint(TypedDict):
 
 @dataclass(frozen=True)
 class FrameReport:
-    """Report of frame 0, or of the update of a frame.
+    """Report of frame 0 or of the update of a frame.
 
     Attributes:
         outcome: of the frame.
-        seconds: by stage; ``report`` is what this report costs, and the writing of the one before.
-        loss: each iteration's weighted sum; of frame 0 at most ``REPORTED_LOSSES`` means.
-        psnr: dB, over the training views of the last iterations, each as it was rendered then; NaN where not measured.
-        moving, gaussians: how many Gaussians move, and are there. born, retired, revived: how many were, in this frame.
-        postponed: what the budget left no time for, in words; the next frame has some for it.
-        alarms: what a person should look at (``robust/alarms.py``).
-        timing: by camera, frames after the others at which its pictures seem to be taken, by all frames so far; only
-            of cameras for which the motion determines it well enough (``robust/timing.py``).
-        cloud: of frame 0: where its first points came from. calibration: of frame 0, against its pictures.
-        cameras: by name, how well each camera's picture was met when it was last rendered: a bumped camera shows.
-        used: cameras whose pictures were learnt from; none of a rejected or skipped frame. dropped: cameras left
-            out, with the reason.
-        degraded: for people, why the state is not the frame's, or only in part; None of a frame that went as it should.
-        attempts: each attempt at the frame, with what came of it.
-        exposure: times that the frame was seen to be brighter than the light in which the colours are; of a frame that
-            was not tried, as the mean brightness of its pictures says. A light that stays becomes that of the colours.
-        frozen: Gaussians that keep their previous state, one by one. guards: by name, how often each guard acted.
-        planned: (iteration, iterations in all) whenever the stopping rule, or the time of frame 0, planned otherwise.
-        shortened: of frame 0: what its time (``StaticSettings.seconds``) was too short for, in words; a few iterations
-            fewer are in ``planned`` alone. grey: of frame 0: grey cameras, where others have colours.
+        seconds: by stage; ``report`` is the time for this report and for writing the previous one.
+        loss: weighted loss of each iteration; for frame 0, at most ``REPORTED_LOSSES`` means.
+        psnr: dB, mean over the training views of the last iterations, as rendered at the time; NaN if not measured.
+        moving, gaussians: numbers of moving and of present Gaussians. born, retired, revived: numbers of such Gaussians
+            in this frame.
+        postponed: work that did not fit the time budget, in words; the next frame has time for some of it.
+        alarms: conditions that need attention (``robust/alarms.py``).
+        timing: by camera, estimated delay in frames relative to the others, from all frames so far. Only cameras whose
+            delay the motion determines well are included (``robust/timing.py``).
+        cloud: frame 0 only: origin of the initial points. calibration: frame 0 only: check of the calibration against
+            the images.
+        cameras: by name, how well each camera's image was matched when last rendered; reveals a bumped camera.
+        used: cameras that were learnt from; empty for a rejected or skipped frame. dropped: excluded cameras, with the
+            reason.
+        degraded: explanation for people if the outcome is degraded; None if it is not.
+        attempts: each attempt at the frame, with its result.
+        exposure: brightness of the frame relative to the lighting in which the colours were learnt. For a frame that
+            was not tried, it is estimated from the mean image brightness. A lasting light change is learnt into the
+            colours.
+        frozen: number of single Gaussians that keep their previous state. guards: number of times each guard acted, by
+            name.
+        planned: (iteration, total iterations) for each change of plan by the stopping rule or the time limit of frame
+            0.
+        shortened: frame 0 only: steps for which ``StaticSettings.seconds`` was too short, in words; small reductions of
+            the iterations appear only in ``planned``. grey: frame 0 only: grayscale cameras in a rig with colour
+            cameras.
         curve: of the last attempt.
-        errors: mean image loss on the probe views by candidate, in pictures without the gain of ``exposure``.
-            kept: the candidate that the state is; "previous" where the frame was held.
+        errors: mean image loss on the probe views by candidate, on images without the gain of ``exposure``.
+        candidate: the candidate that became the state; "previous" if the frame was rejected.
     """
 
     index: int
@@ -103,7 +109,7 @@ class FrameReport:
     planned: list[tuple[int, int]] = field(default_factory=list)
     curve: list[CurvePoint] = field(default_factory=list)
     errors: dict[Candidate, float] = field(default_factory=dict)
-    kept: Candidate = Candidate.END
+    candidate: Candidate = Candidate.END
     born: int = 0
     retired: int = 0
     revived: int = 0
@@ -117,20 +123,20 @@ class FrameReport:
 
     @property
     def warnings(self) -> list[str]:
-        """Sentences on what looks wrong, or was too much for its time (``first_warnings``, ``timing_warnings``)."""
+        """Sentences on likely faults and on steps that had no time (``first_warnings``, ``timing_warnings``)."""
         named = {"cloud": self.cloud, "calibration": self.calibration}
         given = {name: asdict(value) for name, value in named.items() if value is not None}
         first = first_warnings({**given, "shortened": self.shortened, "grey": self.grey})
         return [*first, *timing_warnings(self.timing)]
 
     def record(self) -> dict[str, Any]:
-        """The report as JSON: numbers that are not finite are None."""
+        """Returns the report as JSON data; non-finite numbers become None."""
         record: dict[str, Any] = _finite(asdict(self))
         return record
 
 
 def _finite(value: Any) -> Any:
-    """The same, with None for numbers that JSON does not have."""
+    """Returns the value with None in place of non-finite numbers, which JSON cannot represent."""
     if isinstance(value, dict):
         return {str(name): _finite(inner) for name, inner in value.items()}
     if isinstance(value, list | tuple):
@@ -149,11 +155,11 @@ def report_of_first(
     dropped: Mapping[str, str] | None,
     calibration: CalibrationReport | None = None,
 ) -> FrameReport:
-    """The report of frame 0.
+    """Returns the report of frame 0.
 
     Args:
-        names: of the rig's cameras. moving: Gaussians in the hierarchy. seconds: by stage.
-        dropped: cameras that the caller has left out, with the reason. calibration: as it was measured.
+        names: of the rig's cameras. moving: number of Gaussians in the hierarchy. seconds: by stage.
+        dropped: cameras excluded by the caller, with the reason. calibration: check of the calibration, if measured.
     """
     return FrameReport(
         index=frame.index,
@@ -186,13 +192,13 @@ def report_of_update(
     dropped: Mapping[str, str] | None,
     postponed: Sequence[str] = (),
 ) -> FrameReport:
-    """The report of an update.
+    """Returns the report of an update.
 
     Args:
-        result: that is committed. before: the state committed before.
-        left_out: cameras whose pictures were not believed at first sight, with the reason.
-        names: of the rig's cameras. watch: with the stages "decode", "judge" and "update", and "presence" if it was.
-        dropped: cameras that the caller has left out, with the reason. postponed: see ``FrameReport``.
+        result: that is committed. before: the previously committed state.
+        left_out: cameras excluded by the first checks, with the reason.
+        names: of the rig's cameras. watch: has the stages "decode", "judge", "update" and optionally "presence".
+        dropped: cameras excluded by the caller, with the reason. postponed: see ``FrameReport``.
     """
     trace, gaussians = result.trace, result.gaussians
     began = perf_counter()
@@ -227,7 +233,7 @@ def report_of_update(
         planned=trace.planned,
         curve=curve(trace.losses, trace.iteration_ends),
         errors={candidate: mean_error(errors, list(errors)) for candidate, errors in trace.errors.items()},
-        kept=trace.kept,
+        candidate=trace.kept,
         born=len(gaussians) - len(before),
         retired=int((gaussians.retired[: len(before)] & before.present).sum()),
         revived=int((gaussians.present[: len(before)] & before.retired).sum()),
@@ -240,17 +246,17 @@ def report_of_update(
 
 
 def _last(psnr: Sequence[float]) -> float:
-    """Mean dB of the last views rendered."""
+    """Returns the mean PSNR in dB of the last rendered views."""
     return float(np.mean(psnr[-REPORTED_ITERATIONS:])) if psnr else nan
 
 
 def means(values: list[float], most: int) -> list[float]:
-    """At most so many means of consecutive values."""
+    """Returns at most ``most`` means of consecutive values."""
     return [float(np.mean(part)) for part in np.array_split(values, max(1, min(len(values), most))) if len(part)]
 
 
 def curve(losses: list[float], moments: list[float]) -> list[CurvePoint]:
-    """The curve of an update from the loss of each iteration and the seconds at its end."""
+    """Returns the curve of an update from each iteration's loss and end time in seconds."""
     ends = np.unique(np.linspace(0, len(moments), CHECKPOINTS + 1).round().astype(int))
     return [
         CurvePoint(iterations=int(end), milliseconds=1000 * moments[end - 1], loss=float(np.mean(losses[begin:end])))

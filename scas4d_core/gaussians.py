@@ -1,4 +1,4 @@
-"""Θ, the state of a scene: an ordered set of 3D Gaussians, which grows and never shrinks. Numpy only."""
+"""Θ, the state of a scene: an ordered, append-only set of 3D Gaussians. NumPy only."""
 
 from __future__ import annotations
 
@@ -13,33 +13,36 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float32]
 
 WHOLE: Mapping[str, Any] = MappingProxyType({"whole": True})
-"""Metadata of a field of ``Gaussians`` without a row per Gaussian; such a field may be None."""
+"""Metadata of a ``Gaussians`` field without a row per Gaussian; the field may be None."""
 ONCE: Mapping[str, Any] = MappingProxyType({"once": True})
-"""Metadata of a field that a Gaussian keeps from the frame in which it was born."""
+"""Metadata of a field whose values are fixed from the frame in which a Gaussian is added."""
 UNBORN = -1
-"""Id of a Gaussian that no commit has given one yet."""
+"""Id of a Gaussian that is not committed yet."""
 
 
 @dataclass(frozen=True, eq=False)
 class Gaussians:
-    """N Gaussians at one moment. Row order is identity: row i is the same piece of matter in every frame.
+    """N Gaussians at one time. Row order is identity: row i is the same piece of matter in every frame.
 
-    New ones are appended (``joined``); what has left the scene is retired and keeps its row, so that it can come back
-    as itself. A retired Gaussian is not drawn, does not move, and does not count as moving.
+    New Gaussians are appended (``concatenate``). A Gaussian that leaves the scene is retired but keeps its row, so it
+    can return with the same identity. A retired Gaussian is not rendered, does not move and does not count as moving.
 
     Attributes:
-        means: [N, 3] float32, metres in the inside world.
-        factors: [N, 3, 3] float32; Σ = F Fᵀ; the columns are the transported axes, metres.
-        rotations: [N, 4] float32 unit quaternions (w, x, y, z): material rotation since frame 0, or since birth.
-        opacities: [N] float32 in (0, 1), fixed after frame 0 or birth; as rendered: 0 for the retired.
+        means: [N, 3] float32, metres in the internal world.
+        factors: [N, 3, 3] float32; Σ = F Fᵀ; the columns are the transported axes in metres.
+        rotations: [N, 4] float32 unit quaternions (w, x, y, z): material rotation since frame 0, or since the Gaussian
+            was added.
+        opacities: [N] float32 in (0, 1), fixed after the Gaussian's first frame; as rendered, so 0 for retired
+            Gaussians.
         colours: [N, 3] float32 RGB, nominally 0…1.
-        foreground: [N] float32 in 0…1: the learnt label; above 0.5 the Gaussian moves.
-        ids: [N] int64, for ever; −1 until the frame of its birth is committed.
-        retired: [N] bool; not given: none.
-        own_opacities: [N] float32 in (0, 1), those of the retired too; follows from what is given as ``opacities``.
-        gloss: [M, 3] float32, of the first M: normal, in the world's axes, times strength of what mirrors; those born
-            later are dull. environment: float32, what is mirrored (``kernels.appearance.direction``). Both are None
-            where colours do not depend on direction; else ``colours`` are those without the gloss.
+        foreground: [N] float32 in 0…1: the learnt label; the Gaussian moves if it is above 0.5.
+        ids: [N] int64, permanent; −1 until the first frame of the Gaussian is committed.
+        retired: [N] bool; defaults to all false.
+        own_opacities: [N] float32 in (0, 1), without the zeros of retired Gaussians; derived from ``opacities``.
+        gloss: [M, 3] float32, for the first M Gaussians: world-space normal times the strength of the reflection;
+            Gaussians added later have none. environment: float32, the reflected surroundings
+            (``kernels.appearance.direction``). Both are None if colours do not depend on the viewing direction;
+            otherwise ``colours`` exclude the gloss.
 
     >>> state = Gaussians.of_points([[0, 0, 2], [0.5, 0, 2]], radius=0.1, colours=[1, 0, 0])
     >>> len(state), state.moving
@@ -74,12 +77,12 @@ class Gaussians:
 
     @classmethod
     def of_points(cls, points: ArrayLike, radius: float, colours: ArrayLike = 0.5) -> Gaussians:
-        """Round Gaussians that move, one for each point: for scenes made by hand.
+        """Returns isotropic moving Gaussians, one per point, for hand-made scenes.
 
         Args:
-            points: [N, 3] metres in the inside world.
-            radius: metres, the standard deviation along each axis.
-            colours: [N, 3] RGB in 0…1, or one for all.
+            points: [N, 3] metres in the internal world.
+            radius: standard deviation along each axis, in metres.
+            colours: [N, 3] RGB in 0…1, or one colour for all.
         """
         means = np.array(points, np.float32).reshape(-1, 3)
         count = len(means)
@@ -97,13 +100,13 @@ class Gaussians:
         return len(self.means)
 
     def features(self, colours: Array) -> Array:
-        """[N, 4] features as they are rendered: colours [N, 3], its own or as a camera sees them, and the label."""
+        """Returns the [N, 4] features for rendering: the given colours [N, 3] and the foreground label."""
         return np.concatenate([colours, self.foreground[:, None]], axis=1)
 
     def replace(self, **changes: Any) -> Gaussians:
-        """A copy with some of the arrays exchanged; the others are shared. ``opacities`` are taken as its own.
+        """Returns a copy with some arrays replaced; the others are shared. ``opacities`` also sets ``own_opacities``.
 
-        Where none is retired, all arrays may be exchanged for such of another number of Gaussians.
+        If no Gaussian is retired, all arrays may be replaced by arrays with a different number of rows.
         """
         if "opacities" in changes:
             changes["own_opacities"] = changes["opacities"]
@@ -113,20 +116,20 @@ class Gaussians:
 
     @property
     def present(self) -> NDArray[np.bool_]:
-        """[N] bool: the Gaussians that are there; the others are retired."""
+        """[N] bool: true for Gaussians that are not retired."""
         return ~self.retired
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """[N] bool: the Gaussians that move, by their label; none that is retired."""
+        """[N] bool: true for moving Gaussians, according to their labels; false for retired ones."""
         moving: NDArray[np.bool_] = (self.foreground > 0.5) & ~self.retired
         return moving
 
     def rows(self, which: ArrayLike) -> Gaussians:
-        """The Gaussians of some rows, with their ids.
+        """Returns the Gaussians of the selected rows, with their ids.
 
         Args:
-            which: [N] bool, or rows in any order.
+            which: [N] bool, or row indices in any order.
         """
         chosen = np.asarray(which)
         gloss = self.gloss
@@ -135,16 +138,16 @@ class Gaussians:
         return replace(self, gloss=gloss, **{name: array[chosen] for name, array in self._by_row().items()})
 
     def concatenate(self, born: Gaussians) -> Gaussians:
-        """The state with new Gaussians after its own, in new rows; they get their ids when the frame is committed."""
+        """Returns the state with new Gaussians appended; they get ids when the frame is committed."""
         others = {**born._by_row(), "ids": np.full(len(born), UNBORN, np.int64)}
         return replace(self, **{name: np.concatenate([own, others[name]]) for name, own in self._by_row().items()})
 
     def retire(self, rows: ArrayLike) -> Gaussians:
-        """The state with some rows ([N] bool, or indices) retired."""
+        """Returns the state with the given rows ([N] bool, or indices) retired."""
         return self._with_retired(rows, True)
 
     def revive(self, rows: ArrayLike) -> Gaussians:
-        """The state with some rows ([N] bool, or indices) there again, as they were when they were retired."""
+        """Returns the state with the given retired rows ([N] bool, or indices) restored unchanged."""
         return self._with_retired(rows, False)
 
     def _with_retired(self, rows: ArrayLike, value: bool) -> Gaussians:
@@ -153,14 +156,14 @@ class Gaussians:
         return self.replace(retired=retired)
 
     def _by_row(self) -> dict[str, NDArray[Any]]:
-        """The arrays with a row per Gaussian, as the constructor takes them."""
+        """Returns the arrays with a row per Gaussian, named as in the constructor."""
         return {item.name: getattr(self, item.name) for item in fields(self) if not item.metadata.get("whole")}
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """The arrays by name, as the constructor takes them, for files and messages.
+        """Returns the arrays by constructor name, for files and messages.
 
-        ``opacities`` are those that the Gaussians have of their own. ``retired`` is left out where none is, and so is
-        a field that is None.
+        ``opacities`` are the unmasked ``own_opacities``. ``retired`` is omitted if no Gaussian is retired, and so are
+        fields that are None.
         """
         arrays_by_name = {item.name: getattr(self, item.name) for item in fields(self)}
         arrays_by_name["opacities"] = arrays_by_name.pop("own_opacities")
@@ -170,17 +173,17 @@ class Gaussians:
 
 
 FIXED = tuple(item.name for item in fields(Gaussians) if item.metadata.get("once"))
-"""Arrays that a Gaussian keeps from its first frame."""
+"""Arrays whose values are fixed from the first frame of a Gaussian."""
 WHOLES = tuple(item.name for item in fields(Gaussians) if item.metadata.get("whole"))
-"""Arrays without a row per Gaussian, which may be missing."""
+"""Arrays without a row per Gaussian, which may be None."""
 PER_FRAME = tuple(
     item.name for item in fields(Gaussians) if item.name not in (*FIXED, *WHOLES, "retired", "own_opacities")
 )
-"""Arrays with a row per Gaussian that may differ from frame to frame."""
+"""Arrays with a row per Gaussian that can change from frame to frame."""
 
 
 def quaternions_to_matrices(quaternions: NDArray[Any]) -> NDArray[Any]:
-    """Unit quaternions [..., 4] (w, x, y, z) to rotation matrices [..., 3, 3].
+    """Converts unit quaternions [..., 4] (w, x, y, z) to rotation matrices [..., 3, 3].
 
     >>> quaternions_to_matrices(np.array([0.0, 0, 0, 1]))  # a half turn about z
     array([[-1.,  0.,  0.],
@@ -191,7 +194,7 @@ def quaternions_to_matrices(quaternions: NDArray[Any]) -> NDArray[Any]:
 
 
 def rotation_rows(quaternion: NDArray[Any]) -> list[list[NDArray[Any]]]:
-    """The rows of the rotation matrices of unit quaternions, by component: [4, ...] to three rows of three [...]."""
+    """Converts unit quaternions by component, [4, ...], to rotation matrices as three rows of three arrays [...]."""
     w, x, y, z = quaternion
     return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -201,12 +204,12 @@ def rotation_rows(quaternion: NDArray[Any]) -> list[list[NDArray[Any]]]:
 
 
 def quaternion_products(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
-    """[M, 4] a∘b (w, x, y, z): first b, then a."""
+    """Returns the quaternion products a∘b, [M, 4] (w, x, y, z): b is applied first."""
     return np.stack(product_components(a.T, b.T), axis=1)
 
 
 def product_components(a: NDArray[Any], b: NDArray[Any]) -> list[NDArray[Any]]:
-    """The components (w, x, y, z) of a∘b, [M] each, of quaternions by component, [4, M]: first b, then a."""
+    """Returns the components (w, x, y, z), [M] each, of a∘b for quaternions [4, M]: b is applied first."""
     aw, ax, ay, az = a
     bw, bx, by, bz = b
     return [
@@ -218,12 +221,12 @@ def product_components(a: NDArray[Any], b: NDArray[Any]) -> list[NDArray[Any]]:
 
 
 def moving_extent(gaussians: Gaussians) -> float:
-    """Longest side, in metres, of the box that holds 98 % of the moving Gaussians on each axis.
+    """Returns the longest side, in metres, of the box that holds 98 % of the moving Gaussians on each axis.
 
-    Where none moves it is that of those that are there, and where none is there, of all.
+    If none is moving, all present Gaussians are used; if none is present, all Gaussians.
 
-    It is the unit of tolerances and features that should not depend on the size of the scene; a few stray Gaussians do
-    not change it.
+    Tolerances and features use it as a unit so that they do not depend on the scene size. A few stray Gaussians do not
+    change it.
 
     >>> points = np.linspace(0, 1, 101)[:, None] * [2, 1, 0]
     >>> round(moving_extent(Gaussians.of_points(points, 0.01)), 3)

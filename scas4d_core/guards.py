@@ -1,11 +1,11 @@
-"""Every clamp, floor and epsilon of the core's arithmetic: its name, its value, its unit and its reason, once.
+"""Table of every clamp, floor and epsilon in the core's arithmetic, with name, value, unit and reason.
 
-Two tables. A *guard* acts where the arithmetic would leave the finite numbers, and is counted each time it does, so
-that it cannot hide a fault. A *convention* is part of the method: it acts all the time and is not
-counted. Kernels import the values; ``kernels.cache`` compiles anew when they change.
+There are two tables. A *guard* acts only when a value would become non-finite. Each action is counted, so that a guard
+cannot hide a fault. A *convention* is part of the method: it always acts and is not counted. Kernels import the values;
+``kernels.cache`` recompiles them when a value changes.
 
-``scripts/bench stability`` prints both tables with their counts in the catalogue of hard cases, and takes each one away
-to find the cases that fail then.
+``scripts/bench stability`` prints both tables with their counts over the catalogue of hard cases. It also disables each
+entry in turn to find the cases that then fail.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class Guard:
-    """A number that the arithmetic needs beside the equations.
+    """A numerical constant that the arithmetic needs in addition to the equations.
 
     Attributes:
-        name: of its count.
+        name: key of the entry and of its count.
         value: in ``unit``.
-        without: the value that takes its effect away; NaN where something else has to change for that.
-        where: the file under ``scas4d_core``.
-        reason: of the guard, and its effect.
-        counted: the unit of its count; of a convention, the reason for having none.
+        without: value that disables the guard; NaN if disabling it needs another change.
+        where: files under ``scas4d_core``.
+        reason: purpose and effect of the guard.
+        counted: unit of its count; for a convention, the reason why it is not counted.
     """
 
     name: str
@@ -40,9 +40,9 @@ class Guard:
 
 
 GUARDS: dict[str, Guard] = {}
-"""By name: counted."""
+"""Guards by name; their actions are counted."""
 CONVENTIONS: dict[str, Guard] = {}
-"""By name: part of the method, not counted."""
+"""Conventions by name; they are part of the method and are not counted."""
 
 
 def _guard(name: str, value: float, without: float, *, unit: str, where: str, reason: str, counted: str) -> float:
@@ -153,7 +153,7 @@ LEFT_OUT = _guard(
     counted="Gaussians in a clustering",
 )  # fmt: skip
 
-# Conventions: acting all the time.
+# Conventions: they always act.
 
 ALPHA_FLOOR = _convention(
     "alpha_floor", 1.0 / 255.0, 1e-8,
@@ -234,10 +234,10 @@ SMALLEST_SQUARE = _convention(
 
 
 class GuardCounts(Mapping[str, int]):
-    """Number of times that guards acted since the last ``reset``, by name.
+    """Counts of guard actions since the last ``reset``, by name.
 
     >>> counts = GuardCounts("gradient_ceiling", "moment_floor")
-    >>> counts.add(("gradient_ceiling", "moment_floor"), np.array([[2, 0], [1, 5]]))  # of two tasks
+    >>> counts.add(("gradient_ceiling", "moment_floor"), np.array([[2, 0], [1, 5]]))  # from two tasks
     >>> dict(counts)
     {'gradient_ceiling': 3, 'moment_floor': 5}
     """
@@ -249,7 +249,7 @@ class GuardCounts(Mapping[str, int]):
         self._counts = dict.fromkeys(names, 0)
 
     def add(self, names: Sequence[str], guard_counts: NDArray[np.int64]) -> None:
-        """Adds the counts of a kernel's tasks, [tasks, names] or [names], under these names."""
+        """Adds the counts of a kernel's tasks, [tasks, names] or [names], to the named guards."""
         counts = guard_counts.reshape(-1, len(names)).sum(axis=0)
         for name, count in zip(names, counts.tolist(), strict=True):
             self._counts[name] += count
@@ -275,11 +275,11 @@ OBSERVED = {
     "folded": "Gaussians in a layer, forward, where the cluster map turns space inside out: det J ≤ 0. Nothing is "
     "clamped; the state stays finite, and a fold can be undone by the next steps.",
 }
-"""Events that are counted beside the guards and change nothing."""
+"""Events that are counted like guards but change no value."""
 
 
 def summed(counts: Iterable[Mapping[str, int]]) -> dict[str, int]:
-    """Adds up several counts by name."""
+    """Returns the sum of several counts by name."""
     total: dict[str, int] = {}
     for each in counts:
         for name, count in each.items():

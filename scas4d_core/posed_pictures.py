@@ -1,4 +1,4 @@
-"""Pictures with camera poses, and queries over several of them: visibility, occlusion, colour of points. Numpy only."""
+"""Images with camera poses, and visibility, occlusion and colour of points across several images. NumPy only."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ Bool = NDArray[np.bool_]
 
 
 BLOCK = 32_768
-"""Points whose colours are gathered at a time."""
+"""Number of points whose colours are gathered at once; limits memory."""
 
 
 class InitialPointsError(ValueError):
-    """No cloud can be made: the message names the field, the value and the remedy."""
+    """A point cloud that cannot be computed. The message gives the field, the value and the remedy."""
 
 
 @dataclass(frozen=True, eq=False)
 class PosedPicture:
-    """A camera and its picture.
+    """A camera and its image.
 
     Attributes:
         camera: calibrated, in the user's world.
         image: [H, W, 3] uint8.
-        mask: [H, W] bool, true on the foreground; None where the capture has none.
+        mask: [H, W] bool, true on the foreground; None if the capture has no mask.
     """
 
     camera: Camera
@@ -41,10 +41,10 @@ class PosedPicture:
 def collect_views(
     rig: Rig, images: Mapping[str, NDArray[np.uint8]], masks: Mapping[str, NDArray[np.uint8]]
 ) -> list[PosedPicture]:
-    """Views of all cameras of the rig that have a picture, in the rig's order.
+    """Returns the views of all cameras that have an image, in rig order.
 
     Raises:
-        InitialPointsError: fewer than two pictures, or a picture or mask whose size is not its camera's.
+        InitialPointsError: fewer than two images, or an image or mask does not have its camera's size.
     """
     views = []
     for camera in rig.cameras:
@@ -70,29 +70,29 @@ def collect_views(
 
 
 def halved(view: PosedPicture, width: int) -> PosedPicture:
-    """The view at half, a quarter … of its size, until it is no wider than ``width`` pixels."""
+    """Returns the view downscaled by factors of two until it is at most ``width`` pixels wide."""
     image, mask, camera = view.image.astype(np.float32), view.mask, view.camera
     while camera.width > width and camera.width >= 2 and camera.height >= 2:
         h, w = camera.height // 2 * 2, camera.width // 2 * 2
         image = image[:h, :w].reshape(h // 2, 2, w // 2, 2, 3).mean((1, 3))
         if mask is not None:
             mask = np.asarray(mask[:h, :w].reshape(h // 2, 2, w // 2, 2).any((1, 3)), dtype=np.bool_)
-        # Blocks of 2 × 2 with pixel centres at +0.5: every pixel coordinate is halved exactly, odd sizes or not.
+        # With 2 × 2 blocks and pixel centres at +0.5, every pixel coordinate is halved exactly, even for odd sizes.
         matrix = camera.intrinsics * np.array([[0.5], [0.5], [1.0]])
         camera = type(camera)(camera.name, matrix, camera.world_to_camera, w // 2, h // 2)
     return PosedPicture(camera, np.rint(image).astype(np.uint8), mask)
 
 
 class Posed(Protocol):
-    """Whatever has a camera."""
+    """An object that has a camera."""
 
     @property
     def camera(self) -> Camera:
-        """Calibrated."""
+        """Calibrated camera."""
 
 
 def look_at_point(views: Sequence[Posed]) -> Float:
-    """[3] point nearest to all optical axes (least squares): the middle of the stage of an inward-looking rig."""
+    """Returns the [3] point nearest to all optical axes (least squares): the centre of an inward-looking rig."""
     axes = np.array([view.camera.rotation[2] for view in views])
     centres = np.array([view.camera.centre for view in views])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -102,10 +102,10 @@ def look_at_point(views: Sequence[Posed]) -> Float:
 
 
 def pixels_inside(camera: Camera, points: Float) -> tuple[NDArray[np.intp], NDArray[np.intp], Float, Bool]:
-    """Projects world points [P, 3] to whole pixels of a picture.
+    """Projects world points [P, 3] to whole pixels of an image.
 
     Returns:
-        columns, rows [P] of the pixel that holds each (0 where outside), depths [P], and which are inside [P].
+        Columns and rows [P] of the pixel of each point (0 if outside), depths [P], and [P] true for points inside.
     """
     uv, depth = camera.project(points)
     with np.errstate(invalid="ignore"):
@@ -117,22 +117,23 @@ def pixels_inside(camera: Camera, points: Float) -> tuple[NDArray[np.intp], NDAr
 
 
 def front_depth(camera: Camera, occluders: Float, spacing: float, points: Float) -> Float:
-    """Depth of the nearest occluder over the pixel of each point.
+    """Returns the depth of the nearest occluder at the pixel of each point.
 
     Args:
-        camera: that looks.
-        occluders: [M, 3] world, each a disc of diameter ``spacing`` (world units) or one pixel if that is larger.
-        spacing: distance of neighbouring occluders.
-        points: [P, 3] world.
+        camera: viewing camera.
+        occluders: [M, 3] in the world, each a disc with a diameter of ``spacing`` (world units) or one pixel, whichever
+            is larger.
+        spacing: distance between neighbouring occluders.
+        points: [P, 3] in the world.
 
     Returns:
-        [P] depth; infinity where the way is free, and where the point is outside the picture.
+        [P] depths; infinity if nothing occludes the point or the point is outside the image.
     """
     front = np.full(len(points), np.inf)
     column, line, depth, inside = pixels_inside(camera, occluders)
     if not inside.any():
         return front
-    # Cells two discs wide: each holds a piece of every surface over it, and none of the neighbours' slope.
+    # Cells are two discs wide, so that each holds a piece of every surface over it but little of the neighbours' slope.
     cell = 2.0 * max(1.0, camera.fx * spacing / float(np.median(depth[inside])))
     shape = (int(camera.height / cell) + 1, int(camera.width / cell) + 1)
     nearest = np.full(shape, np.inf)
@@ -145,13 +146,13 @@ def front_depth(camera: Camera, occluders: Float, spacing: float, points: Float)
 
 
 def visible_from(views: Sequence[PosedPicture], points: Float, spacing: float) -> Bool:
-    """Visibility of points [P, 3] in each camera; the points themselves are the occluders.
+    """Returns the visibility of points [P, 3] in each camera; the points themselves are the occluders.
 
-    A point is hidden if it lies more than four diameters of a disc behind the nearest one; see ``front_depth``.
-    Surfaces seen at more than about 60 degrees from their normal may count as hidden: their colour is vague anyway.
+    A point is hidden if it lies more than four disc diameters behind the nearest one; see ``front_depth``. Surfaces
+    seen at more than about 60 degrees from their normal may count as hidden, but their colour is unreliable anyway.
 
     Returns:
-        [V, P] bool; false also where the point projects outside the picture.
+        [V, P] bool; also false if the point projects outside the image.
     """
     visible = np.zeros((len(views), len(points)), dtype=bool)
     for row, view in zip(visible, views, strict=True):
@@ -163,12 +164,12 @@ def visible_from(views: Sequence[PosedPicture], points: Float, spacing: float) -
 
 @dataclass(frozen=True, eq=False)
 class PointColours:
-    """Colours of points over the cameras that may see them.
+    """Colours of points across the cameras that can see them.
 
     Attributes:
-        colours: [P, 3] float32 in 0…1, median over those cameras.
-        spread: [P] median absolute deviation from it, largest channel, 0…1.
-        count: [P] cameras that see the point.
+        colours: [P, 3] float32 in 0…1, median over these cameras.
+        spread: [P] median absolute deviation from the median, maximum over channels, 0…1.
+        count: [P] number of cameras that see the point.
     """
 
     colours: NDArray[np.float32]
@@ -177,8 +178,10 @@ class PointColours:
 
 
 def observe(views: Sequence[PosedPicture], points: Float, visible: Bool) -> PointColours:
-    """Median colour of points [P, 3] over the cameras in ``visible`` [V, P]; NaN where no camera sees the point."""
-    if len(points) > BLOCK:  # bounds the memory of the samples
+    """Returns the median colour of points [P, 3] over the cameras in ``visible`` [V, P]; NaN if no camera sees the
+    point.
+    """
+    if len(points) > BLOCK:  # limits the memory of the samples
         blocks = [slice(start, start + BLOCK) for start in range(0, len(points), BLOCK)]
         parts = [observe(views, points[block], visible[:, block]) for block in blocks]
         return PointColours(

@@ -1,7 +1,8 @@
-"""Prepares the updates of a scene: clusters and neighbours of what moves, and the parts of the effects that are on.
+"""Prepares the updates of a scene: clusters and neighbours of moving Gaussians, and the parts of active effects.
 
-They are made anew where more is found to move, where an effect is switched, and where Gaussians come and go. They are
-made of the scene's *roots*: Θ_0, with the Gaussians born since at the places that they would have had in it.
+They are rebuilt when more Gaussians are found to move, when an effect is switched, and when Gaussians are added or
+retired. They are built from the scene's *roots*: Θ_0 plus the Gaussians added since, at the positions they would have
+had in frame 0.
 """
 
 from __future__ import annotations
@@ -52,23 +53,23 @@ from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import motion_between
 
 SMALLEST_CLUSTER = 8
-"""Gaussians of a cluster, on average, that the layers are capped to: the motion of fewer is noise."""
+"""Minimum mean number of Gaussians per cluster, which limits the layers: smaller clusters fit noise."""
 NEIGHBOURS = 20
-"""Neighbours of a Gaussian in the terms that tie it to them (Dynamic3DGaussians)."""
+"""Number of neighbours per Gaussian in the neighbour terms (Dynamic3DGaussians)."""
 NEIGHBOUR_FALLOFF = 2000.0
-"""1/m²: the weight of a neighbour at a distance d is exp(−falloff d²) (Dynamic3DGaussians)."""
+"""1/m²: the weight of a neighbour at distance d is exp(−falloff d²) (Dynamic3DGaussians)."""
 
 MAX_BORN_SHARE = 0.5
-"""Of the Gaussians of frame 0, that may be born in a scene: memory is bounded."""
+"""Maximum number of Gaussians added to a scene, as a share of those of frame 0; bounds memory."""
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedUpdate:
-    """All that the next update starts from, beside Θ_{t−1}. It is replaced as a whole, or not at all.
+    """The input of the next update in addition to Θ_{t−1}. It is replaced as a whole or not at all.
 
     Attributes:
-        updater: updates frames, with the effects that are on.
-        carried: what the update before left. roots: Θ_0, with the Gaussians born since.
+        updater: updates frames with the active effects.
+        carried: state carried over from the previous update. roots: Θ_0 plus the Gaussians added since.
     """
 
     updater: FrameUpdate
@@ -77,11 +78,11 @@ class PreparedUpdate:
 
     @property
     def plan(self) -> UpdatePlan:
-        """The plan of its updates."""
+        """The plan of the updater."""
         return self.updater.plan
 
     def with_carry_over(self, **changes: Any) -> PreparedUpdate:
-        """The same with changes of what is carried over."""
+        """Returns a copy with changes to the carry-over."""
         return replace(self, carried=replace(self.carried, **changes))
 
 
@@ -89,7 +90,8 @@ class Preparation:
     """Prepares the updates of a scene.
 
     Args:
-        factory: of its views. settings: of the scene. world: user's to inside. renderer: draws.
+        factory: creates the scene's views. settings: of the scene. world: user to internal transform. renderer: renders
+            views.
     """
 
     def __init__(self, factory: ViewFactory, settings: Settings, world: WorldFrame, renderer: Renderer) -> None:
@@ -102,10 +104,10 @@ class Preparation:
             self._scene = self._scene.model_copy(update={"floor": floor_inside(self._scene.floor, world)})
 
     def first_frame_effects(self, frame: Frame, result: StaticResult) -> tuple[dict[str, Switch], dict[str, Arrays]]:
-        """The switches of the effects after the first frame, and the arrays that they keep of it.
+        """Returns the switches of the effects after the first frame, and the arrays that the effects keep from it.
 
         Args:
-            frame: the first, at the size of the rig. result: its fit.
+            frame: the first frame, at the rig's resolution. result: its fit.
         """
         switches = first_switches(self._settings, frame.index, result.evidence or {}, len(frame.masks) > 0)
         views = self._factory.views(frame, result.exposures, use_masks=False)
@@ -117,12 +119,12 @@ class Preparation:
     def views(
         self, frame: Frame, fixed: dict[str, NDArray[np.float32]], prepared: PreparedUpdate
     ) -> list[TrainingView]:
-        """The views of a frame, with the poses and exposures of the cameras as they are known by now.
+        """Returns the views of a frame, with the current estimates of camera poses and exposures.
 
-        Without masks where no term asks for them: they are not even read.
+        Masks are not read if no term uses them.
 
         Args:
-            fixed: [3, 2] gain and offset of each camera, as frame 0 has them.
+            fixed: [3, 2] gain and offset of each camera from frame 0.
 
         Raises:
             ValueError: see ``ViewFactory.views``.
@@ -133,24 +135,25 @@ class Preparation:
         return self._factory.views(self._factory.scaled(frame), exposures, prepared.plan.mask > 0)
 
     def rebuild(self, roots: Gaussians, carried: CarryOver) -> PreparedUpdate:
-        """Prepares the next update anew; a motion that belongs to other clusters is dropped from the carry-over.
+        """Rebuilds the next update; carried-over motion of other clusters is dropped.
 
         Args:
-            roots: Θ_0 with all born since.
+            roots: Θ_0 plus all Gaussians added since.
         """
-        known = {**first_switches(self._settings, 0), **carried.switches}  # where a report was lost, none are carried
+        # if a report was lost, no switches are carried
+        known = {**first_switches(self._settings, 0), **carried.switches}
         switches = {
             name: replace(switch, on=switch.on and effect(name).refusal(self._settings) is None)
             for name, switch in known.items()
         }
-        carried = replace(carried, switches=switches)  # a replay may have other settings than the scene
+        carried = replace(carried, switches=switches)  # a replay can have other settings than the scene
         updater, structure = self._updater(with_labels(roots, carried.labels), switches)
         if carried.structure != structure:
             carried = replace(carried, motion=None, structure=structure)
         return PreparedUpdate(updater, carried, roots)
 
     def _updater(self, roots: Gaussians, switches: Switches) -> tuple[FrameUpdate, int]:
-        """The updater on the engine of ``settings.device``, and the digest of its clusters and neighbours.
+        """Returns the updater on the engine of ``settings.device``, and the digest of its clusters and neighbours.
 
         Args:
             roots: with the labels of the moving Gaussians.
@@ -158,20 +161,22 @@ class Preparation:
         hierarchy = self._clusters(roots)
         builder = PlanBuilder(self._scene, self._settings.update, self._factory, hierarchy, roots)
         built = register_effects(builder, names_on(switches))
-        if not built.plan.freedom.clusters:  # no cascade either
+        if not built.plan.freedom.clusters:  # the cascade is not needed either
             hierarchy = built.hierarchy = hierarchy.without_layers
         neighbours = self._neighbour_graph(roots, hierarchy) if built.plan.neighbour_terms else None
         updater = FrameUpdate(engine_of(self._settings.device), built, neighbours)
         return updater, digest(hierarchy, neighbours)
 
     def _neighbour_graph(self, roots: Gaussians, hierarchy: Hierarchy) -> Neighbours:
-        """The graph of the hierarchy that was made last."""
+        """Returns the neighbour graph of the current hierarchy."""
         if self._neighbours is None:
             self._neighbours = build_neighbours(roots.means[hierarchy.rows], NEIGHBOURS, NEIGHBOUR_FALLOFF)
         return self._neighbours
 
     def _clusters(self, first: Gaussians) -> Hierarchy:
-        """The hierarchy of what moves; that of the updater before where the same Gaussians do, with its neighbours."""
+        """Returns the hierarchy of the moving Gaussians; the previous one and its neighbours are reused if nothing
+        changed.
+        """
         made = self._hierarchy_inputs
         if made is None or not all(map(np.array_equal, made, (first.means, first.moving))):
             update = self._settings.update
@@ -182,14 +187,14 @@ class Preparation:
     def learn_labels(
         self, prepared: PreparedUpdate, newest: Gaussians, believed: Sequence[TrainingView]
     ) -> PreparedUpdate:
-        """Prepared anew with the Gaussians that the pictures show to move, for scenes without masks.
+        """Rebuilds the update with the Gaussians that are seen to move, for scenes without masks.
 
-        A Gaussian that has moved once stays in the hierarchy. The labels become part of the state with the commit of
-        the frame. A hierarchy of other Gaussians is a new one: the motion before does not fit it, and the update
-        starts cold.
+        A Gaussian that has moved once stays in the hierarchy. The labels become part of the state when the frame is
+        committed. Changed labels give a new hierarchy that the previous motion does not fit, so the update is a cold
+        start.
 
         Args:
-            newest: Θ_{t−1}. believed: views of the frame.
+            newest: Θ_{t−1}. believed: views of the frame to learn from.
         """
         carried = prepared.carried
         labels = learn_labels_from_motion(newest, carried.labels, carried.seen, believed, self._renderer)
@@ -200,10 +205,10 @@ class Preparation:
     def after_frame(
         self, prepared: PreparedUpdate, seen: FrameObservation, may_change_population: bool
     ) -> tuple[UpdateResult, PreparedUpdate]:
-        """The result of a frame that was learnt, and what the next update starts from.
+        """Returns the result of a learnt frame, and the input of the next update.
 
         Args:
-            seen: the frame. may_change_population: whether Gaussians may come and go.
+            seen: the observed frame. may_change_population: whether Gaussians may be added or retired.
         """
         on, seen = names_on(prepared.carried.switches), record_arrays(prepared.carried.switches, self._settings, seen)
         switches = decide_switches(prepared.carried.switches, self._settings, seen)
@@ -220,13 +225,13 @@ class Preparation:
         return result, prepared
 
     def add_and_retire_gaussians(self, names: Sequence[str], seen: FrameObservation) -> UpdateResult:
-        """The result of a frame with all that is born, retired or revived in it; what is not finite is left out.
+        """Applies the effects that add, retire or revive Gaussians to a result; non-finite results are skipped.
 
         Args:
-            names: of the effects that took part in its update. seen: the frame.
+            names: effects that took part in the update. seen: the observed frame.
 
         Raises:
-            ValueError: an effect has changed rows otherwise.
+            ValueError: an effect changed rows in a way that is not allowed.
         """
         for name in names:
             one = effect(name)
@@ -240,17 +245,17 @@ class Preparation:
         return seen.result
 
     def _is_motion(self, result: UpdateResult) -> bool:
-        """Whether the difference of two states is a motion; a jump is none."""
+        """Returns true if the difference between two states is a motion and not a jump."""
         return self._settings.update.cluster_map == "centred" and result.outcome is not FrameOutcome.RELOCATED
 
 
 def _with_changed_rows(
     prepared: PreparedUpdate, before: Gaussians, result: UpdateResult, other_rows: bool
 ) -> PreparedUpdate:
-    """With the roots, labels and arrays of effects of the Gaussians of a result.
+    """Updates the roots, labels and effect arrays to the Gaussians of a result.
 
     Args:
-        before: the Gaussians before any came or went. other_rows: whether any did.
+        before: the Gaussians before the change. other_rows: whether any were added, retired or revived.
     """
     now, labels = result.gaussians, prepared.carried.labels
     effects = {
@@ -266,7 +271,7 @@ def _with_changed_rows(
 
 
 def _with_motion(prepared: PreparedUpdate, seen: FrameObservation, result: UpdateResult) -> PreparedUpdate:
-    """With the motion between the two states, in the clusters of the updater."""
+    """Adds the motion between the two states, in the updater's clusters."""
     if seen.result.motion is None:
         return prepared
     before, now, hierarchy = seen.result.gaussians, result.gaussians, prepared.updater.hierarchy
@@ -277,22 +282,22 @@ def _with_motion(prepared: PreparedUpdate, seen: FrameObservation, result: Updat
 
 
 def _check_rows(name: str, before: UpdateResult, after: UpdateResult) -> None:
-    """Raises where an effect has changed rows that it may not change."""
+    """Raises an error if an effect changed rows that it must not change."""
     count, born = len(before.gaussians), len(after.gaussians) - len(before.gaussians)
     kept = born >= 0 and np.array_equal(after.gaussians.ids[:count], before.gaussians.ids)
     if not kept or (after.gaussians.ids[count:] != UNBORN).any():
         raise ValueError(
-            f"effect {name}: rows were lost or moved; append with Gaussians.concatenate, retire the others"
+            f"effect {name}: rows were removed or reordered; append with Gaussians.concatenate, retire the others"
         )
     had = 0 if before.parents is None else len(before.parents)
     if (0 if after.parents is None else len(after.parents)) != had + born:
         raise ValueError(f"effect {name}: parents has not one parent for each of {had + born} that are born")
     if after.parents is not None and not ((after.parents >= NO_PARENT) & (after.parents < count - had)).all():
-        raise ValueError(f"effect {name}: a parent is no row of the frame before")
+        raise ValueError(f"effect {name}: a parent is not a row of the previous frame")
 
 
 def _extend_rows(array: NDArray[Any], count: int, parents: NDArray[np.int64] | None) -> NDArray[Any]:
-    """An array of an effect with rows for the born, where it has one for each Gaussian."""
+    """Returns an effect's array with rows for the added Gaussians, if it has one row per Gaussian."""
     if parents is None or not array.ndim or len(array) != count:
         return array
     rows = array[np.maximum(parents, 0)]
@@ -301,10 +306,10 @@ def _extend_rows(array: NDArray[Any], count: int, parents: NDArray[np.int64] | N
 
 
 def room_for_births(first: int, now: int) -> int:
-    """The number of Gaussians that may still be born.
+    """Returns the number of Gaussians that may still be added.
 
     Args:
-        first: that frame 0 had. now: that there are, retired ones too.
+        first: number of Gaussians in frame 0. now: current number, including retired ones.
 
     >>> room_for_births(1000, 1400), room_for_births(1000, 1600)
     (100, 0)
@@ -313,7 +318,7 @@ def room_for_births(first: int, now: int) -> int:
 
 
 def digest(hierarchy: Hierarchy, neighbours: Neighbours | None) -> int:
-    """CRC-32 of the clusters and the neighbour graph."""
+    """Returns the CRC-32 of the clusters and the neighbour graph."""
     arrays: list[NDArray[np.generic]] = [hierarchy.rows, *hierarchy.labels, *hierarchy.starts]
     if neighbours is not None:
         arrays += [neighbours.index, neighbours.weights, neighbours.distances]

@@ -1,4 +1,4 @@
-"""Named settings, and what a scene changes in them."""
+"""Named presets of the settings, and changes to them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scas4d_core.errors import InputError
 from scas4d_core.settings import Settings, StaticSettings, UpdateSettings, Weights
 
 TIES = ("rigidity", "isometry", "rotation")
-"""Effects that tie neighbours together."""
+"""Effects that couple neighbouring Gaussians."""
 
 
 OURS = (
@@ -29,24 +29,25 @@ OURS = (
     "entering",
     "leaving",
 )
-"""Effects that neither the paper nor Dynamic3DGaussians has."""
+"""Effects that are in neither the paper nor Dynamic3DGaussians."""
 
 
 def _pinned(on: Iterable[str] = (), off: Iterable[str] = ()) -> dict[str, Mode]:
-    """Effects as ``Settings.effects`` has them."""
+    """Returns effect modes in the form of ``Settings.effects``."""
     return {**dict.fromkeys(on, "on"), **dict.fromkeys(off, "off")}
 
 
 PRESETS: dict[str, Settings] = {
     "scas4d": Settings(),
-    # Half of the iterations but for the first motion, and none where nothing moved (docs/accuracy-and-time.md).
+    # Half the iterations after the first motion, and none if nothing has moved (docs/accuracy-and-time.md).
     "adaptive": Settings(update=UpdateSettings(iterations=50, cold_start_iterations=6.0, skip_tolerance=0.02)),
-    # Still fewer, and a third of the Gaussians: a third of the default's time.
+    # Even fewer iterations and a third of the Gaussians, in a third of the default's time.
     "fast": Settings(
         static=StaticSettings(detail=0.3),
         update=UpdateSettings(iterations=45, cold_start_iterations=6.0, skip_tolerance=0.02),
     ),
-    # What the paper says, in place of what this project chose beside it (docs/method.md); rates it does not give.
+    # The paper's choices instead of this project's (docs/method.md); learning rates that the paper does not give are
+    # ours.
     "paper": Settings(
         update=UpdateSettings(
             cluster_map="published",
@@ -80,8 +81,8 @@ PRESETS: dict[str, Settings] = {
         ),
         effects=_pinned(on=("static_colour",), off=OURS),
     ),
-    # By kind of scene: effects that are pinned, all others "auto"; no weight, no rate (figures: docs/effects.md).
-    # A new effect that a kind of scene always or never calls for is pinned here.
+    # Per kind of scene: some effects are pinned, all others are "auto"; weights and rates are unchanged
+    # (docs/effects.md). Pin a new effect here if a kind of scene always or never needs it.
     "rigid": Settings(effects=_pinned(on=TIES, off=("cluster_scaling", "own_rotation", "own_scale"))),
     "articulated": Settings(effects=_pinned(on=("cluster_rotation", "own_position", *TIES))),
     "cloth": Settings(effects=_pinned(on=("bending", "cluster_scaling", "isometry", "own_position"))),
@@ -91,13 +92,13 @@ PRESETS: dict[str, Settings] = {
 
 
 class SettingError(InputError):
-    """A setting that is unknown, or a value that is out of its range.
+    """An unknown setting, or a value that is out of range.
 
     Attributes:
-        setting: its dotted name, as "update.iterations".
-        value: the refused value.
-        fault: what is wrong, for a person.
-        remedy: what to give instead, for a person.
+        setting: dotted name, such as "update.iterations".
+        value: the rejected value.
+        fault: what is wrong, as text for people.
+        remedy: what to give instead, as text for people.
         validation: pydantic's own error; None for an unknown preset.
     """
 
@@ -112,10 +113,10 @@ class SettingError(InputError):
 
 
 def preset(name: str, *changes: Mapping[str, Any]) -> Settings:
-    """The settings called ``name``, with changes given as nested mappings; later ones go over earlier ones.
+    """Returns the preset ``name`` with changes as nested mappings; later changes take precedence.
 
     Raises:
-        SettingError: no such preset or setting, or a value out of its range.
+        SettingError: the preset or setting does not exist, or a value is out of range.
 
     >>> preset("adaptive").update.iterations
     50
@@ -124,15 +125,15 @@ def preset(name: str, *changes: Mapping[str, Any]) -> Settings:
     """
     if name not in PRESETS:
         known = ", ".join(sorted(PRESETS))
-        raise SettingError("preset", name, "there is no preset of this name", f"give one of {known}")
+        raise SettingError("preset", name, "there is no preset with this name", f"give one of {known}")
     return changed(PRESETS[name], *changes)
 
 
 def changed(settings: Settings, *changes: Mapping[str, Any]) -> Settings:
-    """The settings with changes given as nested mappings; later ones go over earlier ones.
+    """Returns the settings with changes as nested mappings; later changes take precedence.
 
     Raises:
-        SettingError: no such setting, or a value out of its range.
+        SettingError: the setting does not exist, or a value is out of range.
 
     >>> changed(preset("adaptive"), {"update": {"iterations": 20}}).update.iterations
     20
@@ -152,7 +153,7 @@ def changed(settings: Settings, *changes: Mapping[str, Any]) -> Settings:
 
 
 def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Nested mappings, the second over the first."""
+    """Returns nested mappings merged; values of the second take precedence."""
     result = dict(base)
     for name, value in changes.items():
         old = result.get(name)
@@ -161,11 +162,11 @@ def _merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, An
 
 
 def _setting_error(error: ValidationError) -> SettingError:
-    """The first error of a validation, with the nearest known name as the remedy for an unknown one."""
+    """Returns the first validation error; for an unknown name, the remedy suggests the closest known name."""
     details = error.errors(include_url=False)
     first = details[0]
     setting = _place(first["loc"])
-    others = len({_place(one["loc"]) for one in details}) - 1  # members of a union each say why they do not match
+    others = len({_place(one["loc"]) for one in details}) - 1  # each member of a union reports its own error
     more = f" (and {others} more)" if others else ""
     remedy = "docs/settings.md lists all settings"
     if first["type"] == "extra_forbidden":
@@ -183,12 +184,12 @@ def _setting_error(error: ValidationError) -> SettingError:
 
 
 def _place(loc: Iterable[int | str]) -> str:
-    """The name of a setting, as ``scene.background.2``."""
+    """Returns the dotted name of a setting, such as ``scene.background.2``."""
     return ".".join(str(part) for part in loc if not _of_union(part))
 
 
 def _description(loc: Iterable[int | str]) -> str:
-    """The sentence of the docs on a setting; empty where they have none.
+    """Returns the documented description of a setting; empty if it has none.
 
     >>> _description(("scene", "image_scale", "float"))
     'Pictures are resized by this before anything else.'
@@ -207,12 +208,12 @@ def _description(loc: Iterable[int | str]) -> str:
 
 
 def _of_union(part: int | str) -> bool:
-    """True where a part of a place names a member of a union, as ``literal['auto']``, and no setting."""
+    """Returns true if a part of the location is a union member, such as ``literal['auto']``, and not a setting."""
     return isinstance(part, str) and (not part.isidentifier() or part in ("bool", "float", "int", "str"))
 
 
 def _names(values: Mapping[str, Any], under: str = "") -> Iterator[str]:
-    """The dotted names of all settings and of their groups."""
+    """Yields the dotted names of all settings and setting groups."""
     for name, value in values.items():
         yield f"{under}{name}"
         if isinstance(value, Mapping):

@@ -1,4 +1,4 @@
-"""Progress of a long task, as the first frame reports it."""
+"""Progress reports of a long task, such as the fit of the first frame."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ class Progress:
     """Progress of a long task.
 
     Attributes:
-        stage: in words. done, total: of its steps. detail: figures by name, as the loss.
+        stage: in words. done, total: numbers of steps. detail: figures by name, such as the loss.
     """
 
     stage: str

@@ -1,7 +1,7 @@
-"""Recomputes a committed state that was damaged on disk, from the pictures of its frame.
+"""Recomputes a committed state that was damaged on disk from the images of its frame.
 
-The recomputed state starts cold from the state before it. It shows the same with other bits, and its report says
-``recomputed``. Later states were made from the original and stay as they are.
+The recomputed state is a cold start from the previous state. It looks the same but is not bit-identical, and its report
+has ``recomputed``. Later states, which were computed from the original, do not change.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 
 RECOMPUTED = "recomputed"
-"""In the report of a state that was made again: true."""
+"""Key in the report of a recomputed state; its value is true."""
 
 
 def recompute(
@@ -32,32 +32,32 @@ def recompute(
     dropped: Mapping[str, str] | None = None,
     notes: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Makes the state of a frame again and writes it in its place.
+    """Recomputes the state of a frame and replaces the damaged one.
 
     Args:
         rig: training cameras, user's world. settings: of the scene.
-        history: of the scene, of the process that appends.
-        base: the committed frame before it. frame: its pictures.
-        budget: that held for it (``Reconstruction.set_budget``).
+        history: of the scene, in the process that appends to it.
+        base: index of the previous committed frame. frame: with the images of the damaged frame.
+        budget: that applied to the frame (``Reconstruction.set_budget``).
         dropped, notes: see ``Reconstruction.step``.
 
     Returns:
-        The report that was written with it.
+        The report written with the state.
 
     Raises:
         HistoryError: the first frame or ``base`` cannot be read.
-        StepError: the frame does not follow ``base``, or does not fit it.
+        StepError: the frame does not follow ``base``, or its images do not fit.
     """
     scratch = Reconstruction.fork(rig, settings, history, base)
-    scratch.may_change_population = False  # what came and went in it is known, and states after it have it
+    scratch.may_change_population = False  # later states already contain the Gaussians added and retired in this frame
     scratch.set_budget(**budget)
     made = scratch.step(frame, dropped=dropped, notes={**(notes or {}), RECOMPUTED: True})
-    if made.outcome.rejected:  # nothing was learnt from the pictures
+    if made.outcome.rejected:  # nothing was learnt from the images
         raise StepError(f"frame {frame.index} does not fit the frame before it: {made.degraded}")
     report = scratch.history.report(frame.index)
     arrays = history.complete_state(frame.index, scratch.history.gaussians(frame.index)).arrays()
     kept = {name: arrays[name] for name in (*PER_FRAME, *WHOLES) if name in arrays}
-    # Who was newborn in it is not known: its births are those of the history, not of this update.
+    # The presence effects are left out: the births of this frame are those in the history, not those of this update.
     left = scratch.history.effects(frame.index)
     left = {name: given for name, given in left.items() if effect(name).group is not EffectGroup.PRESENCE}
     history.replace(frame.index, frame.time, kept, report, left)

@@ -1,7 +1,7 @@
-"""A ``Reconstruction`` holds Θ_t; ``step(frame)`` commits Θ_t = D_t(Θ_{t−1}), or raises and changes nothing.
+"""A ``Reconstruction`` holds Θ_t; ``step(frame)`` commits Θ_t = D_t(Θ_{t−1}), or raises an error and changes nothing.
 
-A commit is one rename: a frame's state and report are in one file. The checkpoint of the next update is on disk before,
-so that ``resume`` goes on after any end of the process, with the same bits on the CPU.
+A commit is one rename, because a frame's state and report are in one file. The checkpoint for the next update is
+written first. Therefore ``resume`` can continue after any crash, on the CPU with bit-identical results.
 """
 
 from __future__ import annotations
@@ -65,14 +65,15 @@ __all__ = ["FrameReport", "Progress", "Reconstruction", "ResumeError", "ResumePo
 
 
 class Reconstruction(CommittedScene):
-    """One scene, from frame 0 on. Made by ``start`` or, from the files of another process, by ``resume``.
+    """One scene from frame 0 onward. Created by ``start`` or, from the files of another process, by ``resume``.
 
-    A process should call ``warm_up.compile_in_processes`` before: else the kernels may be compiled here.
+    A process should call ``warm_up.compile_in_processes`` first; otherwise kernels may be compiled in this process.
 
     Attributes:
-        calibrated: the training cameras as given, or as frame 0 refined them. rig: the same inside, image-scaled.
-        world: user's world to inside, by the cameras as given. history: the committed states. report: of the last frame
-        committed by this object. resumed: where it was taken up again, or None.
+        calibrated: the training cameras as given or as refined with frame 0. rig: the same cameras in the internal
+            world at the scaled image size.
+        world: user to internal world, from the given cameras. history: the committed states. report: of the last frame
+            committed by this object. resumed: the resume point, or None.
         may_change_population: whether effects may add, retire and revive Gaussians.
 
     >>> from scas4d_core.captures import open_capture
@@ -87,7 +88,9 @@ class Reconstruction(CommittedScene):
     """
 
     def __init__(self, rig: Rig, settings: Settings, history: History, found: CalibrationReport | None = None) -> None:
-        """Without a frame yet; ``rig`` as given, of the frames' pictures. ``found``: None: as the history began."""
+        """Creates a scene without frames. ``rig`` is as given, at image size. ``found``: None to use the history's
+        calibration.
+        """
         world, scale = rig.world_frame(settings.scene.metres_per_unit), settings.scene.image_scale
         limits = rig_limits(settings.scene.near, world, rig.cameras)
         super().__init__(history, world, limits)
@@ -123,25 +126,27 @@ class Reconstruction(CommittedScene):
         notes: Mapping[str, Any] | None = None,
         started: float | None = None,
     ) -> Reconstruction:
-        """Reconstruct the first frame and commit it.
+        """Reconstructs the first frame and commits it.
 
         Args:
-            rig: training cameras, user's world and units, at the size of the frame's pictures.
-            frame: with a picture of every camera, or of most; masks where there are.
-            points: a first cloud, user's world; None: made from the pictures. progress: called with each stage.
-            history: to commit to; None: in memory. static: a frame 0 that was fitted before, taken as it is.
-            dropped, notes, started: see ``step``; the stage "load" has the time before: decoding, loading the kernels.
+            rig: training cameras in the user's world and units, at the size of the frame's images.
+            frame: with an image of every camera, or of most; with masks if available.
+            points: initial point cloud in the user's world; None to compute it from the images. progress: called in
+                each stage.
+            history: to commit to; None for one in memory. static: an existing fit of frame 0, used unchanged.
+            dropped, notes, started: see ``step``. The stage "load" is the time since ``started``: decoding and loading
+                kernels.
 
         Raises:
             RigError: the rig cannot work with these settings.
-            ValueError: a time that is not finite, or pictures of another size.
+            ValueError: the time is not finite, or the images have a different size.
         """
         if not isfinite(frame.time):
             raise ValueError(f"frame {frame.index}: time {frame.time} s must be finite")
         if static is None:
             check_rig(rig, settings.scene, None if points is None else points.positions)
         began, on_progress = perf_counter(), progress or (lambda _: None)
-        frame = replace(frame, images=dict(frame.images))  # decoded once
+        frame = replace(frame, images=dict(frame.images))  # decoded only once
         calibration = calibrate_first_frame(rig, frame, settings.static, on_progress, measured=static is None)
         settings, checked = with_background(settings, frame.images), perf_counter()
         self = cls(rig, settings, History() if history is None else history, calibration)
@@ -175,15 +180,16 @@ class Reconstruction(CommittedScene):
     def resume(
         cls, rig: Rig, settings: Settings, history: History, *, held: Callable[[int], bool] = lambda index: True
     ) -> Reconstruction:
-        """Resume a scene where its last commit left it; on the CPU it goes on with the same bits.
+        """Resumes a scene from its last commit; on the CPU, it continues with bit-identical results.
 
-        Where the newest state or its checkpoint is damaged, it goes on from the one before; frames after it are taken
-        back from the history, and ``resumed.undone`` names those to be given again. If one of them is not ``held``, a
-        whole newest state is worth more than the same bits: it goes on from that with a cold start.
+        If the newest state or its checkpoint is damaged, the scene resumes from the previous one. Later frames are
+        rolled back from the history, and ``resumed.undone`` lists the frames to send again. If one of them is not
+        ``held``, an intact newest state is preferred to bit-identical results: the scene resumes from that state with a
+        cold start.
 
         Args:
             rig, settings: as given to ``start``. history: of the scene, on disk, opened with ``History.open``.
-            held: whether the pictures of a committed frame can be given again.
+            held: returns whether the images of a committed frame can be sent again.
 
         Raises:
             ResumeError: the history has no frame, or its first state or every state is damaged.
@@ -205,12 +211,12 @@ class Reconstruction(CommittedScene):
         self.resumed = ResumePoint(index, history.truncate(index), faults, cold=left is None or not same)
         self._checkpoints.clean(history.indices)
         if self.resumed.cold:
-            with suppress(OSError):  # for want of room: the next start is as cold as this one
+            with suppress(OSError):  # no disk space: the next resume is also a cold start
                 self.write_checkpoint(index)
         return self
 
     def write_checkpoint(self, index: int) -> bool:
-        """Writes the checkpoint of the newest commit again; False for another one, which is not in memory."""
+        """Rewrites the checkpoint of the newest commit; returns False for older commits, which are not in memory."""
         if self._checkpoints is None or index != self.history.indices[-1]:
             return False
         self._checkpoints.save(index, self._prepared.carried)
@@ -218,13 +224,13 @@ class Reconstruction(CommittedScene):
 
     @classmethod
     def fork(cls, rig: Rig, settings: Settings, history: History, index: int) -> Reconstruction:
-        """A copy in memory that goes on from a committed frame, cold; ``history`` is read, not changed.
+        """Returns an in-memory copy that continues from a committed frame with a cold start; ``history`` is only read.
 
         Args:
-            rig, settings: as given to ``start``; those of the update may be others. index: a committed frame.
+            rig, settings: as given to ``start``; the update settings may differ. index: of a committed frame.
 
         Raises:
-            HistoryError: the frame or the first one cannot be read.
+            HistoryError: the frame or the first frame cannot be read.
         """
         copy = history.copy_frames((history.indices[0], index))
         self = cls(rig, with_recorded_background(settings, copy), copy)
@@ -233,7 +239,7 @@ class Reconstruction(CommittedScene):
         return self
 
     def _prepare_from_commit(self, index: int, carried: CarryOver) -> bool:
-        """Prepare the updates after a committed one; False: the motion that it left does not fit today's clusters."""
+        """Prepares the updates after a commit; returns False if its stored motion does not fit the current clusters."""
         roots = self.history.roots(index)
         self._fixed = replace(self._fixed, lengths=axis_lengths(roots))
         self._prepared = self._preparation.rebuild(roots, carried)
@@ -247,18 +253,19 @@ class Reconstruction(CommittedScene):
         notes: Mapping[str, Any] | None = None,
         started: float | None = None,
     ) -> FrameReport:
-        """Update to a frame and commit; a frame that does not fit is held or left out in part, and its report says so.
+        """Updates the state to a frame and commits it; a frame that does not fit is rejected entirely or in part.
 
         Args:
-            frame: later than the last; with the pictures of some cameras or all.
-            dropped: cameras that the caller has left out, with the reason; committed with the report.
-            notes: further facts to commit with it, as JSON. started: when the work began; a budget counts from it.
+            frame: later than the last frame, with images of at least one camera.
+            dropped: cameras excluded by the caller, with the reason; committed with the report.
+            notes: additional data to commit, as JSON. started: start of the work, from which a time budget counts.
 
         Raises:
-            StepError: not later than the last frame, no picture of the rig, or a picture of another size.
+            StepError: the frame is not later than the last one, has no image of the rig, or an image has a different
+                size.
         """
         seconds, watch = self._seconds_to(frame), Stopwatch(started)
-        frame = replace(frame, images=dict(frame.images))  # a capture's pictures are decoded whenever looked at
+        frame = replace(frame, images=dict(frame.images))  # a capture decodes its images on every access
         context = FrameContext(frame, watch, dropped, notes or {})
         self._observe(context, seconds)
         self._prepare(context)
@@ -269,12 +276,12 @@ class Reconstruction(CommittedScene):
         return report
 
     def _observe(self, context: FrameContext, seconds: float) -> None:
-        """Decodes the pictures, and judges their brightness and the light."""
+        """Decodes the images and checks their brightness and the lighting."""
         frame, watch, past = context.frame, context.watch, self._prepared.carried.past
         views = self._views(frame)
         watch.lap("decode")
         bright, shown = brightness(frame.images), fingerprints(frame.images)
-        judged = bright if self.settings.update.reject_outliers else {}  # then no picture is doubted
+        judged = bright if self.settings.update.reject_outliers else {}  # otherwise every image is accepted
         exposure, left_out, unusable = check_brightness(past, judged)
         changes = exposure != 1.0 and light_continues(past, judged)
         past = record_brightness(with_light(past, exposure), bright)
@@ -282,7 +289,7 @@ class Reconstruction(CommittedScene):
         watch.lap("judge")
 
     def _prepare(self, context: FrameContext) -> None:
-        """Finds the moving Gaussians where no masks name them, and gathers the input of the update."""
+        """Finds the moving Gaussians if there are no masks, and collects the input of the update."""
         observed, frame, prepared, newest = context.frame_input, context.frame, self._prepared, self.history.newest
         believed, learns = observed.believed, observed.steady and self._learns_labels
         if learns and prepared.carried.seen:
@@ -313,20 +320,20 @@ class Reconstruction(CommittedScene):
         )
 
     def _solve(self, context: FrameContext) -> None:
-        """Updates Θ_{t−1} to the frame; a frame that is rejected changes nothing."""
+        """Updates Θ_{t−1} to the frame; a rejected frame changes nothing."""
         solver = FrameSolver(context.prepared.updater, self._factory, self._renderer, self._update)
         result, context.past = solver.run(context.update_input)
         context.check_seconds = solver.check_seconds
         context.watch.lap("update")
         context.watch.move("update", "judge", solver.check_seconds)
-        if result.outcome.rejected:  # motion seen in pictures that are rejected is rejected with them
+        if result.outcome.rejected:  # labels learnt from rejected images are discarded
             carried = self._prepared.carried
             context.prepared = self._prepared
             result = replace(result, gaussians=self.history.newest, motion=carried.motion, carried=carried.effects)
         context.result = result
 
     def _populate(self, context: FrameContext) -> None:
-        """Takes the effects' evidence, lets Gaussians come and go, and prepares the next update."""
+        """Passes the frame to the effects, adds and retires Gaussians, and prepares the next update."""
         observed, result, believed = context.frame_input, context.result, context.frame_input.believed
         learnt_from = believed if self._learns_labels else None
         carried = context.prepared.carried.after(
@@ -336,7 +343,7 @@ class Reconstruction(CommittedScene):
         context.notes = {"cold": context.update_input.motion is None, "learn_labels": learn_labels, **context.notes}
         context.prepared = replace(context.prepared, carried=carried)
         context.birth_fit_time = FitTime(self._budget.end_of_births(context.watch.began))
-        if not result.outcome.learnt or result.exposure != 1.0:  # where a change of light was taken out, much looks new
+        if not result.outcome.learnt or result.exposure != 1.0:  # after compensation of a light change, much looks new
             return
         learnt = [view for view in result.views or believed if view.name not in result.trace.left_out]
         names = {view.name for view in learnt}
@@ -363,7 +370,7 @@ class Reconstruction(CommittedScene):
         )  # fmt: skip
 
     def _commit_update(self, context: FrameContext, report: FrameReport) -> None:
-        """Commits the frame with what was born in it, and lets the budget learn from its time."""
+        """Commits the frame and the Gaussians added in it, and records its time for the budget."""
         result, prepared, watch = context.result, context.prepared, context.watch
         grown = prepared.roots is not self._prepared.roots
         birth = {"roots": prepared.roots, "parents": result.parents} if grown else {}
@@ -374,11 +381,11 @@ class Reconstruction(CommittedScene):
 
     @property
     def _learns_labels(self) -> bool:
-        """True where moving Gaussians are found from motion: there are no masks, and an effect asks for it."""
+        """True if moving Gaussians are detected from motion: there are no masks and an effect requires it."""
         return self._prepared.plan.learns_labels and not self._fixed.masked
 
     def _seconds_to(self, frame: Frame) -> float:
-        """Seconds from the last committed frame to one that comes after it."""
+        """Returns the seconds from the last committed frame to a later one."""
         last = self.history.indices[-1]
         if frame.index <= last:
             raise StepError(f"frame {frame.index} is not after the last committed frame {last}")
@@ -388,7 +395,7 @@ class Reconstruction(CommittedScene):
         return seconds
 
     def _views(self, frame: Frame) -> list[TrainingView]:
-        """The views of a frame, as the scene knows its cameras by now."""
+        """Returns the views of a frame, with the current camera estimates."""
         try:
             return self._preparation.views(frame, self._fixed.exposures, self._prepared)
         except ValueError as error:
@@ -402,7 +409,9 @@ class Reconstruction(CommittedScene):
         stop_gain: float | None = None,
         skip_tolerance: float | None = None,
     ) -> None:
-        """Give the updates from here on another budget; None: as made. ValueError: out of ``UpdateSettings``' range."""
+        """Changes the budget of later updates; None resets to the settings. ValueError: out of ``UpdateSettings``'
+        range.
+        """
         given = {
             "iterations": iterations,
             "budget_ms": budget_ms,
@@ -416,7 +425,7 @@ class Reconstruction(CommittedScene):
     def _commit(
         self, report: FrameReport, gaussians: Gaussians, prepared: PreparedUpdate, more: Mapping[str, Any], **birth: Any
     ) -> None:
-        """The checkpoint first, then state and report in one rename; ``birth``: see ``History.append``."""
+        """Writes the checkpoint, then state and report in one rename; for ``birth`` see ``History.append``."""
         carried = prepared.carried
         if self._checkpoints is not None:
             self._checkpoints.save(report.index, carried)
@@ -424,7 +433,7 @@ class Reconstruction(CommittedScene):
         resumed = None if self.resumed is None or self.report is not None else asdict(self.resumed)
         effects = encode_switches(carried.switches)
         record = {**report.record(), "effects": effects, "threads": get_num_threads(), "resumed": resumed, **more}
-        seconds = report.seconds  # a record cannot time its own writing: it has that of the one before
+        seconds = report.seconds  # a record cannot time its own writing, so it includes that of the previous one
         seconds[REPORT] = seconds.get(REPORT, 0.0) + self.history.record_seconds + perf_counter() - began
         record["seconds"] = dict(seconds)
         kept = committed_arrays(carried.effects) if self.history.indices else carried.effects

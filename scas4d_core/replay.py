@@ -1,8 +1,8 @@
-"""Replays the last frames of a scene in memory, to measure the cost and the error of another number of iterations.
+"""Replays the last frames of a scene in memory, to measure the cost and error of a different number of iterations.
 
-Every budget starts from the same committed state, cold. The first frame warms it up and is not counted: after it, each
-update starts from a motion, as in the scene. The clock and the stop rule are switched off, so that a budget has its
-iterations. Nothing on disk is touched.
+Every budget starts with a cold start from the same committed state. The first frame is a warm-up and is not counted;
+each later update starts from a motion, as in the scene. The time budget and stopping rule are disabled, so that every
+update runs all iterations. Nothing is written to disk.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 
 Decode = Callable[[], tuple[Frame, Mapping[str, str]]]
-"""A frame's pictures, decoded each time anew, and cameras that are left out, with the reason."""
+"""Decodes a frame's images on each call; also returns the excluded cameras, with the reason."""
 
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """Cost and error of a frame with so many iterations.
+    """Cost and error of a frame for a given number of iterations.
 
     Attributes:
-        milliseconds: a frame from decoding to the end of the update, the median; nothing is written.
-        error: mean image loss on the probe views of the state that was kept; None where the settings judge nothing.
-        psnr: dB, of training views as they were last rendered; None where not measured.
-        frames: how many it is measured on.
+        milliseconds: median time of a frame from decoding to the end of the update, without writing.
+        error: mean image loss on the probe views of the kept state; None if the settings disable the checks.
+        psnr: dB, of the training views as last rendered; None if not measured.
+        frames: number of measured frames.
     """
 
     iterations: int
@@ -52,18 +52,18 @@ def replay(
     iterations: int,
     over: Callable[[], None] = lambda: None,
 ) -> ReplayResult:
-    """Update frames again with another number of iterations.
+    """Replays frames with a different number of iterations.
 
     Args:
         rig: training cameras, user's world. settings: of the scene.
         history: of the scene; only ``base`` and the first frame are read.
-        base: the committed frame that the first of ``frames`` follows.
-        frames: at least two, in order; the first warms up. iterations: a frame.
+        base: index of the committed frame that the first of ``frames`` follows.
+        frames: at least two, in order; the first is a warm-up. iterations: per frame.
         over: called at the end of each update.
 
     Raises:
         HistoryError: ``base`` cannot be read.
-        StepError: a frame does not follow the one before.
+        StepError: a frame does not follow the previous one.
     """
     update = settings.update.model_copy(
         update={"iterations": iterations, "budget_ms": None, "stop_gain": 0.0, "skip_tolerance": -1.0}
@@ -80,9 +80,9 @@ def replay(
 
 
 def summary(iterations: int, reports: Sequence[FrameReport]) -> ReplayResult:
-    """Frames that were tried more than once or are not met say nothing of the budget: they count where all are so."""
+    """Summarizes reports; retried or degraded frames count only if all frames are retried or degraded."""
     clean = [report for report in reports if report.degraded is None and len(report.attempts) <= 1] or reports
-    errors = [report.errors[report.kept] for report in clean if report.kept in report.errors]
+    errors = [report.errors[report.candidate] for report in clean if report.candidate in report.errors]
     return ReplayResult(
         iterations,
         1000 * float(np.median([sum(report.seconds.values()) for report in clean])),

@@ -1,6 +1,6 @@
-"""Checks of a rig before a scene begins: what cannot work is refused, what looks wrong is said. Numpy only.
+"""Checks of a rig before a scene starts: errors for rigs that cannot work, warnings for likely mistakes. NumPy only.
 
-Importers, the service and ``reconstruct`` ask the same functions, so that each gives the same sentences.
+Importers, the service and ``reconstruct`` use the same functions, so that their messages are identical.
 """
 
 from __future__ import annotations
@@ -16,44 +16,47 @@ from scas4d_core.settings import SceneSettings
 Float = NDArray[np.float64]
 
 SMALLEST_SIDE = 11
-"""Pixels, after scaling: SSIM compares windows of 11 pixels, and a smaller picture has none that is whole."""
+"""Minimum image side in pixels after scaling: SSIM uses windows of 11 pixels, and a smaller image has no full window.
+"""
 FOCAL_LENGTHS = (0.05, 1000.0)
-"""Of the longer side of the picture: fields of 169° and of 0.06°. All but orthographic lenses are taken: that of a
-fly's rig has 17."""
+"""Allowed focal length as a multiple of the longer image side: fields of view from 169° to 0.06°. Only
+near-orthographic lenses are excluded; that of a fly rig has 17."""
 RADII = (1e-6, 1e9)
-"""Metres inside: beyond, a unit was mistaken, and float32 holds too little of a scene."""
+"""Allowed rig radius in metres: outside this range a unit is wrong, and float32 is too coarse for the scene."""
 
 FEW_SEE, MAX_SEE = 0.25, 0.9
-"""Shares of the cameras in whose pictures their common point lies: poses are suspected where as given few see it, and
-nearly all would the other way round."""
+"""Share of cameras whose image contains the common point. Poses are suspect if few cameras see it as given, but nearly
+all would see it with inverted poses."""
 POINTS_SEEN = 0.2
-"""Share of all pairs of a camera and a point that have to be in view the other way round, with at most ``FEW_SEE`` of
-it as given. Clouds of rooms go beyond the pictures: of `basketball` a third is in view."""
+"""Minimum share of camera–point pairs in view with inverted poses; the share as given must be at most ``FEW_SEE`` times
+as large. Point clouds of rooms extend beyond the images: a third of `basketball` is in view."""
 LEAST_CAMERAS = 3
-"""Without points: two axes come close to each other somewhere whatever they are."""
+"""Minimum number of cameras for a check without points: two axes always come close to each other somewhere."""
 NOT_PARALLEL = 1e-3
-"""Smallest mean squared sine between the axes and any direction: below, they are parallel and have no common point."""
+"""Smallest mean squared sine between the axes and any direction; below it, they are parallel and have no common point.
+"""
 LEAST_DEPTH = 0.05
-"""Of the rig's extent: a common point that is nearer to a camera is where the cameras themselves are."""
+"""Minimum depth of the common point as a share of the rig's extent; a nearer point lies among the cameras themselves.
+"""
 MAX_POINTS = 2000
-"""Points of a cloud that are looked at, evenly out of all."""
+"""Maximum number of points that are checked, sampled evenly from the cloud."""
 SEEN_AT_ALL = 0.1
-"""Share of a cloud that the cameras together have to have in view."""
+"""Minimum share of a cloud that must be in view of at least one camera."""
 FAR = 100.0
-"""Radii of the rig from its middle to the points, in the median, from which their unit or world is questioned. Not of
-cameras that look all one way: nothing says how far."""
+"""Median distance of the points from the rig centre, in rig radii, above which their unit or world is questioned. Not
+used if all cameras look in the same direction, because then nothing limits the distance."""
 ONE_WAY = 0.9
-"""Length of the mean of the viewing axes, from which the cameras look one way."""
+"""Length of the mean viewing direction above which the cameras look in the same direction."""
 
 USUAL_RADIUS = 60.0
-"""Metres: a larger rig was probably measured in another unit. Small ones stand before small things."""
+"""Rig radius in metres above which the unit is probably wrong. Small rigs are plausible for small objects."""
 
 
 class RigError(CameraError):
-    """A rig, or settings for it, with which a scene cannot work.
+    """A rig, or settings for it, that cannot work.
 
     Attributes:
-        field: dotted, as in a request to the service. value: as it was given.
+        field: dotted name, as in a request to the service. value: as given.
     """
 
     def __init__(self, fault: str, remedy: str, field: str, value: object) -> None:
@@ -62,11 +65,11 @@ class RigError(CameraError):
 
 
 def check_rig(rig: Rig, scene: SceneSettings, positions: Float | None) -> None:
-    """Refuses a rig, settings and points of a first frame that cannot work, before any of its pictures is looked at.
+    """Rejects a rig, settings and points of a first frame that cannot work, before its images are read.
 
     Args:
-        rig: in the user's world, at the size of the pictures. scene: its unit and scale.
-        positions: [P, 3] of the cloud in the same world, or None.
+        rig: in the user's world, at image size. scene: unit and image scale.
+        positions: [P, 3] point cloud in the same world, or None.
 
     Raises:
         RigError: see ``check_scene``, ``check_start`` and ``check_points``.
@@ -78,13 +81,13 @@ def check_rig(rig: Rig, scene: SceneSettings, positions: Float | None) -> None:
 
 
 def check_scene(rig: Rig, scene: SceneSettings) -> None:
-    """Refuses what cannot work, whatever the pictures show.
+    """Rejects rigs and settings that cannot work with any images.
 
     Args:
-        rig: in the user's world, at the size of the pictures. scene: its unit and scale.
+        rig: in the user's world, at image size. scene: unit and image scale.
 
     Raises:
-        RigError: absurd focal lengths, pictures of a few pixels, or a rig of absurd extent.
+        RigError: the focal lengths, the image size or the extent of the rig are out of range.
 
     >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
     >>> check_scene(Rig((camera,)), SceneSettings(image_scale=0.25))
@@ -141,10 +144,10 @@ def _check_extent(rig: Rig, scene: SceneSettings) -> None:
 
 
 def check_start(rig: Rig, has_points: bool) -> None:
-    """Refuses to begin without points where no two cameras are apart: no depth can be found.
+    """Rejects a start without points if no two cameras are apart, because no depth can be found.
 
     Raises:
-        RigError: one camera, or all at one place, and no points.
+        RigError: there is one camera, or all cameras are at one place, and there are no points.
 
     >>> lens = [[100, 0, 32], [0, 100, 24], [0, 0, 1]]
     >>> check_start(Rig((Camera("front", lens, np.eye(4), 64, 48),)), has_points=False)
@@ -163,12 +166,12 @@ def check_start(rig: Rig, has_points: bool) -> None:
 
 
 def check_points(rig: Rig, positions: Float) -> None:
-    """Refuses points [P, 3] of the user's world that lie behind every camera, each of them.
+    """Rejects points [P, 3] in the user's world if every point lies behind every camera.
 
     Raises:
-        RigError: no camera can see any.
+        RigError: no camera can see any point.
     """
-    for cloud in (_some(positions), positions):  # one of few is before a camera mostly
+    for cloud in (_some(positions), positions):  # a small sample is usually sufficient
         if any((camera.to_camera(cloud)[:, 2] > 0).any() for camera in rig.cameras):
             return
     raise RigError(
@@ -181,10 +184,10 @@ def check_points(rig: Rig, positions: Float) -> None:
 
 
 def rig_warnings(rig: Rig, scene: SceneSettings, positions: Float | None = None) -> list[str]:
-    """Sentences on what may be wrong with a rig that can work: its unit, its poses, its cloud.
+    """Returns warnings about a usable rig: its unit, its poses and its point cloud.
 
     Args:
-        rig: in the user's world. scene: its unit. positions: [P, 3] of the cloud in the same world, or None.
+        rig: in the user's world. scene: unit. positions: [P, 3] point cloud in the same world, or None.
     """
     poses = pose_warnings(rig, positions)
     cloud = [] if poses or positions is None else cloud_warnings(rig, positions)
@@ -192,7 +195,7 @@ def rig_warnings(rig: Rig, scene: SceneSettings, positions: Float | None = None)
 
 
 def unit_warnings(rig: Rig, scene: SceneSettings) -> list[str]:
-    """A sentence where the rig is as large as if its unit were not the metre; else none.
+    """Returns a warning if the size of the rig suggests that its unit is not the metre; otherwise empty.
 
     >>> lens, there = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4)
     >>> there[0, 3] = 4000
@@ -215,7 +218,7 @@ def unit_warnings(rig: Rig, scene: SceneSettings) -> list[str]:
 
 
 def cloud_warnings(rig: Rig, positions: Float) -> list[str]:
-    """A sentence on points [P, 3] that no camera has in view, or that lie far off; none where they fit.
+    """Returns a warning about points [P, 3] that no camera sees or that are far away; empty if they fit.
 
     >>> lens, beside = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4)
     >>> beside[0, 3] = -0.2
@@ -239,15 +242,15 @@ def cloud_warnings(rig: Rig, positions: Float) -> list[str]:
 
 
 def pose_warnings(rig: Rig, positions: Float | None = None) -> list[str]:
-    """Sentences on poses that seem to be the wrong way round, camera to world; none where nothing speaks for it.
+    """Returns warnings about poses that appear to be inverted (camera to world); empty without evidence.
 
-    With points: they are out of view, and would be in view the other way round. Without: the viewing axes come
-    together nowhere, before or behind the cameras, and would in nearly all pictures. Rigs that look outward come
-    together behind, those that look all one way neither way. Poses in the world of one of the cameras often come
-    together both ways: nothing is reported then, as only pictures could decide.
+    With points: few of them are in view, but many would be with inverted poses. Without points: the viewing axes meet
+    neither in front of nor behind the cameras, but would meet in nearly all images with inverted poses. The axes of
+    outward-looking rigs meet behind the cameras; those of rigs that look in one direction never meet. Poses relative to
+    one of the cameras often meet both ways. In this case nothing is reported, because only the images could decide.
 
     Args:
-        rig: of at least three cameras where there are no points. positions: [P, 3] in its world, or None.
+        rig: of at least three cameras if there are no points. positions: [P, 3] in its world, or None.
 
     >>> lens, ring = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], []
     >>> for i, angle in enumerate((0, 2, 4)):
@@ -263,7 +266,7 @@ def pose_warnings(rig: Rig, positions: Float | None = None) -> list[str]:
     if positions is not None and len(positions):
         some = _some(positions)
         given = float(np.mean(_seen(rig.cameras, some)))
-        if given > FEW_SEE:  # no other way round can show so much more
+        if given > FEW_SEE:  # inverted poses could not show many times as much
             return []
         other = float(np.mean(_seen([_inverted(camera) for camera in rig.cameras], some)))
         if other < POINTS_SEEN or given > FEW_SEE * other:
@@ -290,7 +293,7 @@ def _inverted(camera: Camera) -> Camera:
 
 
 def _seen(cameras: Sequence[Camera], points: Float) -> NDArray[np.bool_]:
-    """[C, P] as `_sees`, of all cameras at once: a service may start over hundreds of rigs."""
+    """Returns [C, P] visibility as in `_sees`, for all cameras at once: a service may check hundreds of rigs."""
     poses, lenses = np.stack([one.world_to_camera for one in cameras]), np.stack([one.intrinsics for one in cameras])
     sizes = np.array([(one.width, one.height) for one in cameras])[:, None]
     there = points @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
@@ -301,18 +304,19 @@ def _seen(cameras: Sequence[Camera], points: Float) -> NDArray[np.bool_]:
 
 
 def _sees(camera: Camera, points: Float) -> NDArray[np.bool_]:
-    """True for each point [P, 3] that is before the camera and within its picture."""
-    uv, _ = camera.project(points)  # NaN behind
+    """Returns true for each point [P, 3] that is in front of the camera and within its image."""
+    uv, _ = camera.project(points)  # NaN for points behind the camera
     with np.errstate(invalid="ignore"):
         inside = (uv >= 0) & (uv <= (camera.width, camera.height))
     return np.asarray(inside.all(axis=-1))
 
 
 def _come_together(cameras: Sequence[Camera], *, behind: bool) -> float:
-    """The share of the cameras in whose picture the point nearest to all viewing axes lies; 0 where there is none.
+    """Returns the share of cameras whose image contains the point nearest to all viewing axes; 0 if there is no such
+    point.
 
     Args:
-        behind: a point behind a camera counts as well, in the picture on the other side.
+        behind: also count a point behind a camera if its mirror image is within the camera's image.
     """
     axes = np.array([camera.rotation[2] for camera in cameras])
     centres = np.array([camera.centre for camera in cameras])

@@ -1,6 +1,6 @@
-"""Settings of a scene: every number that a user can set, with its unit, range and the reason for its default.
+"""Settings of a scene: every value that a user can change, with its unit, range and the reason for its default.
 
-Numbers that only the method's author would turn are constants beside their use.
+Values that only developers of the method would change are constants in the modules that use them.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ Count = Annotated[int, Field(ge=1, le=1_000_000)]
 
 
 class SettingsModel(BaseModel):
-    """Base of all settings: they do not change once read, and an unknown name is an error."""
+    """Base of all settings: instances are immutable, and an unknown name is an error."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
 class SceneSettings(SettingsModel):
-    """The world of the scene: unit, pictures, background, floor.
+    """Settings of the scene: unit, images, background, near plane and floor.
 
     >>> SceneSettings(metres_per_unit="auto").image_scale
     1.0
@@ -71,7 +71,7 @@ class SceneSettings(SettingsModel):
 
 
 class StaticSettings(SettingsModel):
-    """Frame 0: 3D Gaussian Splatting with adaptive density control.
+    """Settings of frame 0: 3D Gaussian Splatting with adaptive density control.
 
     >>> StaticSettings(seed=3).detail
     1.0
@@ -112,14 +112,14 @@ class StaticSettings(SettingsModel):
 
 
 class LayerRates(SettingsModel):
-    """Adam rates of one layer of clusters."""
+    """Adam learning rates of one layer of clusters."""
 
     rotation: Positive = Field(description="Per iteration, in units of tan(angle/2).")
     translation: Positive = Field(description="Metres per iteration, for a scene radius of 4 m.")
 
 
 class Weights(SettingsModel):
-    """Weights of the terms, beside 1 for the image loss. A term with weight 0 is not computed."""
+    """Weights of the loss terms; the image loss has weight 1. A term with weight 0 is not computed."""
 
     mask: NotNegative = Field(
         1.0,
@@ -140,7 +140,7 @@ class Weights(SettingsModel):
 
 
 class UpdateSettings(SettingsModel):
-    """One update: from Θ_{t−1} and the pictures of frame t to Θ_t.
+    """Settings of an update from Θ_{t−1} and the images of frame t to Θ_t.
 
     >>> UpdateSettings(iterations=50, budget_ms=400).clusters
     (64, 320, 1280)
@@ -285,5 +285,5 @@ class Settings(SettingsModel):
             if name not in EFFECTS:
                 near = difflib.get_close_matches(name, EFFECTS, 1)
                 remedy = f"did you mean {near[0]}? " if near else ""
-                raise InputError(f"{name} is no effect", f"{remedy}docs/effects.md lists all effects")
+                raise InputError(f"{name} is not an effect", f"{remedy}docs/effects.md lists all effects")
         return effects

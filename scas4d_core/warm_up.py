@@ -1,8 +1,7 @@
-"""Has the kernels that a scene needs compiled before they are called, in other processes than the one that computes.
+"""Compiles the kernels of a scene in separate processes before they are first called.
 
-Compiling takes tens of seconds and hundreds of megabytes that a process would keep. A process calls
-`compile_in_processes`
-before its first ``Reconstruction``; without, kernels are compiled where they are first called.
+Compilation takes tens of seconds, and hundreds of megabytes that the calling process would not release. A process calls
+`compile_in_processes` before its first ``Reconstruction``; otherwise kernels are compiled on their first call.
 """
 
 from __future__ import annotations
@@ -15,16 +14,16 @@ from scas4d_core.compilation.manifest import KernelGroup, groups_of_update
 EVERY = tuple(KernelGroup)
 
 _settled: set[KernelGroup] = set()
-"""The groups that this process has asked for."""
+"""Kernel groups that this process has already requested."""
 
 
 def compile_in_processes(
     wanted: Iterable[KernelGroup] = EVERY, *, then: Iterable[KernelGroup] = (), on_progress: OnProgress | None = None
 ) -> None:
-    """Waits until the cache has the kernels of the groups ``wanted``; a process asks for each group once.
+    """Waits until the cache has the kernels of the groups ``wanted``; each group is requested once per process.
 
     Args:
-        wanted, then, on_progress: see `compiled`.
+        wanted, then, on_progress: see ``wait_for_kernels``.
     """
     asked = tuple(group for group in wanted if group not in _settled)
     if asked:
@@ -33,17 +32,17 @@ def compile_in_processes(
 
 
 def first_frame_groups(*, points: bool) -> tuple[KernelGroup, ...]:
-    """Returns the groups that a first frame needs; ``points``: whether it is given points to start from."""
+    """Returns the kernel groups that a first frame needs; ``points``: whether initial points are given."""
     return (KernelGroup.FIRST_FRAME,) if points else (KernelGroup.FIRST_FRAME, KernelGroup.STEREO)
 
 
 def update_groups(covariance: str) -> tuple[KernelGroup, ...]:
-    """Returns the groups that updates need; ``covariance`` as in their settings."""
+    """Returns the kernel groups that updates need; ``covariance`` is as in ``UpdateSettings``."""
     return groups_of_update(covariance)
 
 
 def warm_up(on_progress: OnProgress) -> None:
-    """Waits until the cache has the kernels of a first frame; those of updates are compiled after them."""
+    """Waits until the cache has the kernels of a first frame; those of updates are compiled afterwards."""
     compile_in_processes((KernelGroup.FIRST_FRAME,), then=groups_of_update("entangled"), on_progress=on_progress)
 
 

@@ -16,7 +16,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
-from client.cli.changes import changes_of
+from client.cli.changes import format_changes
 from scas4d_core.presets import PRESETS
 from scas4d_core.settings import Settings
 from server.settings import PREFIX, ServerSettings
@@ -65,7 +65,7 @@ def preset_rows() -> Iterator[str]:
     """Of the presets, what each changes."""
     usual = Settings().model_dump(mode="json")
     for name, settings in PRESETS.items():
-        changes = changes_of(settings.model_dump(mode="json"), usual)
+        changes = format_changes(settings.model_dump(mode="json"), usual)
         found = ", ".join(f"`{one}={json.dumps(value)}`" for one, value in changes.items())
         yield f"| `{name}` | {cell(found or 'nothing: the default')} |"
 

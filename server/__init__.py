@@ -1,1 +1,1 @@
-"""The service: takes frames over HTTP, runs scenes in worker processes, answers views, tracks and parts."""
+"""HTTP service that accepts frames, runs scenes in worker processes, and serves views, tracks and parts."""

@@ -1,4 +1,4 @@
-"""The application factory: middlewares, routes, and the life of the service."""
+"""Application factory: middleware, routes, and the lifespan of the service."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from starlette.routing import Route, WebSocketRoute
 
 from client import __version__
 from server import problems
+from server.connections.client_limit import ClientLimit
 from server.connections.guard import ConnectionGuard, ConnectionLimits
-from server.connections.proxies import ClientLimit
 from server.health.readiness import Readiness
 from server.http import handlers
 from server.http.authentication import AuthMiddleware
-from server.http.middleware import AccessLog, BodyLimit, HeadAsGet, compressed
+from server.http.middleware import AccessLog, BodyLimit, HeadAsGet, compress_responses
 from server.http.tickets import Tickets
 from server.hub import Hub
 from server.peers.peers import Peers
@@ -58,14 +58,14 @@ from server.settings import ServerSettings
 
 
 def create_app(settings: ServerSettings | None = None, placement: Placement | None = None) -> FastAPI:
-    """Makes the application of the service.
+    """Returns the application of the service.
 
-    `server.connections.config.guarded` runs it, as `scas4d serve` does. With
-    `uvicorn --factory server.app:create_app` it works too, but nothing bounds what a peer may send before
-    its token is looked at.
+    Run it with `server.connections.config.uvicorn_config`, as `scas4d serve` does. It also works with
+    `uvicorn --factory server.app:create_app`, but then nothing limits the data that a peer can send before its token is
+    checked.
     """
     settings = settings or ServerSettings.from_environment()
-    if logging.getLogger("scas4d").level == logging.NOTSET:  # `serve` has set it
+    if logging.getLogger("scas4d").level == logging.NOTSET:  # otherwise `serve` has set it
         logging.getLogger("scas4d").setLevel(logging.INFO)
 
     @asynccontextmanager
@@ -77,7 +77,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
         app.state.readiness = Readiness(settings, where)
         app.state.scenes = Scenes(settings, where, app.state.hub)
         await app.state.scenes.open()
-        app.state.peers = Peers(where.peers, settings.secret) if where.has_siblings else None
+        app.state.peers = Peers(where.peers, settings.secret) if where.has_peers else None
         app.state.exports = Exports(app.state.scenes, where)
         await app.state.exports.open()
         yield
@@ -94,18 +94,18 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
         summary="Online 4D reconstruction of calibrated multi-camera rigs.",
         lifespan=lifespan,
         responses=problems.RESPONSES,
-        docs_url=None,  # `routes.reference` has both pages
+        docs_url=None,  # `routes.reference` serves both pages
         redoc_url=None,
     )
     app.state.settings = settings
     app.state.guard = ConnectionGuard(ConnectionLimits.of(settings))
     app.state.tickets = Tickets(settings.secret)
-    handlers.install(app)
-    # The last one added is the first that a request meets.
+    handlers.install_handlers(app)
+    # The middleware added last is the first to receive a request.
     app.add_middleware(BodyLimit, limit=int(settings.max_body_mb * 1e6))
-    app.add_middleware(compressed)
+    app.add_middleware(compress_responses)
     app.add_middleware(HeadAsGet)
-    if placement is not None and placement.has_siblings:
+    if placement is not None and placement.has_peers:
         app.add_middleware(
             ProxyMiddleware,
             peers=lambda: app.state.peers,
@@ -153,7 +153,7 @@ def create_app(settings: ServerSettings | None = None, placement: Placement | No
 
 
 def _keep_document(app: FastAPI) -> None:
-    """Answers /openapi.json from memory: it needs no token, and writing it anew takes milliseconds."""
+    """Serves /openapi.json from memory, since it needs no token and takes milliseconds to generate."""
     kept: list[bytes] = []
 
     async def openapi(request: Request) -> Response:
@@ -166,7 +166,7 @@ def _keep_document(app: FastAPI) -> None:
 
 
 def _answer_plain_requests(app: FastAPI, router: APIRouter) -> None:
-    """Answers 426 instead of 404 to a plain request at the address of a WebSocket."""
+    """Responds with 426 instead of 404 to a plain HTTP request at the URL of a WebSocket."""
 
     async def upgrade(request: Request) -> Response:
         raise Problem(

@@ -1,4 +1,4 @@
-"""Background tasks of a scene: kept until they are done, and cancelled when the scene ends."""
+"""Background tasks of a scene, kept alive until they finish and cancelled when the scene ends."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 
 
 class Background:
-    """Keeps the background tasks of a scene until they are done; the scene's end cancels them.
+    """Set of a scene's background tasks, kept alive until they finish.
 
     Args:
-        failed: called with the error that a task ended with.
+        failed: called with the exception that a task raised.
     """
 
     def __init__(self, failed: Callable[[BaseException], None]) -> None:
@@ -21,11 +21,16 @@ class Background:
 
     @property
     def busy(self) -> bool:
-        """True while a task is not done that ends by itself."""
+        """True while any task other than an endless one is running."""
         return bool(self._tasks - self._endless)
 
     def run(self, coroutine: Coroutine[Any, Any, None], *, endless: bool = False) -> None:
-        """Begins a task; tasks run in the order of the calls where they do not wait."""
+        """Starts a task; tasks start in the order of the calls.
+
+        Args:
+            coroutine: the body of the task.
+            endless: True for a task that runs until it is cancelled; such a task does not count as `busy`.
+        """
         task = asyncio.get_running_loop().create_task(coroutine)
         self._tasks.add(task)
         if endless:

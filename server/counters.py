@@ -1,6 +1,7 @@
-"""Counters and histograms of this process, for Prometheus: each is raised where the event happens.
+"""Prometheus counters and histograms of this process, updated by the code in which the event happens.
 
-This file imports nothing of the service, so that every part can count. `server.health.metrics` has the gauges.
+This module imports no other module of the service, so that every part of the service can import it. The gauges are in
+`server.health.metrics`.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from scas4d_core.frame_outcome import AlarmKind
 SECONDS = (0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1, 2, 4, 8, 16, 32, 64, 128, 256)
 
 registry = CollectorRegistry()
-"""Metrics of this process, without the interpreter's own."""
+"""Registry of this process's metrics, without the metrics of the Python interpreter."""
 
 FRAMES = Counter(
     "scas4d_frames",
@@ -27,7 +28,7 @@ DEGRADED = Counter(
     ["how"],
     registry=registry,
 )
-LEFT_OUT = Counter(
+DROPPED_CAMERAS = Counter(
     "scas4d_cameras_left_out",
     "Cameras of committed frames that were not learnt from: nothing came, or it did not fit.",
     registry=registry,
@@ -43,8 +44,8 @@ for what in AlarmKind:
 UPDATE_SECONDS = Histogram(
     "scas4d_update_seconds", "A committed frame, by stage.", ["stage"], buckets=SECONDS, registry=registry
 )
-ANSWER_SECONDS = Histogram(
-    "scas4d_answer_seconds",
+QUERY_SECONDS = Histogram(
+    "scas4d_query_seconds",
     "From the question to the answer of a scene's reader, by kind (render, tracks, parts, gaussians, ply) and outcome.",
     ["kind", "outcome"],
     buckets=SECONDS,

@@ -1,4 +1,7 @@
-"""Publishes what happens in the scenes. Publishing hands an event to every listener of a scene and waits for none."""
+"""Hub that publishes the events of scenes to their listeners.
+
+Publishing passes an event to every listener of a scene and never waits for a listener.
+"""
 
 from __future__ import annotations
 
@@ -18,18 +21,18 @@ log = logging.getLogger("scas4d.server")
 
 @dataclass(frozen=True)
 class SceneChanged:
-    """The scene's state, progress or queue has changed."""
+    """Event for a change of the scene's state, progress or queue."""
 
 
 @dataclass(frozen=True)
 class FrameFinished:
-    """A frame was committed, or ended without a state of its own."""
+    """Event for a frame that was committed, or that finished without a state of its own."""
 
     report: FrameReportModel
 
     @cached_property
     def text(self) -> str:
-        """The report as JSON, written once for all who listen."""
+        """The report as JSON, serialized once for all listeners."""
         return self.report.model_dump_json()
 
 
@@ -37,45 +40,45 @@ Event = SceneChanged | FrameFinished
 
 
 class Listener(Protocol):
-    """A subscriber, as the hub sees it. All methods return at once."""
+    """Interface of a subscriber to the hub; all methods return immediately."""
 
     def on_event(self, event: Event) -> None:
-        """Something happened in the scene."""
+        """Handles an event of the scene."""
 
     def on_close(self, reason: str) -> None:
-        """The scene is no more."""
+        """Handles the deletion of the scene."""
 
     def on_restart(self) -> None:
-        """The scene is another one from here on: the listener may join it anew."""
+        """Handles the restart of the scene, after which the listener may join it again."""
 
 
 L = TypeVar("L", bound=Listener)
 
 
 class Channel:
-    """The listeners of one scene, and the queries that they share."""
+    """Listeners of one scene and the queries that they share."""
 
     def __init__(self, ask: AskReaders) -> None:
         self.listeners: list[Listener] = []
         self.queries = SharedQueries(ask)
         self._status: str | None = None
 
-    def changed(self) -> None:
-        """Notes that the status has changed."""
+    def invalidate_status(self) -> None:
+        """Discards the cached status because it has changed."""
         self._status = None
 
     def status(self, read: Callable[[], SceneStatus]) -> str:
-        """The scene's status as JSON, written once for all who listen."""
+        """Returns the scene's status as JSON, serialized once for all listeners."""
         if self._status is None:
             self._status = read().model_dump_json()
         return self._status
 
 
 class Hub:
-    """The channels of all scenes, by scene id.
+    """Channels of all scenes, keyed by scene id.
 
     Args:
-        max_listeners: of one scene.
+        max_listeners: maximum number of listeners per scene.
     """
 
     def __init__(self, max_listeners: int) -> None:
@@ -86,7 +89,7 @@ class Hub:
         """Adds a listener to a scene's channel and returns it.
 
         Raises:
-            Problem: 429, as many listen as may.
+            Problem: 429 if the scene already has `max_listeners` listeners.
         """
         channel = self._channels.get(scene) or Channel(ask)
         if len(channel.listeners) >= self.max_listeners:
@@ -104,7 +107,7 @@ class Hub:
         return listener
 
     def leave(self, scene: str, listener: Listener) -> None:
-        """Removes a listener; an empty channel is given up."""
+        """Removes a listener, and discards its channel if it was the last one."""
         channel = self._channels.get(scene)
         if channel is None or listener not in channel.listeners:
             return
@@ -113,16 +116,19 @@ class Hub:
             del self._channels[scene]
 
     def count(self, scene: str | None = None) -> int:
-        """Counts the listeners of one scene, or of all."""
+        """Returns the number of listeners of one scene, or of all scenes."""
         channels = self._channels.values() if scene is None else filter(None, [self._channels.get(scene)])
         return sum(len(channel.listeners) for channel in channels)
 
     def publish(self, scene: str, event: Event) -> None:
-        """Notifies every listener of a scene. Never blocks, never raises: the scene's own work comes first."""
+        """Notifies every listener of a scene.
+
+        Never blocks and never raises, because a listener must not disturb the scene's own work.
+        """
         channel = self._channels.get(scene)
         if channel is None:
             return
-        channel.changed()
+        channel.invalidate_status()
         for listener in tuple(channel.listeners):
             try:
                 listener.on_event(event)
@@ -130,25 +136,26 @@ class Hub:
                 log.exception("scene %s: a subscriber could not take the event %s", scene, type(event).__name__)
 
     def close(self, scene: str, reason: str) -> None:
-        """Closes the channel of a scene that is gone, and notifies its listeners."""
-        for listener in self._give_up(scene):
+        """Closes the channel of a deleted scene and notifies its listeners."""
+        for listener in self._remove_channel(scene):
             listener.on_close(reason)
 
     def restart(self, scene: str) -> None:
-        """Closes the channel of a scene that begins anew; its listeners join again by themselves."""
-        for listener in self._give_up(scene):
+        """Closes the channel of a scene that restarts; its listeners join again on their own."""
+        for listener in self._remove_channel(scene):
             listener.on_restart()
 
-    def _give_up(self, scene: str) -> list[Listener]:
+    def _remove_channel(self, scene: str) -> list[Listener]:
         channel = self._channels.pop(scene, None)
         return [] if channel is None else channel.listeners
 
 
 class Publisher:
-    """Publishes the events of one scene, and counts its finished frames in the metrics.
+    """Publisher of one scene's events, which also counts its finished frames in the metrics.
 
     Args:
-        hub: of the service. scene: id of the scene.
+        hub: the hub of the service.
+        scene: id of the scene.
     """
 
     def __init__(self, hub: Hub, scene: str) -> None:
@@ -160,17 +167,17 @@ class Publisher:
         """Number of listeners of the scene."""
         return self._hub.count(self._scene)
 
-    def changed(self) -> None:
-        """Publishes that the status of the scene has changed; to be called at every change."""
+    def publish_status(self) -> None:
+        """Publishes a change of the scene's status; call it at every change."""
         self._hub.publish(self._scene, SceneChanged())
 
-    def finished(self, report: FrameReportModel) -> None:
-        """Counts and publishes a finished frame; to be called once a frame."""
+    def publish_frame(self, report: FrameReportModel) -> None:
+        """Counts and publishes a finished frame; call it once per frame."""
         counters.FRAMES.labels(report.state.value).inc()
         if report.state == FrameState.COMMITTED:
-            counters.LEFT_OUT.inc(len(report.dropped_cameras))
+            counters.DROPPED_CAMERAS.inc(len(report.dropped_cameras))
             for alarm in report.alarms:
-                counters.ALARMS.labels(alarm.what.value).inc()
+                counters.ALARMS.labels(alarm.kind.value).inc()
             if report.outcome is not None and report.outcome.degraded:
                 counters.DEGRADED.labels("rejected" if report.outcome.rejected else "in_part").inc()
         for stage, seconds in report.seconds.items():

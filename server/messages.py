@@ -1,4 +1,7 @@
-"""Messages between the service and the processes of a scene. They are small: pictures and states go by file."""
+"""Messages between the service and the processes of a scene.
+
+Messages are small: images and states are exchanged as files.
+"""
 
 from __future__ import annotations
 
@@ -16,34 +19,37 @@ from server.storage.layout import SceneFolder
 
 @dataclass(frozen=True, eq=False)
 class SceneSpec:
-    """The scene as its processes are given it when they start; a worker's `folder` has its epoch, if it has one."""
+    """Description of a scene that its processes receive at start.
+
+    A worker's `folder` carries the worker's epoch, if it has one.
+    """
 
     folder: SceneFolder
     rig: Rig
     settings: Settings
     minimum_cameras: int = 1
-    kept: IngestSettings = field(default_factory=IngestSettings)
+    retention: IngestSettings = field(default_factory=IngestSettings)
     frames_per_second: float | None = None
     nodes: Mapping[str, str] = field(default_factory=dict)
-    """Labels that a node must have to run them."""
+    """Labels that a node must have to run the scene's processes."""
 
 
-# To the worker.
+# Messages to the worker.
 
 
 @dataclass(frozen=True)
-class KeepStates:
-    """Other rules for states from now on."""
+class ChangeRetention:
+    """Request to the worker to apply new retention rules for states, effective immediately."""
 
     rules: IngestSettings
 
 
 @dataclass(frozen=True)
 class FrameReady:
-    """The pictures of a frame lie in records of the frame log (`server.storage.frame_store`).
+    """Announcement of a frame whose images are in records of the frame log (`server.storage.frame_store`).
 
-    `identity` is checked where one record holds the whole frame; of several, one a camera, a damaged one is left out.
-    `budget` is the one that holds for this frame, whenever it is reconstructed.
+    `identity` is checked if a single record holds the whole frame. If each camera has its own record, damaged records
+    are left out. `budget` applies to this frame no matter when it is reconstructed.
     """
 
     index: int
@@ -55,9 +61,9 @@ class FrameReady:
 
 @dataclass(frozen=True)
 class RepairFiles:
-    """Asks the worker to check files of the states' folder, found damaged or gone, and to write them again if it can.
+    """Request to the worker to check damaged or missing files of the states folder and to rewrite them if it can.
 
-    `times` and `reports` of frames, as far as the service has them in memory.
+    `times` and `reports` hold the values for those frames that the service still has in memory.
     """
 
     names: tuple[str, ...]
@@ -67,7 +73,7 @@ class RepairFiles:
 
 @dataclass(frozen=True)
 class RecomputeState:
-    """Asks the worker to compute a damaged state again, from its pictures and the committed frame `base`."""
+    """Request to the worker to recompute a damaged state from its images and the committed frame `base`."""
 
     frame: FrameReady
     base: int
@@ -75,17 +81,19 @@ class RecomputeState:
 
 @dataclass(frozen=True)
 class Stop:
-    """Asks a process to finish its work and end."""
+    """Request to a process to finish its work and exit."""
 
 
-# From the worker.
+# Messages from the worker.
 
 
 @dataclass(frozen=True)
 class Ready:
-    """The worker takes frames. It found `indices` committed, could not read `damaged`, and sends the newest report.
+    """Notification that the worker accepts frames.
 
-    `undone`: frames whose commit was taken back, to be given again. `faults`: why, a sentence each.
+    `indices` are the committed frames that it found, `damaged` those that it could not read, and `report` is the newest
+    report. `undone` lists frames whose commit was rolled back and which must be sent again. `faults` gives the reasons,
+    one sentence each.
     """
 
     indices: tuple[int, ...] = ()
@@ -97,21 +105,21 @@ class Ready:
 
 @dataclass(frozen=True)
 class WaitsForNode:
-    """The worker has not started: no machine has room for it. Sent by the placement."""
+    """Notification from the placement that the worker has not started because no machine has room for it."""
 
     reason: str
 
 
 @dataclass(frozen=True)
-class Broken:
-    """The worker cannot resume from the committed states."""
+class ResumeFailed:
+    """Notification that the worker cannot resume from the committed states."""
 
     reason: str
 
 
 @dataclass(frozen=True)
-class Stalled:
-    """The frame cannot be committed for want of room on the disk; it is tried again in `seconds`."""
+class WaitingForDisk:
+    """Notification that a frame cannot be committed because the disk is full; the worker retries after `seconds`."""
 
     index: int
     reason: str
@@ -120,7 +128,7 @@ class Stalled:
 
 @dataclass(frozen=True)
 class Progressed:
-    """Progress of the first frame."""
+    """Progress of the reconstruction of the first frame."""
 
     stage: str
     done: int
@@ -130,14 +138,17 @@ class Progressed:
 
 @dataclass(frozen=True)
 class StatesRetained:
-    """A rule for states holds; it has deleted those of these frames."""
+    """Notification that new retention rules are in effect and have deleted the states of these frames."""
 
     deleted: tuple[int, ...]
 
 
 @dataclass(frozen=True)
 class FrameCommitted:
-    """The frame's state is on disk, with `report` (`History.report`); retention deleted `deleted` after it."""
+    """Notification that the frame's state is on disk with its `report` (`History.report`).
+
+    `deleted` lists the frames whose states retention deleted after the commit.
+    """
 
     index: int
     report: dict[str, Any]
@@ -145,8 +156,11 @@ class FrameCommitted:
 
 
 @dataclass(frozen=True)
-class UpdateFailed:
-    """The frame was not committed; the state is that of the frame before. `fatal`: the scene cannot go on."""
+class FrameFailedInWorker:
+    """Notification that a frame was not committed; the state of the previous frame remains current.
+
+    If `fatal` is true, the scene cannot continue.
+    """
 
     index: int
     reason: str
@@ -155,31 +169,31 @@ class UpdateFailed:
 
 
 class RepairOutcome(StrEnum):
-    """Outcomes for a file that was found damaged."""
+    """Outcome of the repair of a file that was found damaged."""
 
     WHOLE = "whole"
-    """It is not: it was written meanwhile, or the disk could not read it once."""
+    """The file is intact: it was rewritten in the meantime, or the read error was transient."""
     WRITTEN = "written"
-    """It was written again, the same bits."""
+    """The file was rewritten with identical contents."""
     REPORT_LOST = "report_lost"
-    """The state was written again, the same bits; its report was damaged and is not in memory."""
+    """The state was rewritten with identical contents; its report was damaged and is not in memory."""
     DAMAGED = "damaged"
-    """It is, and nothing to write it from is in memory."""
+    """The file is damaged, and memory holds no copy from which to rewrite it."""
     GONE = "gone"
-    """It was deleted by the rules of the scene."""
+    """The file is no longer needed: retention deleted its frame, or the frame was rolled back."""
     RECOMPUTED = "recomputed"
-    """The state was made again from pictures."""
+    """The state was recomputed from images."""
     LOST = "lost"
-    """The state could not be made again."""
+    """The state could not be recomputed."""
     LATER = "later"
-    """The state is to be made again once the one before it is."""
+    """The state is recomputed once the preceding state has been."""
     NO_ROOM = "no_room"
-    """The disk is full; to be tried again."""
+    """The disk is full; the repair is retried."""
 
 
 @dataclass(frozen=True)
 class RepairResult:
-    """The outcome for one file (`RepairFiles`) or for one state (`RecomputeState`, with its new report)."""
+    """Repair outcome of one file (`RepairFiles`) or of one state (`RecomputeState`, with its new report)."""
 
     name: str
     outcome: RepairOutcome
@@ -187,24 +201,24 @@ class RepairResult:
     report: dict[str, Any] = field(default_factory=dict)
 
 
-# Of every process that reads states.
+# Messages from every process that reads states.
 
 
 @dataclass(frozen=True)
-class Damaged:
-    """Files of the states' folder that could not be read, by name with the reason."""
+class DamageFound:
+    """Files of the states folder that could not be read: a mapping from name to reason."""
 
     files: dict[str, str]
 
 
-# Of the replayer, which has a process for each replay.
+# Messages of the replayer, which runs one process per replay.
 
 
 @dataclass(frozen=True)
 class ReplaySpec:
-    """Frames to be updated again in memory, with each of `iterations`; `base` is the commit before them.
+    """Frames to update again in memory, once per entry of `iterations`; `base` is the commit before them.
 
-    `first`: the scene's first frame, which every update needs.
+    `first` is the scene's first frame, which every update needs.
     """
 
     scene: SceneSpec
@@ -216,12 +230,12 @@ class ReplaySpec:
 
 @dataclass(frozen=True)
 class ReplayUpdated:
-    """One update of a replay is over."""
+    """Notification that one update of a replay has finished."""
 
 
 @dataclass(frozen=True)
 class ReplayPoint:
-    """Cost and accuracy of one number of iterations (`scas4d_core.replay.ReplayResult`)."""
+    """Cost and accuracy for one iteration count (`scas4d_core.replay.ReplayResult`)."""
 
     iterations: int
     milliseconds: float
@@ -232,19 +246,20 @@ class ReplayPoint:
 
 @dataclass(frozen=True)
 class ReplayEnded:
-    """The replay has ended; `fault` is None if all numbers of iterations were measured."""
+    """Notification that the replay has ended; `fault` is None if all iteration counts were measured."""
 
     fault: str | None = None
 
 
-# Of the exporter, which has a process for each export.
+# Messages of the exporter, which runs one process per export.
 
 
 @dataclass(frozen=True)
 class ExportSpec:
-    """Committed frames to be written to `file`, alone in its folder, in a format of `scas4d_core.exports`.
+    """Committed frames to write to `file` in a format of `scas4d_core.exports`; `file` has a folder of its own.
 
-    `first`: the scene's first frame, whose report all need. `ids` of `tracks`, None: all that move.
+    `first` is the scene's first frame, whose report every export needs. `ids` selects the Gaussians for the `tracks`
+    format; None selects all moving Gaussians.
     """
 
     scene: SceneSpec
@@ -257,7 +272,7 @@ class ExportSpec:
 
 @dataclass(frozen=True)
 class ExportProgressed:
-    """So many frames of an export are written; its folder has so many bytes."""
+    """Progress of an export: `done` frames are written, and its folder holds `size` bytes."""
 
     done: int
     size: int
@@ -265,6 +280,6 @@ class ExportProgressed:
 
 @dataclass(frozen=True)
 class ExportEnded:
-    """The export has ended; `fault` is None if its file is whole."""
+    """Notification that the export has ended; `fault` is None if its file is complete."""
 
     fault: str | None = None

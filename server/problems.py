@@ -1,4 +1,4 @@
-"""Problem documents (RFC 9457): every error names the field, the value and the remedy."""
+"""Problem documents (RFC 9457) in which every error names the field, the value and the remedy."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from scas4d_core.rig_checks import RigError
 
 MEDIA_TYPE = "application/problem+json"
 VALUE_LENGTH = 200
-"""A value quoted in an answer is cut here: it may be a whole cloud."""
+"""Length in characters at which a value quoted in a response is cut, since it may be a whole point cloud."""
 SERVICE_FAULT = "this is a fault of the service; its log has the traceback"
-"""The remedy where the service failed."""
+"""Remedy given when the service itself failed."""
 
 
 class Problem(HTTPException):
-    """An error answer; `client.wire.ProblemDetails` has the fields of its document.
+    """HTTP error whose response body is a problem document (`client.wire.ProblemDetails`).
 
     Args:
         status: HTTP status, 400…599.
-        detail: the fault, one sentence for a person.
-        remedy: the action that helps, for a person.
+        detail: description of the fault, one sentence for a human reader.
+        remedy: action that fixes the fault, for a human reader.
         field: the parameter or field at fault.
-        value: the value that was given there; it is quoted and shortened.
-        headers: further headers of the answer.
-        more: further members of the document, such as `expected`.
+        value: the value given for the field; it is quoted and shortened.
+        headers: additional headers of the response.
+        more: additional members of the document, such as `expected`.
     """
 
     def __init__(
@@ -53,47 +53,54 @@ class Problem(HTTPException):
             status=status,
             detail=detail,
             field=field,
-            value=None if value is None else quoted(value),
+            value=None if value is None else quote(value),
             remedy=remedy,
             **more,
         )
 
 
-def of_rig(error: RigError) -> Problem:
-    """Makes the problem of a rig, or of settings for it, that cannot work."""
+def rig_problem(error: RigError) -> Problem:
+    """Returns the problem for an invalid rig or for settings that do not fit the rig."""
     return Problem(422, error.fault, field=error.field, value=error.value, remedy=error.remedy)
 
 
-def counted(count: int, noun: str) -> str:
-    """Returns a number and its noun: 1 camera, 2 cameras."""
+def count_noun(count: int, noun: str) -> str:
+    """Returns a count with its noun in singular or plural: 1 camera, 2 cameras."""
     return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
-def quoted(value: object) -> str:
-    """Returns a value as text, short enough to be sent back."""
+def quote(value: object) -> str:
+    """Returns a value as text, shortened to at most `VALUE_LENGTH` characters."""
     text = value if isinstance(value, str) else repr(value)
     return text if len(text) <= VALUE_LENGTH else text[: VALUE_LENGTH - 1] + "…"
 
 
-def answer(document: ProblemDetails, headers: Mapping[str, str] | None = None) -> Response:
-    """Makes a response of the document; it is ASCII, so that lone surrogates can be quoted too."""
-    body = json.dumps(document.model_dump(mode="python", exclude_none=True), ensure_ascii=True).encode()
-    return Response(body, document.status, dict(headers or {}), media_type=MEDIA_TYPE)
+def problem_response(openapi_document: ProblemDetails, headers: Mapping[str, str] | None = None) -> Response:
+    """Returns an HTTP response with the problem document.
+
+    The body is escaped to ASCII so that lone surrogates can be quoted, too.
+    """
+    body = json.dumps(openapi_document.model_dump(mode="python", exclude_none=True), ensure_ascii=True).encode()
+    return Response(body, openapi_document.status, dict(headers or {}), media_type=MEDIA_TYPE)
 
 
 async def refuse(problem: Problem, scope: Scope, receive: Receive, send: Send) -> None:
-    """Answers a request, or a WebSocket's handshake, from outside the routes."""
+    """Responds to a request or a WebSocket handshake with a problem, from code outside the routes."""
     if scope["type"] == "websocket" and "websocket.http.response" not in scope.get("extensions", {}):
-        # The server cannot answer a handshake with a document: 1008 is a violated policy; a reason has 123 bytes.
+        # This server cannot send a document in response to a handshake. Code 1008 means a policy violation, and a close
+        # reason holds at most 123 bytes.
         await send({"type": "websocket.close", "code": 1008, "reason": str(problem.document.detail)[:120]})
         return
-    await answer(problem.document, problem.headers)(scope, receive, send)
+    await problem_response(problem.document, problem.headers)(scope, receive, send)
 
 
-def plain_tuples(schema: Any) -> None:
-    """Writes tuples of one kind as arrays of a fixed length: more tools know `items` than `prefixItems`."""
+def simplify_tuples(schema: Any) -> None:
+    """Rewrites homogeneous tuples in a JSON schema as fixed-length arrays, in place.
+
+    More tools support `items` than `prefixItems`.
+    """
     for part in schema.values() if isinstance(schema, dict) else schema if isinstance(schema, list) else ():
-        plain_tuples(part)
+        simplify_tuples(part)
     if isinstance(schema, dict) and schema.get("prefixItems") and "items" not in schema:
         kinds = schema["prefixItems"]
         if isinstance(kinds, list) and all(kind == kinds[0] for kind in kinds):
@@ -101,7 +108,7 @@ def plain_tuples(schema: Any) -> None:
 
 
 def first_sentence(text: str) -> str:
-    """The first sentence of a text, or what stands before its semicolon, without the stop at its end.
+    """Returns the first sentence of a text, or the part before its semicolon, without the final punctuation mark.
 
     >>> first_sentence("Lists all scenes; wakes none. More.")
     'Lists all scenes'
@@ -109,8 +116,11 @@ def first_sentence(text: str) -> str:
     return re.split(r"[.;](?:\s|$)", " ".join(text.split()), maxsplit=1)[0]
 
 
-def document(app: FastAPI) -> dict[str, Any]:
-    """Returns the OpenAPI document, with summaries, the media type of errors, and the token if there is one."""
+def openapi_document(app: FastAPI) -> dict[str, Any]:
+    """Returns the OpenAPI document of the service.
+
+    Adds to FastAPI's document the summaries, the media type of errors, and bearer authentication if a token is set.
+    """
     token = app.state.settings.token is not None
     if app.openapi_schema is None:
         written = FastAPI.openapi(app)
@@ -123,12 +133,12 @@ def document(app: FastAPI) -> dict[str, Any]:
                 if token and path.startswith("/health/"):
                     operation["security"] = []
         for schema in written.get("components", {}).get("schemas", {}).values():
-            plain_tuples(schema)
+            simplify_tuples(schema)
         if token:
             schemes = written.setdefault("components", {}).setdefault("securitySchemes", {})
             schemes["bearer"] = {"type": "http", "scheme": "bearer", "description": "SCAS4D_TOKEN of the service."}
             written["security"] = [{"bearer": []}]
-    assert app.openapi_schema is not None  # FastAPI.openapi keeps what it returns
+    assert app.openapi_schema is not None  # FastAPI.openapi caches its result
     return app.openapi_schema
 
 
@@ -137,5 +147,5 @@ RESPONSES: dict[int | str, dict[str, Any]] = {
     "5XX": {"description": "The service failed, or cannot answer now.", "model": ProblemDetails},
     422: {"description": "A field has a wrong value.", "model": ProblemDetails},
 }
-"""Answers of every route in the OpenAPI document."""
+"""Responses that the OpenAPI document lists for every route."""
 PROBLEM = {"$ref": "#/components/schemas/ProblemDetails"}

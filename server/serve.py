@@ -1,4 +1,4 @@
-"""Runs the service as a process: logs, signals, uvicorn."""
+"""Process of the service: logging, signals and uvicorn."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from typing import Any
 import uvicorn
 
 from server.app import create_app
-from server.connections.config import guarded
-from server.connections.process import keep_freed_memory, room_for_connections
+from server.connections.config import uvicorn_config
+from server.connections.process_limits import raise_open_file_limit, retain_freed_memory
 from server.health import logs
 from server.processes.placement import STOP_SECONDS, Placement
-from server.settings import ServerSettings, unknown
+from server.settings import ServerSettings, unknown_names
 from server.storage.disk import lock_data
 
 log = logging.getLogger("scas4d.server")
 
 
 class Server(uvicorn.Server):
-    """uvicorn's server, which logs its address in a sentence.
+    """uvicorn server that logs a greeting with its address once it listens.
 
     Args:
-        config: of uvicorn.
-        greeting: the sentence that is logged once requests are answered.
+        config: configuration of uvicorn.
+        greeting: sentence that is logged once the server accepts requests.
     """
 
     def __init__(self, config: uvicorn.Config, greeting: str) -> None:
@@ -39,42 +39,43 @@ class Server(uvicorn.Server):
         self._greeting = greeting
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Starts the application and listens."""
+        """Starts the application, listens on the sockets, and logs the greeting."""
         await super().startup(sockets)
         if self.started:
             log.info(self._greeting)
 
 
 def serve(settings: ServerSettings) -> None:
-    """Runs until SIGTERM or SIGINT.
+    """Runs the service until SIGTERM or SIGINT.
 
-    Then it takes no more connections, closes WebSockets (1012), answers what was asked, and asks the scenes' processes
-    to end: each has `STOP_SECONDS`. What they do not finish is in the frame log, and is taken up at the next start.
+    On a signal it accepts no more connections, closes WebSockets (1012), responds to pending requests, and asks the
+    scenes' processes to exit within `STOP_SECONDS`. Unfinished frames remain in the frame log and are resumed at the
+    next start.
 
     Raises:
-        RuntimeError: the address or the data folder is in use, or cannot be had.
+        RuntimeError: the address or the data folder is in use or not available.
     """
     prepare = partial(logs.configure, settings.log_format, settings.log_level)
     prepare()
-    for name in unknown(os.environ):
-        log.warning("%s is no setting and was ignored; docs/operations.md lists them", name)
+    for name in unknown_names(os.environ):
+        log.warning("%s is not a setting and was ignored; docs/operations.md lists them", name)
     try:
-        lock_data(settings.data).release()  # said here in a sentence; taken for good when the application starts
+        lock_data(settings.data).release()  # early check; the application takes the lock at startup
     except OSError as error:
         raise RuntimeError(f"data folder {settings.data}: {error.strerror}; name another with --data") from None
     placement = _placement(settings, prepare)
     sockets = listen(settings.host, settings.port)
-    asyncio.run(placement.open())  # said here in a sentence, too
+    asyncio.run(placement.open())  # early check, too
     asyncio.run(placement.announce(settings.host, sockets[0].getsockname()[1]))
-    keep_freed_memory()
-    config = guarded(
-        create_app(_with_files(settings), placement),
+    retain_freed_memory()
+    config = uvicorn_config(
+        create_app(_limit_to_open_files(settings), placement),
         log_config=None,
         access_log=False,
         timeout_graceful_shutdown=max(1, round(STOP_SECONDS)),
     )
-    # uvicorn ends gracefully and then raises the signal again, for its caller: here there is none, and the
-    # process ends with status 0.
+    # uvicorn shuts down gracefully and then raises the signal again for its caller. Here there is no caller, so the
+    # signal is ignored and the process exits with status 0.
     for ending in (signal.SIGTERM, signal.SIGINT):
         signal.signal(ending, lambda *_: None)
     greeting = (
@@ -85,10 +86,10 @@ def serve(settings: ServerSettings) -> None:
 
 
 def _placement(settings: ServerSettings, prepare: Callable[[], None]) -> Placement:
-    """Makes the placement of scenes' processes.
+    """Returns the placement of the scenes' processes.
 
     Raises:
-        RuntimeError: on a Ray cluster, and Ray is not installed.
+        RuntimeError: the placement is a Ray cluster, but Ray is not installed.
     """
     if settings.placement == "local":
         return Placement(prepare)
@@ -101,9 +102,9 @@ def _placement(settings: ServerSettings, prepare: Callable[[], None]) -> Placeme
     return RayPlacement(prepare, settings.placement.partition("=")[2] or None, settings)
 
 
-def _with_files(settings: ServerSettings) -> ServerSettings:
-    """Lowers the limit of connections to the number of files that may be open for them."""
-    room = room_for_connections(settings.max_connections)
+def _limit_to_open_files(settings: ServerSettings) -> ServerSettings:
+    """Returns settings whose connection limit fits the system's limit on open files."""
+    room = raise_open_file_limit(settings.max_connections)
     if room < settings.max_connections:
         log.warning(
             "SCAS4D_MAX_CONNECTIONS is %d, but files may be open for %d connections only; raise the limit on open "
@@ -115,18 +116,18 @@ def _with_files(settings: ServerSettings) -> ServerSettings:
 
 
 def listen(host: str, port: int) -> list[socket.socket]:
-    """Binds sockets to every address of the host that this machine has, all at one port; uvicorn listens at them.
+    """Binds one socket per address of the host on this machine, all to the same port, and returns them.
 
     Raises:
-        RuntimeError: there is no such address, or the port cannot be had.
+        RuntimeError: this machine has no such address, or the port is not available.
     """
     sockets: list[socket.socket] = []
     try:
         for family, kind, protocol, _, where in socket.getaddrinfo(host, port, type=socket.SOCK_STREAM):
-            # With port 0 all addresses get the port of the first.
+            # With port 0, all addresses use the port that the first one was assigned.
             free = sockets[0].getsockname()[1] if sockets else port
-            with contextlib.suppress(_NotHere):
-                sockets.append(_bound(family, kind, protocol, (where[0], free, *where[2:])))
+            with contextlib.suppress(_AddressUnavailableError):
+                sockets.append(_bind(family, kind, protocol, (where[0], free, *where[2:])))
         if not sockets:
             raise OSError(errno.EADDRNOTAVAIL, os.strerror(errno.EADDRNOTAVAIL))
     except OSError as error:
@@ -144,29 +145,29 @@ def listen(host: str, port: int) -> list[socket.socket]:
     return sockets
 
 
-class _NotHere(Exception):
-    """An address that this machine does not have, as ::1 where IPv6 is off."""
+class _AddressUnavailableError(Exception):
+    """Address that this machine does not have, such as ::1 if IPv6 is disabled."""
 
 
-def _bound(family: int, kind: int, protocol: int, where: tuple[Any, ...]) -> socket.socket:
+def _bind(family: int, kind: int, protocol: int, where: tuple[Any, ...]) -> socket.socket:
     try:
         opened = socket.socket(family, kind, protocol)
     except OSError:
-        raise _NotHere from None
+        raise _AddressUnavailableError from None
     try:
         opened.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         if family == socket.AF_INET6:
-            opened.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)  # IPv4 has a socket of its own
+            opened.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)  # IPv4 has its own socket
         opened.bind(where)
     except OSError as error:
         opened.close()
         if error.errno == errno.EADDRNOTAVAIL:
-            raise _NotHere from None
+            raise _AddressUnavailableError from None
         raise
     return opened
 
 
 def address(host: str, sockets: list[socket.socket]) -> str:
-    """Returns the address of the service for a browser on this machine."""
+    """Returns the URL of the service for a browser on this machine."""
     name = "127.0.0.1" if host in ("0.0.0.0", "::", "") else host
     return f"http://{f'[{name}]' if ':' in name else name}:{sockets[0].getsockname()[1]}"

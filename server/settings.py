@@ -269,7 +269,7 @@ class ServerSettings(BaseSettings):
         try:
             written = {} if file is None else TomlConfigSettingsSource(cls, toml_file=Path(file))()
         except ValueError as error:  # tomllib's says line and column
-            raise SettingsError(f"{CONFIG}: {file} is no TOML ({error})") from None
+            raise SettingsError(f"{CONFIG}: {file} is not valid TOML ({error})") from None
         merged = {**written, **read, **{n: v for n, v in given.items() if v is not None}}
         try:
             return cls.model_validate(merged)
@@ -284,7 +284,7 @@ class ServerSettings(BaseSettings):
             raise SettingsError((f"setting {name}{value}: " if name else "") + fault + known) from None
 
 
-def unknown(environment: Mapping[str, str]) -> list[str]:
+def unknown_names(environment: Mapping[str, str]) -> list[str]:
     """Returns names that look like settings and are none: misspelt, most likely."""
     known = {f"{PREFIX}{name.upper()}" for name in ServerSettings.model_fields} | {CONFIG, URL}
     return sorted(name for name in environment if name.upper().startswith(PREFIX) and name.upper() not in known)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Unpack
 
-from client.calls.call import Call, body, path, reads
+from client.calls.call import Call, body, json_reader, path
 from client.wire import Budget, ReplayRequest, SceneBudget, TradeoffModel
 from client.wire.budgets import BudgetFields
 
@@ -16,7 +16,7 @@ def budget(id: str) -> Call[SceneBudget]:
     >>> client.budget(scene).effective.iterations
     100
     """
-    return Call("GET", path(id, "budget"), reads(SceneBudget))
+    return Call("GET", path(id, "budget"), json_reader(SceneBudget))
 
 
 def set_budget(id: str, **budget: Unpack[BudgetFields]) -> Call[SceneBudget]:
@@ -33,7 +33,7 @@ def set_budget(id: str, **budget: Unpack[BudgetFields]) -> Call[SceneBudget]:
     >>> client.set_budget(scene).effective.iterations  # as the scene was made
     100
     """
-    return Call("PUT", path(id, "budget"), reads(SceneBudget), arguments=body(Budget(**budget)))
+    return Call("PUT", path(id, "budget"), json_reader(SceneBudget), arguments=body(Budget(**budget)))
 
 
 def tradeoff(id: str) -> Call[TradeoffModel]:
@@ -42,7 +42,7 @@ def tradeoff(id: str) -> Call[TradeoffModel]:
     >>> "measured" in [point.kind for point in client.tradeoff(scene).points]
     True
     """
-    return Call("GET", path(id, "tradeoff"), reads(TradeoffModel))
+    return Call("GET", path(id, "tradeoff"), json_reader(TradeoffModel))
 
 
 def replay(id: str, iterations: Sequence[int] = (25, 50, 200), frames: int = 4) -> Call[TradeoffModel]:
@@ -61,7 +61,7 @@ def replay(id: str, iterations: Sequence[int] = (25, 50, 200), frames: int = 4) 
     True
     """
     request = ReplayRequest(iterations=list(iterations), frames=frames)
-    return Call("POST", path(id, "tradeoff"), reads(TradeoffModel), repeatable=False, arguments=body(request))
+    return Call("POST", path(id, "tradeoff"), json_reader(TradeoffModel), repeatable=False, arguments=body(request))
 
 
 def end_replay(id: str) -> Call[TradeoffModel]:
@@ -70,4 +70,4 @@ def end_replay(id: str) -> Call[TradeoffModel]:
     >>> client.end_replay(scene).scene == scene
     True
     """
-    return Call("DELETE", path(id, "tradeoff"), reads(TradeoffModel))
+    return Call("DELETE", path(id, "tradeoff"), json_reader(TradeoffModel))

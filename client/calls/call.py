@@ -47,7 +47,7 @@ def path(*parts: str | int) -> str:
     return "/".join(["/v1/scenes", *(quote(str(part), safe="") for part in parts)])
 
 
-def reads(model: type[M]) -> Callable[[httpx.Response], M]:
+def json_reader(model: type[M]) -> Callable[[httpx.Response], M]:
     """A reader of the answer's JSON as a model of the wire."""
     return lambda response: model.model_validate_json(response.content)
 

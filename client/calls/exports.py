@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from client.calls.call import Call, body, nothing, path, reads
+from client.calls.call import Call, body, json_reader, nothing, path
 from client.wire.exports import ExportFormat, ExportList, ExportModel, ExportRequest
 
 
@@ -34,7 +34,7 @@ def begin_export(
     """
     given = {"format": format, "first": first, "last": last, "ids": None if ids is None else list(ids)}
     request = ExportRequest.model_validate({name: value for name, value in given.items() if value is not None})
-    return Call("POST", path(id, "exports"), reads(ExportModel), repeatable=False, arguments=body(request))
+    return Call("POST", path(id, "exports"), json_reader(ExportModel), repeatable=False, arguments=body(request))
 
 
 def exports(id: str) -> Call[ExportList]:
@@ -45,7 +45,7 @@ def exports(id: str) -> Call[ExportList]:
     True
     >>> client.delete_export(scene, begun.id)
     """
-    return Call("GET", path(id, "exports"), reads(ExportList))
+    return Call("GET", path(id, "exports"), json_reader(ExportList))
 
 
 def export(id: str, export_id: str) -> Call[ExportModel]:
@@ -58,7 +58,7 @@ def export(id: str, export_id: str) -> Call[ExportModel]:
     (<ExportState.DONE: 'done'>, 2, None)
     >>> client.delete_export(scene, begun.id)
     """
-    return Call("GET", path(id, "exports", export_id), reads(ExportModel))
+    return Call("GET", path(id, "exports", export_id), json_reader(ExportModel))
 
 
 def export_file(id: str, export_id: str, begin: int = 0, count: int | None = None) -> Call[bytes]:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from client.calls.call import Call, body, path, reads
+from client.calls.call import Call, body, json_reader, path
 from client.wire import (
     FRAME_MEDIA_TYPE,
+    CameraReceipt,
     FileKind,
     FrameReceipt,
     FrameReportModel,
     MissingRequest,
-    PartReceipt,
     frame_chunks,
 )
 from client.wire.frames import FrameList
@@ -45,16 +45,16 @@ def put_frame(
     <FrameState.COMMITTED: 'committed'>
     """
     arguments = _framed(index, images, masks or {}, time)
-    return Call("PUT", path(id, "frames", index), reads(FrameReceipt), arguments=arguments)
+    return Call("PUT", path(id, "frames", index), json_reader(FrameReceipt), arguments=arguments)
 
 
 def put_camera(
     id: str, index: int, camera: str, image: bytes, mask: bytes | None = None, time: float | None = None
-) -> Call[PartReceipt]:
+) -> Call[CameraReceipt]:
     """Sends one camera's picture of frame `index`, where each camera has its own sender.
 
-    The frame is closed when all are in, by `close_frame`, or when the scene's `ingest.part_seconds` are over. A camera
-    may be some frames ahead of the others.
+    The frame closes when all cameras are in, on `close_frame`, or after the scene's `ingest.open_frame_seconds`. A
+    camera may be some frames ahead of the others.
 
     Args:
         id: of the scene.
@@ -71,7 +71,7 @@ def put_camera(
     []
     """
     arguments = _framed(index, {camera: image}, {} if mask is None else {camera: mask}, time, part=True)
-    return Call("PUT", path(id, "frames", index, "cameras", camera), reads(PartReceipt), arguments=arguments)
+    return Call("PUT", path(id, "frames", index, "cameras", camera), json_reader(CameraReceipt), arguments=arguments)
 
 
 def close_frame(id: str, index: int) -> Call[FrameReceipt]:
@@ -83,7 +83,7 @@ def close_frame(id: str, index: int) -> Call[FrameReceipt]:
     >>> client.close_frame(open_scene, n).index == n
     True
     """
-    return Call("POST", path(id, "frames", index, "close"), reads(FrameReceipt))
+    return Call("POST", path(id, "frames", index, "close"), json_reader(FrameReceipt))
 
 
 def declare_missing(id: str, index: int, reason: str = "") -> Call[FrameReportModel]:
@@ -96,7 +96,7 @@ def declare_missing(id: str, index: int, reason: str = "") -> Call[FrameReportMo
     True
     """
     arguments = body(MissingRequest(reason=reason))
-    return Call("POST", path(id, "frames", index, "missing"), reads(FrameReportModel), arguments=arguments)
+    return Call("POST", path(id, "frames", index, "missing"), json_reader(FrameReportModel), arguments=arguments)
 
 
 def _framed(
@@ -113,7 +113,7 @@ def frame(id: str, index: int) -> Call[FrameReportModel]:
     >>> report.state, report.used_cameras
     (<FrameState.COMMITTED: 'committed'>, ['c0', 'c1'])
     """
-    return Call("GET", path(id, "frames", index), reads(FrameReportModel))
+    return Call("GET", path(id, "frames", index), json_reader(FrameReportModel))
 
 
 def frames(id: str, first: int = 0, limit: int = 500) -> Call[FrameList]:
@@ -124,7 +124,7 @@ def frames(id: str, first: int = 0, limit: int = 500) -> Call[FrameList]:
     ([0], 1)
     """
     arguments = {"params": {"first": first, "limit": limit}}
-    return Call("GET", path(id, "frames"), reads(FrameList), arguments=arguments)
+    return Call("GET", path(id, "frames"), json_reader(FrameList), arguments=arguments)
 
 
 def ply(id: str, index: int) -> Call[bytes]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from client.calls.call import Call, path, reads
+from client.calls.call import Call, json_reader, path
 from client.wire import GaussiansModel
 
 
@@ -16,4 +16,4 @@ def gaussians(id: str, ids: Sequence[int]) -> Call[GaussiansModel]:
     [(1, 0, []), (0, 0, [])]
     """
     arguments = {"params": {"ids": ",".join(str(int(value)) for value in ids)}}
-    return Call("GET", path(id, "gaussians"), reads(GaussiansModel), arguments=arguments)
+    return Call("GET", path(id, "gaussians"), json_reader(GaussiansModel), arguments=arguments)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from client.calls.call import Call, path, reads
+from client.calls.call import Call, json_reader, path
 from client.wire import PartsModel
 
 
@@ -14,4 +14,4 @@ def parts(id: str, count: int | None = None) -> Call[PartsModel]:
     (2, True)
     """
     arguments = {"params": {} if count is None else {"count": count}}
-    return Call("GET", path(id, "parts"), reads(PartsModel), arguments=arguments)
+    return Call("GET", path(id, "parts"), json_reader(PartsModel), arguments=arguments)

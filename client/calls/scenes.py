@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from client.calls.call import NPZ, Call, body, nothing, path, reads
+from client.calls.call import NPZ, Call, body, json_reader, nothing, path
 from client.wire import (
     IngestSettings,
     PointsReceipt,
@@ -61,7 +61,7 @@ def create_scene(
         ingest=ingest or IngestSettings(),
         nodes=dict(nodes or {}),
     )
-    return Call("POST", path(), reads(SceneStatus), repeatable=False, arguments=body(request))
+    return Call("POST", path(), json_reader(SceneStatus), repeatable=False, arguments=body(request))
 
 
 def estimate(rig: Rig, *, preset: str = "scas4d", settings: Mapping[str, Any] | None = None) -> Call[SceneEstimate]:
@@ -72,7 +72,7 @@ def estimate(rig: Rig, *, preset: str = "scas4d", settings: Mapping[str, Any] | 
     True
     """
     request = SceneCreate(rig=RigModel.of(rig), preset=preset, settings=dict(settings or {}))
-    return Call("POST", "/v1/estimate", reads(SceneEstimate), arguments=body(request))
+    return Call("POST", "/v1/estimate", json_reader(SceneEstimate), arguments=body(request))
 
 
 def scenes() -> Call[list[SceneStatus]]:
@@ -90,7 +90,7 @@ def scene(id: str) -> Call[SceneStatus]:
     >>> client.scene(scene).committed
     3
     """
-    return Call("GET", path(id), reads(SceneStatus))
+    return Call("GET", path(id), json_reader(SceneStatus))
 
 
 def rig(id: str) -> Call[Rig]:
@@ -110,7 +110,7 @@ def pause(id: str) -> Call[SceneStatus]:
     >>> client.resume(scene).paused
     False
     """
-    return Call("POST", path(id, "pause"), reads(SceneStatus))
+    return Call("POST", path(id, "pause"), json_reader(SceneStatus))
 
 
 def resume(id: str) -> Call[SceneStatus]:
@@ -119,7 +119,7 @@ def resume(id: str) -> Call[SceneStatus]:
     >>> client.resume(scene).paused
     False
     """
-    return Call("POST", path(id, "resume"), reads(SceneStatus))
+    return Call("POST", path(id, "resume"), json_reader(SceneStatus))
 
 
 def edit_scene(
@@ -148,7 +148,7 @@ def edit_scene(
     edit = SceneEdit(
         name=name, archived=archived, keep_frames=keep_frames, keep_states=keep_states, exact_states=exact_states
     )
-    return Call("PATCH", path(id), reads(SceneStatus), arguments=body(edit))
+    return Call("PATCH", path(id), json_reader(SceneStatus), arguments=body(edit))
 
 
 def put_to_sleep(id: str) -> Call[SceneStatus]:
@@ -159,7 +159,7 @@ def put_to_sleep(id: str) -> Call[SceneStatus]:
     True
     >>> client.delete_scene(new.id)
     """
-    return Call("POST", path(id, "sleep"), reads(SceneStatus))
+    return Call("POST", path(id, "sleep"), json_reader(SceneStatus))
 
 
 def delete_scene(id: str) -> Call[None]:
@@ -206,7 +206,7 @@ def begin_again(
     >>> client.delete_scene(new.id)
     """
     request = ReconstructionRequest(settings=dict(settings or {}), frame=frame, points=points, discard=discard)
-    return Call("PUT", path(id, "reconstructions", n), reads(SceneStatus), arguments=body(request))
+    return Call("PUT", path(id, "reconstructions", n), json_reader(SceneStatus), arguments=body(request))
 
 
 def put_points(id: str, points: InitialPoints, *, reconstruction: int | None = None) -> Call[PointsReceipt]:
@@ -231,4 +231,4 @@ def put_points(id: str, points: InitialPoints, *, reconstruction: int | None = N
     arguments: dict[str, Any] = {"content": file.getvalue(), "headers": {"Content-Type": NPZ}}
     if reconstruction is not None:
         arguments["params"] = {"reconstruction": reconstruction}
-    return Call("PUT", path(id, "points"), reads(PointsReceipt), arguments=arguments)
+    return Call("PUT", path(id, "points"), json_reader(PointsReceipt), arguments=arguments)

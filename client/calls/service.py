@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from client.calls.call import Call, body, reads
+from client.calls.call import Call, body, json_reader
 from client.wire import Cluster, Health, Share, ShareRequest, Ticket
 
 
@@ -12,7 +12,7 @@ def live() -> Call[Health]:
     >>> client.live().status
     'live'
     """
-    return Call("GET", "/health/live", reads(Health))
+    return Call("GET", "/health/live", json_reader(Health))
 
 
 def ready() -> Call[Health]:
@@ -21,7 +21,7 @@ def ready() -> Call[Health]:
     >>> client.ready().status
     'ready'
     """
-    return Call("GET", "/health/ready", reads(Health))
+    return Call("GET", "/health/ready", json_reader(Health))
 
 
 def ingest_ready() -> Call[Health]:
@@ -30,7 +30,7 @@ def ingest_ready() -> Call[Health]:
     >>> client.ingest_ready().ingest_ready
     True
     """
-    return Call("GET", "/health/ingest", reads(Health))
+    return Call("GET", "/health/ingest", json_reader(Health))
 
 
 def cluster() -> Call[Cluster]:
@@ -39,7 +39,7 @@ def cluster() -> Call[Cluster]:
     >>> [node.alive for node in client.cluster().nodes]
     [True]
     """
-    return Call("GET", "/v1/cluster", reads(Cluster))
+    return Call("GET", "/v1/cluster", json_reader(Cluster))
 
 
 def metrics() -> Call[str]:
@@ -57,7 +57,7 @@ def ticket() -> Call[Ticket]:
     >>> client.ticket().ticket != client.ticket().ticket
     True
     """
-    return Call("POST", "/v1/tickets", reads(Ticket))
+    return Call("POST", "/v1/tickets", json_reader(Ticket))
 
 
 def share(scene: str | None = None, seconds: int = 7 * 86_400) -> Call[Share]:
@@ -70,4 +70,4 @@ def share(scene: str | None = None, seconds: int = 7 * 86_400) -> Call[Share]:
     client.errors.Conflict: 409: the service has no token
     """
     request = ShareRequest(scene=scene, seconds=seconds)
-    return Call("POST", "/v1/shares", reads(Share), repeatable=False, arguments=body(request))
+    return Call("POST", "/v1/shares", json_reader(Share), repeatable=False, arguments=body(request))

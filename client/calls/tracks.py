@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from client.calls.call import Call, body, path, read_npz, reads, wire_camera
+from client.calls.call import Call, body, json_reader, path, read_npz, wire_camera
 from client.wire import TracksModel, TracksRequest
 from scas4d_core.cameras import Camera
 
@@ -43,7 +43,7 @@ def tracks(
     [0]
     """
     request = _request(ids, pixels, camera, points, at, frames, project, "json")
-    return Call("POST", path(id, "tracks", "query"), reads(TracksModel), arguments=body(request))
+    return Call("POST", path(id, "tracks", "query"), json_reader(TracksModel), arguments=body(request))
 
 
 def tracks_arrays(

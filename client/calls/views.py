@@ -42,7 +42,7 @@ def render(
     >>> client.render(scene, rig.cameras[1], 0, kind="depth").shape
     (16, 24)
     """
-    arguments = _asks(camera, frame, [kind], format, background, width, parts)
+    arguments = _request(camera, frame, [kind], format, background, width, parts)
     return Call("POST", path(id, "render"), read_picture, arguments=arguments)
 
 
@@ -62,7 +62,7 @@ def render_file(
     >>> client.render_file(scene, "c0", format="jpeg")[:2].hex()
     'ffd8'
     """
-    arguments = _asks(camera, frame, [kind], format, background, width, parts)
+    arguments = _request(camera, frame, [kind], format, background, width, parts)
     return Call("POST", path(id, "render"), lambda response: response.content, arguments=arguments)
 
 
@@ -82,11 +82,11 @@ def render_arrays(
     >>> views["colour"].shape, views["depth"].shape
     ((16, 24, 3), (16, 24))
     """
-    arguments = _asks(camera, frame, kinds, "npz", background, width, parts)
+    arguments = _request(camera, frame, kinds, "npz", background, width, parts)
     return Call("POST", path(id, "render"), read_npz, arguments=arguments)
 
 
-def _asks(
+def _request(
     camera: Camera | str,
     frame: int | None,
     kinds: Sequence[str],

@@ -1,4 +1,4 @@
-"""Options on how a capture is read, the same for every command and study that takes one: `takes_capture` adds them."""
+"""Options of every command and study that reads a capture; `with_capture_options` adds them."""
 
 from __future__ import annotations
 
@@ -34,23 +34,25 @@ class SizeMismatch(StrEnum):
 
 def _options(
     calibration: Annotated[
-        Path | None, typer.Option(help="Calibration, a file or a folder, if it is not in CAPTURE; docs/captures.md.")
+        Path | None, typer.Option(help="Calibration file or folder, if it is not in CAPTURE; see docs/captures.md.")
     ] = None,
     pictures: Annotated[
-        PicturesFrom | None, typer.Option(help="Kind of pictures to take, where a capture has several.")
+        PicturesFrom | None, typer.Option(help="Kind of pictures to use, if the capture has several.")
     ] = None,
     capture_fps: Annotated[
-        float | None, typer.Option(min=0.001, help="Frames a second of the capture, where its files do not say.")
+        float | None, typer.Option(min=0.001, help="Frames per second, if the files do not say.")
     ] = None,
     masks: Annotated[bool, typer.Option(help="Use the capture's masks.")] = True,
     test: Annotated[
-        list[str] | None, typer.Option(help="Hold out a camera, for measuring. May be repeated.", metavar="CAMERA")
+        list[str] | None, typer.Option(help="Hold out a camera for evaluation. May be repeated.", metavar="CAMERA")
     ] = None,
     size_mismatch: Annotated[
         SizeMismatch | None,
         typer.Option(
-            help="Pictures of another shape than calibrated were cut at the right and the bottom (corner), were cut "
-            "evenly (centre), or were resized (stretch)."
+            help=(
+                "How pictures with another aspect ratio than the calibration were made: cropped at the "
+                "right and bottom (corner), cropped evenly (centre), or resized (stretch)."
+            )
         ),
     ] = None,
 ) -> CaptureOptions:
@@ -64,12 +66,12 @@ def _options(
     )
 
 
-def takes_capture(command: Callable[..., None]) -> Callable[..., None]:
+def with_capture_options(command: Callable[..., None]) -> Callable[..., None]:
     """Gives a command the options of a capture; they reach it as one `CaptureOptions`, its argument `options`.
 
     An option that the command declares itself, as `masks`, stays its own.
 
-    >>> @takes_capture
+    >>> @with_capture_options
     ... def count(folder: Path, options: CaptureOptions) -> None:
     ...     print(options.open(folder).frame_count, options.test)
     >>> count(folder, test=["1"])
@@ -102,7 +104,7 @@ def _parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
     return {name: parameter.replace(annotation=hints[name]) for name, parameter in parameters.items()}
 
 
-def opened(folder: Path, options: CaptureOptions, **more: Any) -> Capture:
+def open_capture(folder: Path, options: CaptureOptions, **more: Any) -> Capture:
     """Opens a capture for a command, and prints the remarks on its reading; `more` as in `open_source`."""
     capture = options.open(folder, **more)
     print_remarks(capture)

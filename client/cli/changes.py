@@ -15,7 +15,9 @@ PRESETS = "scas4d, adaptive, fast, paper, dynamic3dgs, rigid, articulated, cloth
 Preset = Annotated[str, typer.Option(help=PRESETS)]
 Changes = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="NAME=VALUE", help="Change a setting, as update.iterations=200. May be repeated."),
+    typer.Option(
+        "--set", metavar="NAME=VALUE", help="Change a setting, such as update.iterations=200. May be repeated."
+    ),
 ]
 
 Labels = Annotated[
@@ -74,20 +76,20 @@ def parse_changes(changes: Sequence[str] | None) -> dict[str, Any]:
     return result
 
 
-def changes_of(values: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, Any]:
+def format_changes(values: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, Any]:
     """The nested settings that are not as usual, by dotted name; the inverse of ``parse_changes``.
 
-    >>> changes_of({"update": {"iterations": 200, "seed": 0}}, {"update": {"iterations": 100, "seed": 0}})
+    >>> format_changes({"update": {"iterations": 200, "seed": 0}}, {"update": {"iterations": 100, "seed": 0}})
     {'update.iterations': 200}
     """
-    before = dict(_flat(usual))
-    return {name: value for name, value in _flat(values) if before.get(name) != value}
+    before = dict(_flatten(usual))
+    return {name: value for name, value in _flatten(values) if before.get(name) != value}
 
 
-def _flat(values: Mapping[str, Any], under: str = "") -> Iterator[tuple[str, Any]]:
+def _flatten(values: Mapping[str, Any], under: str = "") -> Iterator[tuple[str, Any]]:
     """``{"update": {"iterations": 100}}`` as ``("update.iterations", 100)``."""
     for name, value in values.items():
         if isinstance(value, dict):
-            yield from _flat(value, f"{under}{name}.")
+            yield from _flatten(value, f"{under}{name}.")
         else:
             yield f"{under}{name}", value

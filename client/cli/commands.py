@@ -12,7 +12,7 @@ import typer
 
 from client import rig
 from client.cli import scenes
-from client.cli.capture_options import opened, takes_capture
+from client.cli.capture_options import open_capture, with_capture_options
 from client.cli.changes import Changes, Labels, Preset, parse_changes, parse_labels
 from client.importers.open_source import CaptureOptions
 from client.progress import Bars, console
@@ -39,47 +39,51 @@ class WhenFull(StrEnum):
     SKIP = "skip"
 
 
-CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture; docs/captures.md.")]
+CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture; see docs/captures.md.")]
 Url = Annotated[str, typer.Option(envvar="SCAS4D_URL", help="Address of the service.")]
 Token = Annotated[
-    str | None, typer.Option(envvar="SCAS4D_TOKEN", help="Token of the service; better given in SCAS4D_TOKEN.")
+    str | None, typer.Option(envvar="SCAS4D_TOKEN", help="Token of the service; prefer the variable SCAS4D_TOKEN.")
 ]
 Scene = Annotated[str, typer.Argument(metavar="SCENE", help="Id of a scene.")]
 Encode = Annotated[
-    Encoding, typer.Option(help="Encoding of undistorted pictures and frames of video; jpeg has quality 95.")
+    Encoding, typer.Option(help="Encoding of undistorted pictures and video frames; jpeg uses quality 95.")
 ]
 
 
-@takes_capture
+@with_capture_options
 def push(
     capture: CaptureFolder,
     options: CaptureOptions,
     url: Url = DEFAULT_URL,
     token: Token = None,
     scene: Annotated[
-        str | None, typer.Option(help="Continue this scene from its next frame; a new scene without it.")
+        str | None, typer.Option(help="Continue this scene from its next frame; default: create a new scene.")
     ] = None,
     fps: Annotated[
         float | None,
         typer.Option(
             min=0.001,
-            help="Send so many frames a second, as a rig would; without it as fast as the service takes them.",
+            help="Frames per second to send, as a rig would; default: as fast as the service accepts them.",
         ),
     ] = None,
-    frames: Annotated[int | None, typer.Option(min=1, help="Send until the scene has so many frames.")] = None,
-    start: Annotated[int, typer.Option(min=0, help="The frame of the capture to begin with.")] = 0,
-    loop: Annotated[bool, typer.Option("--loop", help="Back and forth, until --frames or Ctrl-C.")] = False,
-    jitter: Annotated[float, typer.Option(min=0, help="Each frame leaves up to so many seconds late.")] = 0.0,
-    drop: Annotated[float, typer.Option(min=0, max=0.99, help="Share of frames that the rig loses.")] = 0.0,
-    seed: Annotated[int, typer.Option(help="Seed of jitter and drop.")] = 0,
+    frames: Annotated[int | None, typer.Option(min=1, help="Send frames until the scene has this many.")] = None,
+    start: Annotated[int, typer.Option(min=0, help="First frame of the capture to send.")] = 0,
+    loop: Annotated[
+        bool, typer.Option("--loop", help="Play the capture back and forth until --frames or Ctrl-C.")
+    ] = False,
+    jitter: Annotated[float, typer.Option(min=0, help="Delay each frame by up to this many seconds.")] = 0.0,
+    drop: Annotated[float, typer.Option(min=0, max=0.99, help="Share of frames to drop.")] = 0.0,
+    seed: Annotated[int, typer.Option(help="Seed of jitter and dropped frames.")] = 0,
     per_camera: Annotated[
-        bool, typer.Option("--per-camera", help="Each camera sends its own pictures; --drop loses single ones.")
+        bool,
+        typer.Option("--per-camera", help="Send each camera's pictures separately; --drop then drops single pictures."),
     ] = False,
     websocket: Annotated[bool, typer.Option("--websocket", help="Send over one WebSocket.")] = False,
     when_full: Annotated[
-        WhenFull, typer.Option(help="refuse: wait for a full queue; skip: the newest frame takes its place.")
+        WhenFull,
+        typer.Option(help="refuse: wait while the queue is full; skip: the newest frame replaces the waiting ones."),
     ] = WhenFull.REFUSE,
-    outage: Annotated[float, typer.Option(min=0, help="Seconds to wait for a service that is away.")] = PUSH_OUTAGE_S,
+    outage: Annotated[float, typer.Option(min=0, help="Seconds to wait for an unreachable service.")] = PUSH_OUTAGE_S,
     encoding: Encode = Encoding.JPEG,
     preset: Preset = "scas4d",
     changes: Changes = None,
@@ -88,8 +92,8 @@ def push(
     """Sends a capture to a running service as its rig would, and waits for the last frame."""
     settings, labels = parse_changes(changes), parse_labels(nodes)
     if labels and scene is not None:
-        raise ValueError("--node is for a new scene, and --scene goes on with one that has its nodes; leave one out")
-    source = opened(capture, options, encoding=encoding.value)
+        raise ValueError("--node is for a new scene, and --scene continues one that has its nodes; leave one out")
+    source = open_capture(capture, options, encoding=encoding.value)
     with Client(url, token=token, outage=0) as client:
         client.live()  # a wrong address is said at once, an outage later is waited for
     with Client(url, token=token, outage=outage) as client, Bars() as bars:
@@ -147,10 +151,12 @@ def watch(scene: Scene, url: Url = DEFAULT_URL, token: Token = None) -> None:
 
 def budget(
     scene: Scene,
-    iterations: Annotated[int | None, typer.Option(min=1, help="Iterations a frame.")] = None,
+    iterations: Annotated[int | None, typer.Option(min=1, help="Iterations per frame.")] = None,
     milliseconds: Annotated[
         float | None,
-        typer.Option(min=0.001, help="Milliseconds a frame, decoding and commit included: as many iterations as fit."),
+        typer.Option(
+            min=0.001, help="Milliseconds per frame, including decoding and commit; as many iterations run as fit."
+        ),
     ] = None,
     stop_gain: Annotated[
         float | None,
@@ -162,19 +168,19 @@ def budget(
         float | None,
         typer.Option(
             min=-1,
-            help="Skip the iterations where the state before shows a frame within 1 + this times the usual error.",
+            help="Skip the update if the previous state's error is at most (1 + this) × the usual error.",
         ),
     ] = None,
-    as_made: Annotated[bool, typer.Option("--as-made", help="Take every budget back: as the scene was made.")] = False,
+    reset: Annotated[bool, typer.Option("--reset", help="Reset the budget to the scene's settings.")] = False,
     url: Url = DEFAULT_URL,
     token: Token = None,
 ) -> None:
     """Prints the budget of a scene's updates; with options, sets it from the next frame on."""
     given = (iterations, milliseconds, stop_gain, skip_tolerance)
-    if as_made and any(value is not None for value in given):
-        raise ValueError("--as-made stands for no other budget; leave it out, or the others")
+    if reset and any(value is not None for value in given):
+        raise ValueError("--reset cannot be combined with a budget; leave one out")
     with Client(url, token=token, outage=0) as client:
-        if as_made or any(value is not None for value in given):
+        if reset or any(value is not None for value in given):
             budget_now = client.set_budget(
                 scene, iterations=iterations, budget_ms=milliseconds, stop_gain=stop_gain, skip_tolerance=skip_tolerance
             )
@@ -196,22 +202,25 @@ def budget(
 def begin_again(
     scene: Scene,
     frame: Annotated[
-        int | None, typer.Option(min=0, help="The frame to begin with, here or still to come; as before without it.")
+        int | None,
+        typer.Option(
+            min=0, help="First frame of the new reconstruction, received or still to come; default: as before."
+        ),
     ] = None,
     changes: Annotated[
         list[str] | None,
         typer.Option(
-            "--set", metavar="NAME=VALUE", help="Change a setting, as static.iterations=3000. May be repeated."
+            "--set", metavar="NAME=VALUE", help="Change a setting, such as static.iterations=3000. May be repeated."
         ),
     ] = None,
     points: Annotated[
         Path | None,
         typer.Option(
-            help="npz with positions and colours (and foreground), or init_pt_cld.npz; without it the scene's own."
+            help=("npz with positions and colours (and foreground), or init_pt_cld.npz; default: the scene's points.")
         ),
     ] = None,
-    no_points: Annotated[bool, typer.Option("--no-points", help="Begin from the pictures alone.")] = False,
-    discard: Annotated[bool, typer.Option("--discard", help="Drop the frames that are committed.")] = False,
+    no_points: Annotated[bool, typer.Option("--no-points", help="Start from the pictures alone.")] = False,
+    discard: Annotated[bool, typer.Option("--discard", help="Discard the committed frames.")] = False,
     url: Url = DEFAULT_URL,
     token: Token = None,
 ) -> None:
@@ -242,31 +251,31 @@ def begin_again(
     )
 
 
-@takes_capture
+@with_capture_options
 def import_(
     capture: CaptureFolder,
     options: CaptureOptions,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="New folder for the undistorted capture.")],
-    frames: Annotated[int | None, typer.Option(min=1, help="Import only so many frames.")] = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Maximum number of frames to import.")] = None,
     encoding: Encode = Encoding.JPEG,
 ) -> None:
     """Undistorts a capture once and for all: read without OpenCV or PyAV, and fast enough for a rig's full rate."""
     from client.importers.write import write_dynamic3dgs
 
-    source = opened(capture, options, encoding=encoding.value)
+    source = open_capture(capture, options, encoding=encoding.value)
     with Bars() as bars:
         write_dynamic3dgs(source, out, frames=frames, on_progress=bars)
     count = len(source.rig) + (0 if source.test_rig is None else len(source.test_rig))
     console.print(f"{out}: {count} cameras; try: scas4d push {out}", highlight=False, soft_wrap=True)
 
 
-IN_THE_LINE = frozenset({AlarmKind.CAMERA_LEFT_OUT, AlarmKind.FRAME_REJECTED, AlarmKind.FRAME_IN_PART})
+REPORT_LINE_PARTS = frozenset({AlarmKind.CAMERA_LEFT_OUT, AlarmKind.FRAME_REJECTED, AlarmKind.FRAME_IN_PART})
 """Alarms that the line of a frame states already."""
 
 
 def out_of_step(report: FrameReportModel) -> set[str]:
     """The cameras that are clearly out of step, as a frame's report has them."""
-    return {name for name, one in report.timing.items() if one.off}
+    return {name for name, one in report.timing.items() if one.out_of_step}
 
 
 def frame_line(report: FrameReportModel, missed: int = 0, off: Collection[str] = ()) -> str:
@@ -285,7 +294,7 @@ def frame_line(report: FrameReportModel, missed: int = 0, off: Collection[str] =
     if report.dropped_cameras:
         parts.append(f"without {', '.join(report.dropped_cameras)}")
     for alarm in report.alarms:
-        if alarm.what not in IN_THE_LINE:
+        if alarm.kind not in REPORT_LINE_PARTS:
             parts.append(alarm.evidence if alarm.camera is None else f"camera {alarm.camera}: {alarm.evidence}")
     for name in sorted(out_of_step(report).difference(off)):
         parts.append(f"camera {name}: out of step by {report.timing[name].frames:+.2f} frames")

@@ -23,7 +23,7 @@ from scas4d_core.captures import Capture
 
 POLL_S = 0.5
 """Between two questions whether the service is ready."""
-READYING = "making the kernels ready"
+PREPARING = "making the kernels ready"
 
 
 @contextmanager
@@ -46,13 +46,13 @@ def running_service(data: Path, log: Path, port: int = 8000) -> Iterator[str]:
         url = f"http://127.0.0.1:{port}"
         total = 1
         with Bars() as bars:
-            while (left := _unready(url, log)) is not None:
+            while (left := _compile_progress(url, log)) is not None:
                 if process.poll() is not None:
-                    raise RuntimeError(f"the service has ended: {_last_words(log)}; its log is {log}")
+                    raise RuntimeError(f"the service has ended: {_last_log_line(log)}; its log is {log}")
                 done, total = left
-                bars(READYING, done, total)
+                bars(PREPARING, done, total)
                 time.sleep(POLL_S)
-            bars(READYING, total, total)
+            bars(PREPARING, total, total)
         yield url
     finally:
         process.terminate()
@@ -73,7 +73,7 @@ def _free(port: int) -> int:
         return int(probe.getsockname()[1])
 
 
-def _unready(url: str, log: Path) -> tuple[int, int] | None:
+def _compile_progress(url: str, log: Path) -> tuple[int, int] | None:
     """Returns how many kernels are compiled, and of how many (0 of 1 where that is not known); None: it is ready."""
     try:
         with Client(url, token=_token(), outage=0) as client:
@@ -93,7 +93,7 @@ def _token() -> str | None:
     return os.environ.get("SCAS4D_TOKEN")
 
 
-def _last_words(log: Path) -> str:
+def _last_log_line(log: Path) -> str:
     """The last line that a person wrote for people, of a log that is JSON otherwise."""
     said = [line for line in log.read_text(errors="replace").splitlines() if line and not line.startswith("{")]
     return said[-1].removeprefix("scas4d: ") if said else "it says no reason"
@@ -160,7 +160,7 @@ def save_views(capture: Capture, client: Client, id: str, frames: int, out: Path
         except ServiceError as error:
             console.print(f"[red]no depth and parts: {error}")
         else:
-            pictures.save(out / "depth.png", pictures.brightness(views["depth"]))
-            pictures.save(out / "parts.png", pictures.coloured(views["parts"]))
+            pictures.save(out / "depth.png", pictures.depth_to_grey(views["depth"]))
+            pictures.save(out / "parts.png", pictures.colour_labels(views["parts"]))
             bars("depth and parts", 1, 1)
     return scores

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from client import pictures
-from client.cli.changes import changes_of
+from client.cli.changes import format_changes
 from client.cli.reconstruct import compile_kernels, reconstruct_frames
 from client.cli.scores import Row, Store, digest, markdown, stage_table
 from client.importers.open_source import CaptureOptions
@@ -79,7 +79,7 @@ class Job:
     @property
     def record(self) -> Row:
         """The settings and constants as the row has them."""
-        return recorded(self.settings, self.constants)
+        return settings_record(self.settings, self.constants)
 
     @property
     def variant(self) -> str:
@@ -97,7 +97,7 @@ class Job:
         usual = preset(self.preset).model_dump(mode="json")
         words = [
             f"{name}={json.dumps(value, separators=(',', ':'))}"
-            for name, value in changes_of(self.record, usual).items()
+            for name, value in format_changes(self.record, usual).items()
             if name not in ("update.iterations", "update.seed", "static.seed")
             and (name, value) != ("static.seconds", None)  # studies have no limit, and depend on no machine
         ]
@@ -112,7 +112,7 @@ class Job:
         return f"{self.capture.resolve().name}-{self.variant}"
 
 
-def recorded(settings: Settings, constants: Sequence[tuple[str, Any]]) -> Row:
+def settings_record(settings: Settings, constants: Sequence[tuple[str, Any]]) -> Row:
     """Settings as JSON, with those constants of the method that have another value, where there are any."""
     return settings.model_dump(mode="json") | ({"constants": dict(constants)} if constants else {})
 
@@ -155,13 +155,13 @@ def evaluate(
         store.put(row)
     else:
         report(f"[1/1] {job.key}: measured already")
-    table = page([row])
+    table = score_tables([row])
     (out / "table.md").write_text(table + "\n")
     report(table)
     return row
 
 
-def page(rows: Sequence[Row], stages_of: Sequence[Row] | None = None) -> str:
+def score_tables(rows: Sequence[Row], stages_of: Sequence[Row] | None = None) -> str:
     """The table of scores, and the table of seconds by stage where there were updates; Markdown."""
     table = markdown(rows)
     if stages := stage_table(rows if stages_of is None else stages_of):
@@ -218,7 +218,7 @@ def measure(
                 line["stages"] = {name: float(value) for name, value in done.report.seconds.items()}
                 line["moving"], line["gaussians"] = int(done.report.moving), int(done.report.gaussians)
                 line["alarms"] = [
-                    {"what": a.what.value, "camera": a.camera, "evidence": a.evidence} for a in done.report.alarms
+                    {"what": a.kind.value, "camera": a.camera, "evidence": a.evidence} for a in done.report.alarms
                 ]
             scores, by_camera = measure_pictures(reconstruction, truth, index, with_lpips=job.lpips)
             line |= scores
@@ -316,7 +316,7 @@ def save_parts(reconstruction: Committed, capture: Capture, index: int, labels: 
             true = truth.labels(camera.name, index)
             picture = np.where(true > 0, render_parts(reconstruction, camera, index, labels), 0)
             shown = np.concatenate([true, picture], axis=1).astype(np.uint8)
-            pictures.save(folder / f"parts{index:04d}_camera{camera.name}.png", pictures.coloured(shown))
+            pictures.save(folder / f"parts{index:04d}_camera{camera.name}.png", pictures.colour_labels(shown))
 
 
 def peak_megabytes() -> float | None:

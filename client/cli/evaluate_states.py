@@ -12,7 +12,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from rich.console import Console
 
-from client.cli.evaluate import DEFAULT_OPTIONS, TRAINING, Report, page, peak_megabytes, save_comparisons, summary
+from client.cli.evaluate import (
+    DEFAULT_OPTIONS,
+    TRAINING,
+    Report,
+    peak_megabytes,
+    save_comparisons,
+    score_tables,
+    summary,
+)
 from client.cli.scores import Row, Store
 from client.exports.sources import Source, of_path
 from client.importers.open_source import CaptureOptions
@@ -64,7 +72,7 @@ def evaluate_states(
     row["measured_on"] = "test cameras" if unseen else TRAINING
     row["changes"] = "" if unseen else TRAINING
     Store(out).put(row)
-    table = page([row])
+    table = score_tables([row])
     (out / "table.md").write_text(table + "\n")
     report(table)
     return row
@@ -94,7 +102,7 @@ def _measure(found: Source, truth: Capture, store: Store, frames: int | None, re
     lines: list[Row] = []
     with Bars(Console(stderr=True)) as bars:
         for index, time, state in given.states(chosen[0], chosen[-1]):
-            history.append(index, time, _owned(state, history), {"background": list(given.head.background)})
+            history.append(index, time, _with_ids(state, history), {"background": list(given.head.background)})
             history.move_to_scratch(store.folder)
             scores, by_camera = measure_pictures(scene, truth, index)
             line: Row = {"index": index, **scores}
@@ -123,7 +131,7 @@ def _measure(found: Source, truth: Capture, store: Store, frames: int | None, re
     return row
 
 
-def _owned(state: Gaussians, history: History) -> Gaussians:
+def _with_ids(state: Gaussians, history: History) -> Gaussians:
     """The state with the ids that the history gives: rows are the same, and nothing asks for ids of the file."""
     if not len(history):
         return state

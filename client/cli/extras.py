@@ -26,7 +26,7 @@ def need_server() -> None:
             raise ModuleNotFoundError(f"No module named {module!r}", name=module)
 
 
-def remedy(missing: ModuleNotFoundError) -> str | None:
+def install_hint(missing: ModuleNotFoundError) -> str | None:
     """Says what to install, in a sentence; None where the module belongs to no extra."""
     package = (missing.name or "").partition(".")[0]
     extras = {"server": SERVER, "exports": EXPORTS, "rerun": RERUN}

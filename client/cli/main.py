@@ -13,7 +13,7 @@ import typer
 
 from client import __version__
 from client.cli import commands, extras, viewing
-from client.cli.capture_options import opened, takes_capture
+from client.cli.capture_options import open_capture, with_capture_options
 from client.cli.changes import Changes, Preset, parse_changes
 from client.errors import ServiceError, ServiceUnreachable
 from client.importers.open_source import CaptureOptions
@@ -26,22 +26,25 @@ commands.register(app)
 viewing.register(app)
 
 CaptureFolder = Annotated[Path, typer.Argument(metavar="CAPTURE", help="Folder of a capture.")]
-Frames = Annotated[int | None, typer.Option(min=1, help="Take only so many frames.")]
+Frames = Annotated[int | None, typer.Option(min=1, help="Maximum number of frames.")]
 Out = Annotated[Path, typer.Option(help="Folder for the results.")]
 
 
 @app.command()
 def serve(
     host: Annotated[
-        str | None, typer.Option(help="Address to listen at; beyond the loopback only with a token (SCAS4D_TOKEN).")
+        str | None, typer.Option(help="Address to listen at; other than loopback only with a token (SCAS4D_TOKEN).")
     ] = None,
-    port: Annotated[int | None, typer.Option(min=0, max=65535, help="8000 where not set otherwise.")] = None,
-    data: Annotated[Path | None, typer.Option(help="Folder of the scenes; ./data where not set otherwise.")] = None,
+    port: Annotated[int | None, typer.Option(min=0, max=65535, help="Port; default: 8000, or the setting.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder of the scenes; default: ./data, or the setting.")] = None,
     placement: Annotated[
-        str | None, typer.Option(help="`local`, or `ray[=HOST:PORT]`: scenes run on a Ray cluster (docs/cluster.md).")
+        str | None, typer.Option(help="`local`, or `ray[=HOST:PORT]` to run scenes on a Ray cluster (docs/cluster.md).")
     ] = None,
     config: Annotated[
-        Path | None, typer.Option(help="TOML file of settings; docs/operations.md lists them. The environment wins.")
+        Path | None,
+        typer.Option(
+            help=("TOML file of settings, listed in the documentation. Environment variables take precedence.")
+        ),
     ] = None,
 ) -> None:
     """Starts the service. Settings not given here are read from the environment (SCAS4D_...), then from the file."""
@@ -54,15 +57,15 @@ def serve(
 
 
 @app.command()
-@takes_capture
+@with_capture_options
 def demo(
     options: CaptureOptions,
     capture: Annotated[Path, typer.Option(help="Folder of a capture.")] = Path("samples/robot"),
     out: Out = Path("out/demo"),
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Another is taken where this is in use.")] = 8000,
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port; another one is used if it is taken.")] = 8000,
     stay: Annotated[
         bool | None,
-        typer.Option(help="Leave the service running until Ctrl-C; the default in a terminal, and only there."),
+        typer.Option(help="Keep the service running until Ctrl-C; the default in a terminal only."),
     ] = None,
     frames: Frames = None,
     preset: Preset = "scas4d",
@@ -71,7 +74,7 @@ def demo(
     """Starts a service, streams the sample capture through it, and leaves renders beside the truth."""
     from client.cli import demo as main_job
 
-    given, settings = opened(capture, options), parse_changes(changes)
+    given, settings = open_capture(capture, options), parse_changes(changes)
     stays = sys.stdout.isatty() if stay is None else stay
     data, log = out / "data", out / "service.log"
     with main_job.running_service(data, log, port) as url:
@@ -90,25 +93,25 @@ def demo(
 
 
 @app.command()
-@takes_capture
+@with_capture_options
 def reconstruct(
     capture: CaptureFolder,
     options: CaptureOptions,
     out: Out = Path("out/reconstruct"),
     frames: Frames = None,
     preset: Preset = "scas4d",
-    videos: Annotated[bool, typer.Option("--videos", help="Leave the pictures of each camera as an MP4, too.")] = False,
+    videos: Annotated[bool, typer.Option("--videos", help="Also write an MP4 per camera.")] = False,
     changes: Changes = None,
 ) -> None:
     """Reconstructs a capture in this process, without a service: pictures, states, and a .ply of the last frame."""
     from client.cli.reconstruct import reconstruct as run
 
     given = parse_changes(changes)
-    run(opened(capture, options), out, frames=frames, preset=preset, changes=given, videos=videos)
+    run(open_capture(capture, options), out, frames=frames, preset=preset, changes=given, videos=videos)
 
 
 @app.command()
-@takes_capture
+@with_capture_options
 def evaluate(
     capture: CaptureFolder,
     options: CaptureOptions,
@@ -116,15 +119,13 @@ def evaluate(
     frames: Frames = None,
     preset: Preset = "scas4d",
     changes: Changes = None,
-    again: Annotated[
-        bool, typer.Option("--again", help="Measure anew, even where the folder holds the scores.")
-    ] = False,
+    again: Annotated[bool, typer.Option("--again", help="Measure again, even if the folder has the scores.")] = False,
     states: Annotated[
         Path | None,
-        typer.Option(help="Score these states, and reconstruct nothing: a .s4d file, USD, numbered .glb files."),
+        typer.Option(help="Score these states without reconstructing: a .s4d file, USD, or numbered .glb files."),
     ] = None,
     rate: Annotated[
-        float | None, typer.Option("--source-fps", help="Frames a second of numbered files in --states. [30]")
+        float | None, typer.Option("--source-fps", help="Frames per second of numbered files in --states. [30]")
     ] = None,
 ) -> None:
     """Prints a capture's scores on its test cameras and ground truth; reconstructs it unless `out` has them already.
@@ -148,26 +149,29 @@ def export(
         str,
         typer.Argument(
             metavar="SOURCE",
-            help="A compact file (.s4d), the folder of `scas4d reconstruct`, a scene's id, or an export with ids: USD, "
-            "numbered .glb files in a folder or a .zip.",
+            help=(
+                "A compact file (.s4d), a folder of `scas4d reconstruct`, a scene id, or an export with "
+                "ids: USD, or numbered .glb files in a folder or .zip."
+            ),
         ),
     ],
     format: Annotated[
         str | None,
-        typer.Option(help="ply, splat, spz, spz4, glb, glb-parts, usd, tracks, poses or s4d; docs/exports.md."),
+        typer.Option(help="ply, splat, spz, spz4, glb, glb-parts, usd, tracks, poses or s4d; see docs/exports.md."),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder or .zip for a file a frame, else a file. [named after SOURCE]")
+        Path | None, typer.Option(help="Folder or .zip for one file per frame, else a file. [named after SOURCE]")
     ] = None,
     player: Annotated[
-        Path | None, typer.Option(metavar="OUT.html", help="Write one page that plays the frames, without a network.")
+        Path | None, typer.Option(metavar="OUT.html", help="Write one page that plays the frames offline.")
     ] = None,
-    frames: Annotated[str | None, typer.Option(metavar="A:B", help="Only these frames, both ends counted in.")] = None,
+    frames: Annotated[str | None, typer.Option(metavar="A:B", help="First and last frame, inclusive.")] = None,
     ids: Annotated[
-        list[int] | None, typer.Option("--id", help="Only this Gaussian, for tracks. May be repeated.")
+        list[int] | None, typer.Option("--id", help="Export only this Gaussian, with tracks. May be repeated.")
     ] = None,
     rate: Annotated[
-        float | None, typer.Option("--source-fps", help="Frames a second of numbered files, which have no times. [30]")
+        float | None,
+        typer.Option("--source-fps", help="Frames per second of numbered files, which have no times. [30]"),
     ] = None,
     url: commands.Url = DEFAULT_URL,
     token: commands.Token = None,
@@ -202,7 +206,7 @@ def options(version: Annotated[bool, typer.Option("--version", callback=_version
 
 def main() -> None:
     """The entry point."""
-    run(app, "scas4d", extras.remedy)
+    run(app, "scas4d", extras.install_hint)
 
 
 def run(commands: typer.Typer, name: str, remedy: Callable[[ModuleNotFoundError], str | None]) -> None:

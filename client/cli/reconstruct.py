@@ -185,7 +185,7 @@ def remarks_on(report: FrameReport | None) -> str:
         return ""
     parts = [] if report.degraded is None else [report.degraded]
     for alarm in report.alarms:
-        if alarm.what not in FRAME_ALARMS:  # the sentence before says as much
+        if alarm.kind not in FRAME_ALARMS:  # the sentence before says as much
             parts.append(alarm.evidence if alarm.camera is None else f"camera {alarm.camera}: {alarm.evidence}")
     return "".join(f"\n  ! {part}" for part in parts)
 

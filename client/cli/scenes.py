@@ -13,7 +13,7 @@ from client.wire import Retention, SceneStatus
 
 Url = Annotated[str, typer.Option(envvar="SCAS4D_URL", help="Address of the service.")]
 Token = Annotated[
-    str | None, typer.Option(envvar="SCAS4D_TOKEN", help="Token of the service; better given in SCAS4D_TOKEN.")
+    str | None, typer.Option(envvar="SCAS4D_TOKEN", help="Token of the service; prefer the variable SCAS4D_TOKEN.")
 ]
 Scenes = Annotated[list[str], typer.Argument(metavar="SCENE...", help="Ids of scenes.")]
 
@@ -39,7 +39,7 @@ def listed(
     context: typer.Context,
     url: Url = DEFAULT_URL,
     token: Token = None,
-    all: Annotated[bool, typer.Option("--all", help="Archived ones, too.")] = False,
+    all: Annotated[bool, typer.Option("--all", help="Include archived scenes.")] = False,
 ) -> None:
     """Lists the scenes of the service, oldest first; SCENE in other commands is the id."""
     if context.invoked_subcommand is not None:
@@ -57,7 +57,7 @@ def listed(
 @app.command()
 def rename(
     scene: Annotated[str, typer.Argument(metavar="SCENE", help="Id of a scene.")],
-    name: Annotated[str, typer.Argument(metavar="NAME", help="For people; the id stays.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="New name; the id does not change.")],
     url: Url = DEFAULT_URL,
     token: Token = None,
 ) -> None:
@@ -103,15 +103,19 @@ def keep(
     scene: Annotated[str, typer.Argument(metavar="SCENE", help="Id of a scene.")],
     frames: Annotated[
         str | None,
-        typer.Option(metavar="COUNT|all", help="Keep the pictures of so many frames, the last, or of all."),
+        typer.Option(metavar="COUNT|all", help="Keep the pictures of this many newest frames, or of all."),
     ] = None,
     states: Annotated[
         str | None,
-        typer.Option(metavar="COUNT|all", help="Keep so many committed states, the last; others are deleted for good."),
+        typer.Option(
+            metavar="COUNT|all", help="Keep this many newest committed states; the others are deleted for good."
+        ),
     ] = None,
     exact: Annotated[
         int | None,
-        typer.Option(min=24, metavar="COUNT", help="Keep so many states exact; older ones go to compact files."),
+        typer.Option(
+            min=24, metavar="COUNT", help="Keep this many newest states exact; older ones move to compact files."
+        ),
     ] = None,
     url: Url = DEFAULT_URL,
     token: Token = None,
@@ -133,8 +137,8 @@ def sleep(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
 @app.command()
 def share(
     scene: Annotated[str, typer.Argument(metavar="SCENE", help="Id of a scene, or all.")],
-    hours: Annotated[float, typer.Option(min=0.01, max=87_840, help="So long the link holds.")] = 168,
-    only_token: Annotated[bool, typer.Option("--only-token", help="Print the token alone, for a program.")] = False,
+    hours: Annotated[float, typer.Option(min=0.01, max=87_840, help="Lifetime of the link.")] = 168,
+    only_token: Annotated[bool, typer.Option("--only-token", help="Print only the token, for a program.")] = False,
     url: Url = DEFAULT_URL,
     token: Token = None,
 ) -> None:
@@ -147,7 +151,7 @@ def share(
 @app.command()
 def delete(
     scenes: Scenes,
-    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask for confirmation.")] = False,
     url: Url = DEFAULT_URL,
     token: Token = None,
 ) -> None:

@@ -40,7 +40,7 @@ def export_player(source: str, out: Path, frames: str | None = None, *, url: str
         InputError: a range or an output that cannot be, or more than browsers open.
     """
     if out.suffix.lower() not in (".html", ".htm"):
-        raise InputError(f"player={str(out)!r} is no name of a page", "give one that ends in .html")
+        raise InputError(f"player={str(out)!r} is not the name of a page", "give one that ends in .html")
     low, high = frame_range(frames)
     with opened(source, low, high, True, url, token) as given:
         if given.of.damage is not None:

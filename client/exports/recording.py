@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.exports.sources import Source, frame_range, opened
-from client.exports.video.overlay import rows_that_move
+from client.exports.video.overlay import moving_rows
 from client.exports.video.rig_view import RigView
 from client.progress import Bars, console
 from client.wire import part_colour
@@ -66,7 +66,7 @@ def make_recording(
         labels = given.parts()
         if parts and labels is None:
             raise InputError(f"parts: {given.name} holds none", "leave --parts out; there are none without motion")
-        rows = rows_that_move(given.some(list(times)), tracks)
+        rows = moving_rows(given.some(list(times)), tracks)
         with _stream(target) as stream:
             _log_what_stays(stream, given, labels)
             ways: deque[tuple[float, NDArray[np.float64]]] = deque()

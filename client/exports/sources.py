@@ -240,7 +240,9 @@ def frame_range(text: str | None) -> tuple[int, int]:
         low = int(first or 0)
         high = int(last or LAST) if colon else low
     except ValueError:
-        raise InputError(f"frames {text!r} is no range", "give A:B, as 0:99; A: and :B are open at one end") from None
+        raise InputError(
+            f"frames {text!r} is not a range", "give A:B, such as 0:99; A: and :B are open at one end"
+        ) from None
     if not 0 <= low <= high:
-        raise InputError(f"frames {text!r} holds no frame", "give A:B with 0 ≤ A ≤ B")
+        raise InputError(f"frames {text!r} contains no frame", "give A:B with 0 ≤ A ≤ B")
     return low, high

@@ -8,7 +8,7 @@ from typing import Any
 INSTALL = "in the project's folder: pip install -e '.[importers]'"
 
 
-class MissingExtra(RuntimeError):
+class MissingExtraError(RuntimeError):
     """A package of the extra `importers` is not installed."""
 
 
@@ -16,13 +16,13 @@ def load(module: str, *, needed: str) -> Any:
     """Imports a module; `needed` names its purpose in the error.
 
     Raises:
-        MissingExtra: it is not installed; the message names the extra.
+        MissingExtraError: it is not installed; the message names the extra.
     """
     try:
         return importlib.import_module(module)
     except ImportError as fault:
         packages = {"cv2": "OpenCV (opencv-python-headless)", "av": "PyAV (av)"}
-        raise MissingExtra(
+        raise MissingExtraError(
             f"{needed} needs {packages.get(module, module)}, which cannot be imported ({fault}): {INSTALL}"
         ) from fault
 

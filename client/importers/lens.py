@@ -60,7 +60,7 @@ class LensCamera:
         return self.model == "OPENCV_FISHEYE"
 
     @property
-    def straight(self) -> bool:
+    def is_pinhole(self) -> bool:
         """True for a pinhole camera. (A fisheye without coefficients is none.)"""
         return not self.fisheye and not self.distortion.any()
 

@@ -8,10 +8,16 @@ from typing import Any, Literal
 
 from client.importers.calibration import Calibration
 from client.importers.formats.colmap import is_model, read_colmap
-from client.importers.formats.find import READ, found_in, is_calibration, only, read_found
+from client.importers.formats.find import (
+    READ,
+    find_calibrations,
+    is_calibration,
+    read_calibration_file,
+    single_calibration,
+)
 from client.importers.formats.nerfstudio import FILE, read_transforms
 from client.importers.pictures import PictureFiles, folders_of, named_files
-from client.importers.source import Encoding, ImportedPictures, RawReader, check_times, fitted
+from client.importers.source import Encoding, ImportedPictures, RawReader, check_times, fit_to_pictures
 from client.importers.videos import ENDS, Videos, find_videos
 from scas4d_core.captures import Capture, CaptureError, SizeMismatch, open_capture
 from scas4d_core.captures.dynamic3dgs import TRAIN_META
@@ -81,7 +87,7 @@ def open_source(
 
     Raises:
         CaptureError: no known layout, or a fault in one of the files; the message says what is missing.
-        MissingExtra: a lens or a video needs a package of the extra `importers`.
+        MissingExtraError: a lens or a video needs a package of the extra `importers`.
 
     >>> capture = open_source(folder)
     >>> capture.rig.names, capture.frame_count
@@ -121,7 +127,7 @@ def _imported(
     size_mismatch: SizeMismatch | None,
 ) -> Capture:
     raw = _pictures(folder, found, pictures)
-    found, resized = fitted(found, raw, size_mismatch)
+    found, resized = fit_to_pictures(found, raw, size_mismatch)
     masks = folder / "masks"
     files = tuple(folders_of(masks, found, what="masks")) if use_masks and masks.is_dir() else ()
     if files and isinstance(raw, PictureFiles):
@@ -139,7 +145,7 @@ def _imported(
         reader,
         fps=fps or raw.fps or found.fps or 30.0,
         points=found.points,
-        remarks=(*found.remarks, *resized, *uncalibrated(folder, found), *reader.remarks),
+        remarks=(*found.remarks, *resized, *uncalibrated_remark(folder, found), *reader.remarks),
     )
     check_times(capture.name, [capture.time(index) for index in range(capture.frame_count)])
     return capture
@@ -151,7 +157,7 @@ def read_calibration(folder: Path, given: Path | None = None) -> Calibration:
 
     Raises:
         CaptureError: there is none, there are several, or it cannot be read.
-        MissingExtra: it needs a package of the extra `importers`.
+        MissingExtraError: it needs a package of the extra `importers`.
     """
     if given is not None:
         if given.is_file() and given.suffix == ".json":
@@ -159,16 +165,16 @@ def read_calibration(folder: Path, given: Path | None = None) -> Calibration:
         if given.is_dir() and is_model(given):
             return read_colmap(given)
         if is_calibration(given):
-            return read_found(given, folder)
+            return read_calibration_file(given, folder)
         raise CaptureError(f"{given}: is neither a transforms.json, nor the folder of a COLMAP model, nor {READ}")
-    others = found_in(folder)
+    others = find_calibrations(folder)
     if (folder / FILE).is_file():
-        return _instead_of(others, folder, read_transforms(folder / FILE))
+        return _with_unread_remark(others, folder, read_transforms(folder / FILE))
     for name in COLMAP_FOLDERS:
         if is_model(folder / name):
-            return _instead_of(others, folder, read_colmap(folder / name))
+            return _with_unread_remark(others, folder, read_colmap(folder / name))
     if others:
-        return read_found(only(others, folder), folder)
+        return read_calibration_file(single_calibration(others, folder), folder)
     raise CaptureError(
         f"{folder}: no known capture layout: no {TRAIN_META} (Dynamic3DGaussians), no {FILE} (nerfstudio), no "
         f"cameras.bin or cameras.txt (COLMAP) in {', '.join(COLMAP_FOLDERS)}, nor, here or in calibration/, {READ}; "
@@ -176,7 +182,7 @@ def read_calibration(folder: Path, given: Path | None = None) -> Calibration:
     )
 
 
-def _instead_of(others: list[Path], folder: Path, found: Calibration) -> Calibration:
+def _with_unread_remark(others: list[Path], folder: Path, found: Calibration) -> Calibration:
     """The calibration, with a remark on others that are there and not read."""
     if not others:
         return found
@@ -185,7 +191,7 @@ def _instead_of(others: list[Path], folder: Path, found: Calibration) -> Calibra
     return replace(found, remarks=(*found.remarks, remark))
 
 
-def uncalibrated(folder: Path, calibration: Calibration) -> list[str]:
+def uncalibrated_remark(folder: Path, calibration: Calibration) -> list[str]:
     """A remark on cameras that have pictures or a video, and are not in the calibration; none where all are."""
     images, videos = folder / "images", folder / "videos"
     there = {path.name for path in images.iterdir() if path.is_dir()} if images.is_dir() else set[str]()

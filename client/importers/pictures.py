@@ -70,7 +70,7 @@ class PictureFiles:
             if picture is None or mask is None or picture.stem != mask.stem:
                 raise CaptureError(
                     f"frame {index}: its picture is {picture} and its mask {mask}; call masks like the pictures and "
-                    "give one of every picture, or none (--no-masks)"
+                    "give one for every picture, or none (--no-masks)"
                 )
 
 

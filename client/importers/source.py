@@ -65,14 +65,14 @@ class ImportedPictures:
     In a file, a picture of a straight lens goes as it is; every other is encoded anew.
 
     Args:
-        calibration: of the rig, for pictures of the size that `raw` has (`fitted`).
+        calibration: of the rig, for pictures of the size that `raw` has (`fit_to_pictures`).
         raw: pictures of all its cameras.
         masks: [T] files by camera, or none.
         encoding: of pictures that are encoded anew; JPEG has quality 95 and no subsampling.
 
     Raises:
         CaptureError: a lens cannot be undone.
-        MissingExtra: a lens has to be undone and OpenCV is not there.
+        MissingExtraError: a lens has to be undone and OpenCV is not there.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class ImportedPictures:
 
     def encoded_image(self, index: int, camera: str) -> bytes:
         """The file as it is, or the undistorted picture encoded; 16 bits are rounded to 8."""
-        if self._undistorters[camera].lens.straight:
+        if self._undistorters[camera].lens.is_pinhole:
             file = self._raw.file(index, camera)
             if file is not None:
                 return eight_bit_file(read_bytes(file), str(file))
@@ -131,7 +131,7 @@ class ImportedPictures:
         return encode(255 * self.mask(index, camera), "png") if self.has_mask(index, camera) else None
 
 
-def fitted(
+def fit_to_pictures(
     calibration: Calibration, raw: RawReader, size_mismatch: SizeMismatch | None
 ) -> tuple[Calibration, list[str]]:
     """The calibration for pictures of the size that they have, and remarks on cameras where that is another.

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from client.importers.curve import Curve
+from client.importers.distortion_curve import DistortionCurve
 from client.importers.extras import opencv
 from client.importers.lens import LensCamera
 from scas4d_core.cameras import Camera
@@ -48,7 +48,7 @@ class Undistorter:
 
     Raises:
         CaptureError: the distortion cannot be undone in a quarter of the picture or more.
-        MissingExtra: OpenCV is needed and not there.
+        MissingExtraError: OpenCV is needed and not there.
     """
 
     lens: LensCamera
@@ -56,12 +56,12 @@ class Undistorter:
     @cached_property
     def camera(self) -> Camera:
         """The pinhole camera that the undistorted picture belongs to."""
-        return self.lens.pinhole() if self.lens.straight else self.lens.pinhole(self._view.intrinsics)
+        return self.lens.pinhole() if self.lens.is_pinhole else self.lens.pinhole(self._view.intrinsics)
 
     @cached_property
     def remark(self) -> str | None:
         """A sentence on a lens that is cut, because its polynomial turns back; None for others."""
-        if self.lens.straight or self._view.kept is None:
+        if self.lens.is_pinhole or self._view.kept is None:
             return None
         return (
             f"camera {self.lens.name!r}: its distortion turns back towards the corners, where its calibration had no "
@@ -86,7 +86,7 @@ class Undistorter:
     @cached_property
     def valid(self) -> NDArray[np.bool_]:
         """Mask [H, W] of the undistorted pixels that the camera saw."""
-        if self.lens.straight:
+        if self.lens.is_pinhole:
             return np.ones((self.lens.height, self.lens.width), dtype=bool)
         u, v = self._maps  # of OpenCV: the picture's edges are at −0.5 and size − 0.5
         inside = (u >= -HALF) & (u <= self.lens.width - HALF) & (v >= -HALF) & (v <= self.lens.height - HALF)
@@ -110,7 +110,7 @@ class Undistorter:
                 f"camera {self.lens.name!r}: a picture of {picture.shape[1]}x{picture.shape[0]}, but calibrated for "
                 f"{self.lens.width}x{self.lens.height}"
             )
-        if self.lens.straight:
+        if self.lens.is_pinhole:
             return picture
         cv2 = opencv()
         result: Picture = cv2.remap(picture, *self._maps, getattr(cv2, how), borderMode=cv2.BORDER_REPLICATE)
@@ -139,8 +139,8 @@ class _View:
 
 def _inscribed(lens: LensCamera) -> _View:
     """The pinhole whose whole picture the lens saw; its pixels have the shape of the lens's."""
-    curve = Curve.of(lens)
-    left, top, right, bottom = _seen_rectangle(lens, curve)
+    curve = DistortionCurve.of(lens)
+    left, top, right, bottom = _inner_rectangle(lens, curve)
     fx, fy = lens.intrinsics[0, 0], lens.intrinsics[1, 1]
     # One factor for both focal lengths keeps the pixels' shape.
     factor = max(lens.width / ((right - left) * fx), lens.height / ((bottom - top) * fy))
@@ -150,7 +150,7 @@ def _inscribed(lens: LensCamera) -> _View:
     return _within(lens, curve, k) if curve.turns else _View(k)
 
 
-def _within(lens: LensCamera, curve: Curve, k: Float) -> _View:
+def _within(lens: LensCamera, curve: DistortionCurve, k: Float) -> _View:
     """Narrows a pinhole about the lens's axis until all that it shows lies where the lens's polynomial rises.
 
     Raises:
@@ -160,9 +160,9 @@ def _within(lens: LensCamera, curve: Curve, k: Float) -> _View:
     kept = 0.0
     while k[0, 0] < MOST_NARROWED * lens.intrinsics[0, 0]:
         rays = (border - k[:2, 2]) / k.diagonal()[:2]
-        at = curve.bent(rays) * lens.intrinsics.diagonal()[:2] + lens.intrinsics[:2, 2]
+        at = curve.distort(rays) * lens.intrinsics.diagonal()[:2] + lens.intrinsics[:2, 2]
         inside = (at > -TOLERANCE_PIXELS) & (at < size + TOLERANCE_PIXELS)
-        if inside.all() and np.linalg.norm(rays, axis=-1).max() <= curve.widest:
+        if inside.all() and np.linalg.norm(rays, axis=-1).max() <= curve.max_radius:
             x, y = at.T
             kept = float(abs(x @ np.roll(y, 1) - y @ np.roll(x, 1))) / 2 / (lens.width * lens.height)
             break
@@ -187,14 +187,14 @@ def _edges(lens: LensCamera) -> dict[str, Float]:
     }
 
 
-def _seen_rectangle(lens: LensCamera, curve: Curve) -> tuple[float, float, float, float]:
+def _inner_rectangle(lens: LensCamera, curve: DistortionCurve) -> tuple[float, float, float, float]:
     """Left, top, right, bottom at distance 1 of a rectangle that lies within what the lens saw.
 
     No edge of the picture, bent as it is, comes into the rectangle: it ends where each edge's innermost point lies. Of
     a lens that turns back, `_within` cuts the corners.
     """
-    limit = min(np.tan(np.radians(WIDEST_DEGREES / 2)), curve.widest)
-    rays = {side: straightened(lens, pixels, curve) for side, pixels in _edges(lens).items()}
+    limit = min(np.tan(np.radians(WIDEST_DEGREES / 2)), curve.max_radius)
+    rays = {side: undistort_pixels(lens, pixels, curve) for side, pixels in _edges(lens).items()}
     seen = {side: points[~np.isnan(points).any(axis=-1)] for side, points in rays.items()}
     left, top = (seen[side][:, axis].max(initial=-limit) for axis, side in enumerate(("left", "top")))
     right, bottom = (seen[side][:, axis].min(initial=limit) for axis, side in enumerate(("right", "bottom")))
@@ -206,14 +206,14 @@ def _seen_rectangle(lens: LensCamera, curve: Curve) -> tuple[float, float, float
     return float(left), float(top), float(right), float(bottom)
 
 
-def straightened(lens: LensCamera, pixels: Float, curve: Curve | None = None) -> Float:
+def undistort_pixels(lens: LensCamera, pixels: Float, curve: DistortionCurve | None = None) -> Float:
     """[P, 2] pixels of the lens to rays (x/z, y/z) [P, 2].
 
     Rays are ±infinity beyond 89° from the axis of a fisheye, and NaN where the lens has none: its polynomial turns back
     before the pixel.
     """
-    curve = curve or Curve.of(lens)
-    return curve.straight((pixels - lens.intrinsics[:2, 2]) / lens.intrinsics.diagonal()[:2])
+    curve = curve or DistortionCurve.of(lens)
+    return curve.undistort((pixels - lens.intrinsics[:2, 2]) / lens.intrinsics.diagonal()[:2])
 
 
 def _listed(lens: LensCamera) -> str:

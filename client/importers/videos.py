@@ -40,7 +40,7 @@ class Video:
 
     Raises:
         CaptureError: no video, damaged, turned by its metadata, or fewer than one frame.
-        MissingExtra: PyAV is not there.
+        MissingExtraError: PyAV is not there.
     """
 
     def __init__(self, path: Path) -> None:

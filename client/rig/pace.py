@@ -17,9 +17,9 @@ class Pace:
         seed: of what is random here.
 
     >>> pace = Pace(fps=30, drop=0.5)
-    >>> [pace.loses(index) for index in range(4)] == [pace.loses(index) for index in range(4)]
+    >>> [pace.drops(index) for index in range(4)] == [pace.drops(index) for index in range(4)]
     True
-    >>> pace.loses(0)
+    >>> pace.drops(0)
     False
     """
 
@@ -36,10 +36,10 @@ class Pace:
         if not 0 <= self.drop < 1:
             raise ValueError(f"drop {self.drop!r} must be a share from 0 to below 1")
 
-    def loses(self, index: int, camera: str = "") -> bool:
+    def drops(self, index: int, camera: str = "") -> bool:
         """True where this frame (or this camera's picture of it) is lost; the same answer every time."""
         return index > 0 and random.Random(f"{self.seed} {index} {camera} lost").random() < self.drop
 
-    def late(self, index: int, camera: str = "") -> float:
+    def delay(self, index: int, camera: str = "") -> float:
         """Seconds that this frame leaves late."""
         return random.Random(f"{self.seed} {index} {camera} late").uniform(0, self.jitter)

@@ -10,7 +10,7 @@ from client.errors import FrameGap
 from client.ingest import IngestSocket
 from client.rig.delivery import Delivery
 from client.rig.pace import Pace
-from client.rig.sequence import Files, Sequence
+from client.rig.sequence import FrameFiles, Sequence
 from client.sdk import Client
 
 OnMessage = Callable[[str], None]
@@ -23,11 +23,11 @@ class Requests:
         self._client = client
         self._scene = scene
 
-    def frame(self, index: int, files: Files) -> None:
+    def frame(self, index: int, files: FrameFiles) -> None:
         """Sends a whole frame."""
         self._client.put_frame(self._scene, index, files.images, files.masks, time=files.time)
 
-    def camera(self, index: int, name: str, files: Files) -> None:
+    def camera(self, index: int, name: str, files: FrameFiles) -> None:
         """Sends one camera's pictures."""
         mask = files.masks.get(name)
         self._client.put_camera(self._scene, index, name, files.images[name], mask, time=files.time)
@@ -44,11 +44,11 @@ class Sockets:
         self._scene = scene
         self._sockets: dict[str, IngestSocket] = {}
 
-    def frame(self, index: int, files: Files) -> None:
+    def frame(self, index: int, files: FrameFiles) -> None:
         """Sends a whole frame."""
         self._of("").put_frame(index, files.images, files.masks, time=files.time)
 
-    def camera(self, index: int, name: str, files: Files) -> None:
+    def camera(self, index: int, name: str, files: FrameFiles) -> None:
         """Sends one camera's pictures over its own socket."""
         self._of(name).put_camera(index, name, files.images[name], files.masks.get(name), time=files.time)
 
@@ -116,20 +116,20 @@ class Sender:
     def _await(self, index: int) -> float | None:
         due = self._began + (self._sent / self._pace.fps if self._pace.fps else 0.0)
         self._sent += 1
-        time.sleep(max(0.0, due + self._pace.late(index) - time.monotonic()))
+        time.sleep(max(0.0, due + self._pace.delay(index) - time.monotonic()))
         return due
 
     def _send(self, index: int) -> None:
         id = self._delivery.scene
         if self._cameras is None:
-            if self._pace.loses(index):
+            if self._pace.drops(index):
                 self._lose(index)
                 return
             files = self._sequence.files(index)
             self._way.frame(index, files)
             return
         files = self._sequence.files(index)
-        sending = [name for name in files.images if not self._pace.loses(index, name)]
+        sending = [name for name in files.images if not self._pace.drops(index, name)]
         if not sending:
             self._lose(index)
             return
@@ -139,8 +139,8 @@ class Sender:
             lost = ", ".join(name for name in files.images if name not in sending)
             self._on_message(f"frame {index}: the rig lost the pictures of {lost}; closed without them")
 
-    def _send_camera(self, index: int, name: str, files: Files) -> None:
-        time.sleep(self._pace.late(index, name))
+    def _send_camera(self, index: int, name: str, files: FrameFiles) -> None:
+        time.sleep(self._pace.delay(index, name))
         self._way.camera(index, name, files)
 
     def _lose(self, index: int) -> None:

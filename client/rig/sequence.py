@@ -12,7 +12,7 @@ FOREVER = 10**9
 
 
 @dataclass(frozen=True)
-class Files:
+class FrameFiles:
     """One frame as it is sent."""
 
     time: float
@@ -20,10 +20,10 @@ class Files:
     masks: dict[str, bytes]
 
 
-def there_and_back(index: int, count: int) -> int:
+def ping_pong(index: int, count: int) -> int:
     """The place among so many of an index that goes to their end, back to their start, and so on.
 
-    >>> [there_and_back(index, 3) for index in range(6)]
+    >>> [ping_pong(index, 3) for index in range(6)]
     [0, 1, 2, 1, 0, 1]
     """
     if count == 1:
@@ -46,15 +46,15 @@ class Sequence:
         self.loop = loop
         self._last = source.frame_count - 1 - start
         self._pool = ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1), thread_name_prefix="frames")
-        self._ahead: tuple[int, Future[Files]] | None = None
+        self._ahead: tuple[int, Future[FrameFiles]] | None = None
         self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="ahead")
 
     def __len__(self) -> int:
         return FOREVER if self.loop else self._last + 1
 
-    def place(self, index: int) -> int:
+    def capture_index(self, index: int) -> int:
         """The frame of the capture that is frame `index` of the scene."""
-        return self.start + there_and_back(index, self._last + 1)
+        return self.start + ping_pong(index, self._last + 1)
 
     def time(self, index: int) -> float:
         """Seconds: those of the capture; beyond its end by its rate."""
@@ -62,7 +62,7 @@ class Sequence:
             return self.source.time(self.start + index) - self.source.time(self.start)
         return self.time(self._last) + (index - self._last) / self.source.fps
 
-    def files(self, index: int) -> Files:
+    def files(self, index: int) -> FrameFiles:
         """Returns the files of a frame; those of the next are made meanwhile."""
         future = self._ahead[1] if self._ahead and self._ahead[0] == index else self._reader.submit(self._files, index)
         files = future.result()
@@ -70,15 +70,15 @@ class Sequence:
             self._ahead = index + 1, self._reader.submit(self._files, index + 1)
         return files
 
-    def _files(self, index: int) -> Files:
-        place, names = self.place(index), self.source.full_rig.names
+    def _files(self, index: int) -> FrameFiles:
+        place, names = self.capture_index(index), self.source.full_rig.names
         images = dict(
             zip(names, self._pool.map(lambda name: self.source.encoded_image(place, name), names), strict=True)
         )
         files = dict(zip(names, self._pool.map(lambda name: self.source.encoded_mask(place, name), names), strict=True))
         masks = {name: mask for name, mask in files.items() if mask is not None}
         # The service takes masks of all cameras or of none.
-        return Files(self.time(index), images, masks if len(masks) == len(images) else {})
+        return FrameFiles(self.time(index), images, masks if len(masks) == len(images) else {})
 
     def close(self) -> None:
         """Ends its threads."""

@@ -101,7 +101,7 @@ def push(
         stack.callback(way.close)
         sender = Sender(client, way, sequence, pace or Pace(), delivery, on_message, per_camera)
         stack.callback(sender.close)
-        stack.enter_context(_listening(client, delivery.lateness, on_message))
+        stack.enter_context(_record_retries(client, delivery.lateness, on_message))
         try:
             for index in sender.send_all(status.next_frame, count):
                 if index == 0:
@@ -121,7 +121,7 @@ def push(
     return delivery
 
 
-class _listening:
+class _record_retries:
     """Counts what the client waits for, and says when an outage begins."""
 
     def __init__(self, client: Client, lateness: Lateness, on_message: OnMessage) -> None:
@@ -157,7 +157,7 @@ def _check_cameras(status: SceneStatus, source: Capture) -> None:
     if set(status.cameras) != set(source.full_rig.names):
         raise RuntimeError(
             f"scene {status.id} has the cameras {', '.join(status.cameras)}, {source.name} has "
-            f"{', '.join(source.full_rig.names)}; go on with the capture that the scene began with"
+            f"{', '.join(source.full_rig.names)}; continue with the capture that the scene started with"
         )
 
 

@@ -8,6 +8,7 @@ from client.wire.frames import (
     AlarmModel,
     CalibrationModel,
     CameraFitModel,
+    CameraReceipt,
     CameraResidualModel,
     CurvePointModel,
     EffectModel,
@@ -16,7 +17,6 @@ from client.wire.frames import (
     FrameReportModel,
     FrameState,
     MissingRequest,
-    PartReceipt,
     RefinedCameraModel,
     RefinementModel,
 )
@@ -48,7 +48,7 @@ from client.wire.scenes import (
     SceneStatus,
     StateBounds,
 )
-from client.wire.service import Cluster, Health, Node, ProblemDetails, Share, ShareRequest, Ticket, Waiting
+from client.wire.service import Cluster, Health, Node, ProblemDetails, Share, ShareRequest, Ticket, WaitingProcess
 from client.wire.tracks import GaussianModel, GaussiansModel, TracksModel, TracksRequest, tracks_model
 from client.wire.tradeoff import (
     CurveMean,
@@ -73,6 +73,7 @@ __all__ = [
     "CameraFitModel",
     "CameraModel",
     "CameraName",
+    "CameraReceipt",
     "CameraResidualModel",
     "Cluster",
     "CurveMean",
@@ -101,7 +102,6 @@ __all__ = [
     "MissingRequest",
     "Model",
     "Node",
-    "PartReceipt",
     "PartsModel",
     "Pixel",
     "PointKind",
@@ -137,7 +137,7 @@ __all__ = [
     "TradeoffModel",
     "TradeoffPoint",
     "Unit",
-    "Waiting",
+    "WaitingProcess",
     "frame_chunks",
     "head_length",
     "parse_frame",

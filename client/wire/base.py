@@ -20,7 +20,7 @@ CameraName = Annotated[
     str,
     Field(
         pattern=CAMERA_NAME,
-        description="Letters, digits, dot, dash, underscore; not `time`, and not beginning with `mask.`.",
+        description=("Letters, digits, dots, dashes and underscores; not `time`, and not starting with `mask.`."),
     ),
 ]
 

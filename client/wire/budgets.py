@@ -17,23 +17,29 @@ Iterations = Annotated[int, Field(strict=True, ge=1, le=MOST_ITERATIONS)]
 class Budget(Model):
     """Limits of a scene's updates. A field that is null is as the scene was made."""
 
-    iterations: Iterations | None = Field(default=None, description="A frame; of `update.iterations`.")
+    iterations: Iterations | None = Field(
+        default=None, description="Iterations per frame; see the setting `update.iterations`."
+    )
     budget_ms: float | None = Field(
         default=None,
         strict=True,
         gt=0,
         le=LONGEST_MS,
         allow_inf_nan=False,
-        description="Milliseconds a frame, decoding and commit included: as many iterations as fit, whatever "
-        "`iterations` says.",
+        description=(
+            "Milliseconds per frame, including decoding and commit. As many iterations run as fit, "
+            "regardless of `iterations`."
+        ),
     )
     stop_gain: float | None = Field(
         default=None,
         strict=True,
         ge=0,
         lt=1,
-        description="An update ends once ten iterations lower its error on four training views by less than this "
-        "share; 0: never.",
+        description=(
+            "End an update once ten iterations lower its error on four training views by less than "
+            "this share; 0: never."
+        ),
     )
     skip_tolerance: float | None = Field(
         default=None,
@@ -41,8 +47,10 @@ class Budget(Model):
         ge=-1,
         le=1000,
         allow_inf_nan=False,
-        description="A frame needs no iteration where the one before shows it with at most 1 + this times the usual "
-        "error; -1: every frame is updated.",
+        description=(
+            "Skip the update if the previous state's error on the probe views is at most (1 + this) × "
+            "the usual error; -1: never skip."
+        ),
     )
 
 
@@ -59,7 +67,7 @@ class EffectiveBudget(Model):
     """The limits that apply, each field filled in."""
 
     iterations: int
-    budget_ms: float | None = Field(description="Milliseconds a frame; null: no limit.")
+    budget_ms: float | None = Field(description="Milliseconds per frame; null: no limit.")
     stop_gain: float
     skip_tolerance: float
 
@@ -68,6 +76,6 @@ class SceneBudget(Model):
     """The budget of a scene."""
 
     scene: str
-    asked: Budget = Field(description="As it was put last; nulls where nothing was.")
-    effective: EffectiveBudget = Field(description="What frames that are not begun get.")
-    since: int = Field(description="The first frame that it holds for.")
+    requested: Budget = Field(description="The budget as last set; a field is null if it was never set.")
+    effective: EffectiveBudget = Field(description="The budget that applies to frames that have not started.")
+    since: int = Field(description="The first frame to which it applies.")

@@ -10,14 +10,18 @@ from client.wire.base import Model
 class SceneEstimate(Model):
     """Memory and disk, in MB of a million bytes; `docs/operations.md` has the formula and what was measured."""
 
-    pixels: int = Field(description="Of all cameras together, as they are sent.")
-    scaled_pixels: int = Field(description="The same after `settings.scene.image_scale`.")
-    gaussians: int = Field(description="The budget of Gaussians; where frame 0 decides it, the most it may decide.")
-    pictures_mb: float = Field(description="Pictures of a frame in the worker: cameras times pixels.")
-    gaussians_mb: float = Field(description="All that an update keeps for each Gaussian.")
-    worker_mb: float = Field(description="The process that updates, at its peak.")
-    readers_mb: float = Field(description="The two processes that answer, without long histories.")
-    memory_mb: float = Field(description="Together.")
-    limit_mb: float = Field(description="What a scene may take on this service.")
-    state_mb: float = Field(description="On disk for each committed frame.")
-    history_mb: float = Field(description="In a reader for each frame of a query over all Gaussians.")
+    pixels: int = Field(description="Pixels of all cameras together, as sent.")
+    scaled_pixels: int = Field(description="Pixels of all cameras after `settings.scene.image_scale`.")
+    gaussians: int = Field(
+        description="Maximum number of Gaussians. If frame 0 chooses the number, this is its upper limit."
+    )
+    pictures_mb: float = Field(
+        description="Memory of one frame's pictures in the worker, proportional to cameras × pixels."
+    )
+    gaussians_mb: float = Field(description="Memory that an update needs for its Gaussians.")
+    worker_mb: float = Field(description="Peak memory of the worker process.")
+    readers_mb: float = Field(description="Memory of the two reader processes, without queries over many frames.")
+    memory_mb: float = Field(description="Memory of all processes of the scene.")
+    limit_mb: float = Field(description="Memory limit per scene on this service.")
+    state_mb: float = Field(description="Disk space per committed frame.")
+    history_mb: float = Field(description="Memory of a reader per frame of a query over all Gaussians.")

@@ -44,12 +44,12 @@ class ExportState(StrEnum):
 class ExportRequest(Model):
     """A request for an export: the committed frames of a range in the format of another tool (docs/exports.md)."""
 
-    format: ExportFormat = Field(description="docs/exports.md has what each holds, and what is lost.")
-    first: FrameNumber | None = Field(default=None, description="First frame; null: the first committed one.")
-    last: FrameNumber | None = Field(default=None, description="Last frame, included; null: the last committed one.")
+    format: ExportFormat = Field(description="The format; docs/exports.md lists what each contains and loses.")
+    first: FrameNumber | None = Field(default=None, description="First frame; null: the first committed frame.")
+    last: FrameNumber | None = Field(default=None, description="Last frame, inclusive; null: the last committed frame.")
     ids: (
         Annotated[list[Annotated[int, Field(ge=0, le=LARGEST_ID)]], Field(min_length=1, max_length=MOST_IDS)] | None
-    ) = Field(default=None, description="Gaussians of format `tracks`; null: all that move.")
+    ) = Field(default=None, description="Gaussians for the format `tracks`; null: all moving Gaussians.")
 
 
 class ExportModel(Model):
@@ -58,17 +58,17 @@ class ExportModel(Model):
     id: str
     scene: str
     format: ExportFormat
-    first: int = Field(description="First frame that it has.")
-    last: int = Field(description="Last frame that it has.")
+    first: int = Field(description="First exported frame.")
+    last: int = Field(description="Last exported frame.")
     state: ExportState
-    done: int = Field(description="Frames that are written.")
-    frames: int = Field(description="Frames in all.")
-    bytes: int = Field(description="On disk so far; of the file, once it is done.")
-    error: str | None = Field(description="Why it failed or was cancelled.")
-    created: str = Field(description="Time, ISO 8601.")
-    expires: str | None = Field(description="Time at which its file is removed; null while it is made.")
-    name: str = Field(description="Of the file. Numbered files come in one .zip.")
-    file: str | None = Field(description="Path of the file below the address of the service; null until it is done.")
+    done: int = Field(description="Number of frames written so far.")
+    frames: int = Field(description="Number of frames in total.")
+    bytes: int = Field(description="Bytes on disk so far; the size of the file once it is done.")
+    error: str | None = Field(description="Why the export failed or was cancelled.")
+    created: str = Field(description="Creation time, ISO 8601.")
+    expires: str | None = Field(description="Time at which the file is removed; null until it is done.")
+    name: str = Field(description="Name of the file. Numbered files are packed into one .zip.")
+    file: str | None = Field(description="Path of the file relative to the service's address; null until it is done.")
 
 
 class ExportList(Model):

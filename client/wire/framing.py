@@ -21,7 +21,7 @@ from typing import Annotated
 from pydantic import Field, FiniteFloat, ValidationError
 
 from client.wire.base import MAX_CAMERAS, CameraName, Model
-from client.wire.frames import FrameReceipt, PartReceipt
+from client.wire.frames import CameraReceipt, FrameReceipt
 from client.wire.service import ProblemDetails
 from scas4d_core.errors import InputError
 
@@ -49,29 +49,33 @@ class FrameFile(Model):
 
     camera: CameraName
     kind: FileKind = FileKind.IMAGE
-    size: int = Field(ge=0, description="Bytes.")
+    size: int = Field(ge=0, description="Size in bytes.")
 
 
 class FrameHead(Model):
     """FileHeader of a framed body: the frame's index, time and files."""
 
     index: int = Field(ge=0, le=MAX_INDEX)
-    time: FiniteFloat | None = Field(default=None, description="Seconds; by the scene's frame rate where not given.")
+    time: FiniteFloat | None = Field(
+        default=None, description="Time in seconds; by default the index divided by the scene's frame rate."
+    )
     files: Annotated[list[FrameFile], Field(min_length=1, max_length=2 * MAX_CAMERAS)]
-    part: bool = Field(
+    single_camera: bool = Field(
         default=False,
-        description="These are the files of one camera, not the whole frame: as PUT …/frames/{n}/cameras/{c}.",
+        description=("The files belong to one camera, as in PUT …/frames/{n}/cameras/{c}, not to a whole frame."),
     )
 
 
 class IngestAnswer(Model):
     """Answers one binary message of `WS …/ingest`, as JSON text, in the order of the messages."""
 
-    index: int | None = Field(description="Of the frame; null where the message could not be read.")
-    status: int = Field(description="The status over HTTP: 202, 409, 422, 429, 507 …")
-    retry_after: int | None = Field(default=None, description="Seconds; the same as Retry-After over HTTP.")
-    receipt: FrameReceipt | PartReceipt | None = Field(default=None, description="With status 202: it is on disk.")
-    problem: ProblemDetails | None = Field(default=None, description="Otherwise.")
+    index: int | None = Field(description="Index of the frame; null if the message could not be read.")
+    status: int = Field(description="The same status as over HTTP: 202, 409, 422, 429, 507 …")
+    retry_after: int | None = Field(default=None, description="Seconds to wait; the same as Retry-After over HTTP.")
+    receipt: FrameReceipt | CameraReceipt | None = Field(
+        default=None, description="Receipt, with status 202: the files are on disk."
+    )
+    problem: ProblemDetails | None = Field(default=None, description="Problem document, with any other status.")
 
 
 def frame_chunks(
@@ -94,7 +98,7 @@ def frame_chunks(
     kinds = ((FileKind.IMAGE, images), (FileKind.MASK, masks or {}))
     named = [(camera, kind, data) for kind, files in kinds for camera, data in files.items()]
     files = [FrameFile(camera=camera, kind=kind, size=len(data)) for camera, kind, data in named]
-    head = FrameHead(index=index, time=time, files=files, part=part).model_dump_json().encode()
+    head = FrameHead(index=index, time=time, files=files, single_camera=part).model_dump_json().encode()
     return [PREFIX.pack(MAGIC, len(head)) + head, *(data for _, _, data in named)]
 
 

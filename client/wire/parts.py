@@ -17,14 +17,14 @@ GOLDEN = 0.618033988749895
 class PartsModel(Model):
     """A part label for every Gaussian. Parts that go on when frames are committed keep their labels and colours."""
 
-    count: int = Field(description="How many parts there are.")
-    frame: int = Field(description="The newest frame that they were found from.")
-    ids: list[int] = Field(description="[N]")
+    count: int = Field(description="Number of parts.")
+    frame: int = Field(description="The newest frame used to find the parts.")
+    ids: list[int] = Field(description="[N] ids of Gaussians.")
     labels: list[int] = Field(
-        description="[N] from 0; −1 for what stands still. Those of a count that was chosen may have gaps."
+        description=("[N] labels from 0; −1 for static Gaussians. With a chosen count, some labels may be unused.")
     )
     colours: list[tuple[int, int, int]] = Field(
-        description="RGB, 0…255, of each label from 0 to the largest; the same label always has the same."
+        description="RGB 0…255 for each label from 0 to the largest. A label always has the same colour."
     )
 
 

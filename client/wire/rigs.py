@@ -17,13 +17,13 @@ class CameraModel(Model):
 
     name: CameraName
     intrinsics: Annotated[list[Row3], Field(min_length=3, max_length=3)] = Field(
-        description="[[fx,0,cx],[0,fy,cy],[0,0,1]] in pixels; the upper left corner of the picture is (0, 0)."
+        description="[[fx,0,cx],[0,fy,cy],[0,0,1]] in pixels; (0, 0) is the upper left corner of the picture."
     )
     world_to_camera: Annotated[list[Row4], Field(min_length=4, max_length=4)] = Field(
         description="X_cam = R X_world + t as [[R, t], [0, 1]], in the user's units."
     )
-    width: int = Field(ge=1, le=MAX_PIXELS_A_SIDE, description="Pixels.")
-    height: int = Field(ge=1, le=MAX_PIXELS_A_SIDE, description="Pixels.")
+    width: int = Field(ge=1, le=MAX_PIXELS_A_SIDE, description="Width of the pictures in pixels.")
+    height: int = Field(ge=1, le=MAX_PIXELS_A_SIDE, description="Height of the pictures in pixels.")
 
     @model_validator(mode="after")
     def _can_be(self) -> CameraModel:
@@ -53,7 +53,11 @@ class CameraModel(Model):
 class RigModel(Model):
     """The cameras of a scene."""
 
-    axes: Literal["opencv"] = Field(description="x right, y down, z forward. The only choice; named so nobody guesses.")
+    axes: Literal["opencv"] = Field(
+        description=(
+            "Camera axes: x right, y down, z forward. The only choice; it is named so that nobody has to guess."
+        )
+    )
     cameras: Annotated[list[CameraModel], Field(min_length=1, max_length=MAX_CAMERAS)]
 
     @model_validator(mode="after")

@@ -17,8 +17,12 @@ from scas4d_core.errors import InputError
 class Retention(Model):
     """Retention of data that comes frame by frame: all of it, the last N frames, or the newest bytes."""
 
-    last: int | None = Field(default=None, ge=0, description="Frames. Not together with `bytes`.")
-    bytes: int | None = Field(default=None, ge=0, description="At most so many. Not together with `last`.")
+    last: int | None = Field(
+        default=None, ge=0, description="Number of newest frames to keep. Not together with `bytes`."
+    )
+    bytes: int | None = Field(
+        default=None, ge=0, description="Maximum number of bytes to keep. Not together with `last`."
+    )
 
     @model_validator(mode="after")
     def _one_rule(self) -> Retention:
@@ -30,50 +34,62 @@ class Retention(Model):
 class StateBounds(Model):
     """The largest error that a state may have once it is in a compact file (docs/format.md)."""
 
-    position: float = Field(default=0.04, ge=1e-6, le=1, description="Of a centre, in the Gaussian's own size.")
-    axes: float = Field(default=0.055, ge=1e-6, le=1, description="Of its axes, in the same.")
-    rotation: float = Field(default=0.05, ge=0.002, le=1, description="Of its material rotation, radians.")
-    colour: float = Field(default=0.012, ge=1e-6, le=1, description="Of a channel, where colours are 0 to 1.")
-    gloss: float = Field(default=0.01, ge=1e-6, le=1, description="Of a component of its gloss.")
-    opacity: float = Field(default=0.0005, ge=1e-6, le=1, description="In files that are taken away; here it is exact.")
+    position: float = Field(
+        default=0.04, ge=1e-6, le=1, description="Error of the centre, relative to the Gaussian's size."
+    )
+    axes: float = Field(default=0.055, ge=1e-6, le=1, description="Error of its axes, relative to the Gaussian's size.")
+    rotation: float = Field(default=0.05, ge=0.002, le=1, description="Error of the material rotation, radians.")
+    colour: float = Field(default=0.012, ge=1e-6, le=1, description="Error per colour channel; colours are 0…1.")
+    gloss: float = Field(default=0.01, ge=1e-6, le=1, description="Error per gloss component.")
+    opacity: float = Field(
+        default=0.0005, ge=1e-6, le=1, description="Error of the opacity in downloaded files; stored states are exact."
+    )
 
 
 class IngestSettings(Model):
     """Rules of a scene for frames that are sent, and for what it keeps of them."""
 
     queue_frames: int | None = Field(
-        default=None, ge=1, le=10_000, description="Frames acknowledged and not finished; the service's where null."
+        default=None,
+        ge=1,
+        le=10_000,
+        description="Maximum number of acknowledged, unfinished frames; null: the service's default.",
     )
     when_full: Literal["refuse", "skip"] = Field(
         default="refuse",
-        description="refuse: 429 with Retry-After. skip: the new frame is taken, and those that wait are skipped.",
+        description="refuse: 429 with Retry-After. skip: accept the new frame and skip the waiting ones.",
     )
     minimum_cameras: int | None = Field(
         default=None,
         ge=1,
         le=MAX_CAMERAS,
-        description="A frame that has fewer pictures left fails; half of the rig's, rounded up, where null.",
+        description="A frame with fewer pictures fails; null: half of the rig's cameras, rounded up.",
     )
-    part_seconds: float | None = Field(
+    open_frame_seconds: float | None = Field(
         default=None,
         gt=0,
         le=86_400,
-        description="A frame that cameras send one by one is closed so long after its first; never where null.",
+        description=("Seconds after its first picture until a frame sent camera by camera is closed; null: never."),
     )
     keep_frames: Retention = Field(
-        default=Retention(last=32), description="Pictures as they came; those not yet committed are always kept."
+        default=Retention(last=32),
+        description=("Retention of the pictures. Pictures of frames that are not committed yet are always kept."),
     )
     keep_states: Retention = Field(
         default=Retention(),
-        description="Committed states; the first and the two newest are always kept. Those of a compact file, at most "
-        "120, go together.",
+        description=(
+            "Retention of committed states. The first and the two newest are always kept. States in "
+            "one compact file, at most 120, are deleted together."
+        ),
     )
     exact_states: int | None = Field(
         default=48,
         ge=24,
         le=1_000_000,
-        description="So many newest states stay exact; older ones go to compact files, within `state_bounds`, a "
-        "twentieth of the size. null: all stay exact.",
+        description=(
+            "Number of newest states that stay exact. Older ones move to compact files within "
+            "`state_bounds`, a twentieth of the size. null: all stay exact."
+        ),
     )
     state_bounds: StateBounds = StateBounds()
 
@@ -82,42 +98,44 @@ class SceneCreate(Model):
     """A new scene: the rig, and how to reconstruct what it sees."""
 
     rig: RigModel
-    name: str = Field(default="", max_length=200, description="For people; the service makes the id.")
+    name: str = Field(default="", max_length=200, description="Name for people; the service generates the id.")
     preset: str = Field(default="scas4d", max_length=64, description="Named settings to start from.")
     settings: dict[str, Any] = Field(
-        default_factory=dict, description='What differs from the preset, nested: {"update": {"iterations": 200}}.'
+        default_factory=dict, description='Differences from the preset, nested: {"update": {"iterations": 200}}.'
     )
     frames_per_second: float = Field(
         default=30.0,
         gt=0,
         le=10_000,
-        description="Frame n without a time of its own is taken at n / frames_per_second.",
+        description="Frame n has the time n / frames_per_second unless it is sent with one.",
     )
     ingest: IngestSettings = IngestSettings()
     nodes: Labels = Field(
         default_factory=dict,
-        description='On a cluster: its processes run only on nodes with all these labels, as {"rig": "stage-a"}.',
+        description=(
+            'On a cluster: run the scene\'s processes only on nodes with all these labels, such as {"rig": "stage-a"}.'
+        ),
     )
 
 
 class SceneEdit(Model):
     """Changes of a scene; what is left out or null stays as it is."""
 
-    name: str | None = Field(default=None, max_length=200, description="For people.")
+    name: str | None = Field(default=None, max_length=200, description="New name.")
     archived: bool | None = Field(
         default=None,
         strict=True,
-        description="true: it takes no further frames, and sleeps unless it is looked at; not while frames wait.",
+        description="true: accept no more frames, and sleep except when viewed. Refused while frames wait.",
     )
-    keep_frames: Retention | None = Field(default=None, description="As in `ingest`; holds at once.")
+    keep_frames: Retention | None = Field(default=None, description="As in `ingest`; takes effect at once.")
     keep_states: Retention | None = Field(
-        default=None, description="As in `ingest`; holds at once: states beyond it are deleted for good."
+        default=None, description="As in `ingest`; takes effect at once and deletes the other states for good."
     )
     exact_states: int | None = Field(
         default=None,
         ge=24,
         le=1_000_000,
-        description="As in `ingest`; older states go to compact files when the worker is idle, and stay there.",
+        description="As in `ingest`. The idle worker moves older states to compact files, where they stay.",
     )
 
     @model_validator(mode="after")
@@ -131,24 +149,26 @@ class ReconstructionRequest(Model):
     """Another beginning of a scene's reconstruction, from its first frame on, in place of the one before."""
 
     settings: dict[str, Any] = Field(
-        default_factory=dict, description="What changes of the scene's settings, nested, as when a scene is created."
+        default_factory=dict, description="Changes of the scene's settings, nested as on creation."
     )
     frame: int | None = Field(
         default=None,
         strict=True,
         ge=0,
         le=1_000_000_000,
-        description="The frame to begin with, here or still to come; null: as before. Earlier frames fail.",
+        description=(
+            "First frame of the new reconstruction, received or still to come; null: as before. Earlier frames fail."
+        ),
     )
     points: bool = Field(
         default=True,
         strict=True,
-        description="Begin from the scene's points, the newest that were sent; false: from the pictures alone.",
+        description="Start from the scene's newest points; false: from the pictures alone.",
     )
     discard: bool = Field(
         default=False,
         strict=True,
-        description="Drop committed states; must be true where a frame after the first is committed.",
+        description="Discard committed states; must be true if a frame after the first is committed.",
     )
 
 
@@ -169,13 +189,13 @@ class ProgressModel(Model):
 
     stage: str
     done: int
-    total: int = Field(
-        description="Steps of the stage; where the time of frame 0 is short, there may come to be fewer."
-    )
+    total: int = Field(description="Steps of the stage. A short time limit of frame 0 may reduce it.")
     detail: dict[str, float] = Field(
         default_factory=dict,
-        description="Figures by name: `loss`; `seconds_left`, predicted; `seconds_at_most`, what is left of the "
-        "setting `static.seconds`.",
+        description=(
+            "Figures by name: `loss`; `seconds_left`, predicted; `seconds_at_most`, the rest of the "
+            "setting `static.seconds`."
+        ),
     )
 
 
@@ -183,7 +203,7 @@ class EffectStatus(EffectModel):
     """The switch of one effect in a scene's status, with the words that describe the effect."""
 
     group: str = Field(description="motion, coherence, appearance, cameras or presence.")
-    description: str = Field(description="A sentence that says what it does.")
+    description: str = Field(description="A sentence that describes the effect.")
 
 
 class SceneStatus(Model):
@@ -192,63 +212,72 @@ class SceneStatus(Model):
     id: str
     name: str
     state: SceneState = Field(
-        description="What the scene does; `paused` and `degraded` hold beside. "
-        "awaiting_first_frame: nothing to do yet. initialising: frame 0 is being reconstructed. ready: "
-        "idle, the last frame was committed whole. updating: a later frame is being reconstructed. paused: it takes "
-        "frames and reconstructs none. degraded: the scene goes on, but its last frame lost a camera, was rejected or "
-        "failed, or its worker is being restarted; `error` says why. failed: it takes no more frames until its "
-        "reconstruction is begun anew (PUT …/reconstructions/{n})."
+        description=(
+            "awaiting_first_frame: nothing to do yet. initialising: frame 0 is being reconstructed. "
+            "ready: idle, and the last frame was committed whole. updating: a later frame is being "
+            "reconstructed. paused: accepts frames, and reconstructs none. degraded: continues, but "
+            "its last frame lost a camera, was rejected or failed, or its worker is restarting; see "
+            "`error`. failed: accepts no more frames until its reconstruction is restarted (PUT "
+            "…/reconstructions/{n}). `paused` and `degraded` also have fields of their own."
+        )
     )
     error: str | None = Field(default=None, description="Why the scene is failed or degraded.")
-    progress: ProgressModel | None = Field(default=None, description="While initialising.")
+    progress: ProgressModel | None = Field(default=None, description="Progress of frame 0, while initialising.")
     cameras: list[str]
     has_points: bool
-    next_frame: int = Field(description="The only index that PUT …/frames/{n} takes next.")
-    queued: int = Field(description="Frames acknowledged and not yet finished, the one at work among them.")
+    next_frame: int = Field(description="The only new index that PUT …/frames/{n} accepts.")
+    queued: int = Field(description="Acknowledged, unfinished frames, including the one being reconstructed.")
     queue_limit: int
-    committed: int = Field(description="How many frames can be rendered and tracked.")
+    committed: int = Field(description="Number of frames that can be rendered and tracked.")
     first_committed: int | None
     last_committed: int | None
     gaussians: int | None
-    reconstruction: int = Field(description="Number of its reconstruction: one more each time that it was begun anew.")
-    first_frame: int = Field(description="The reconstruction begins with this frame; earlier frames failed.")
-    paused: bool = Field(description="It begins no further frame, whatever `state` says: one may still be at work.")
+    reconstruction: int = Field(description="Number of the reconstruction, increased at each restart.")
+    first_frame: int = Field(description="First frame of the reconstruction; earlier frames failed.")
+    paused: bool = Field(description="No further frame is started, whatever `state` says; one may still be running.")
     asleep: bool = Field(
-        description="It was idle, has no processes and counts for nothing; it wakes by itself when it is asked or sent "
-        "something. What `state` says holds.",
+        description=(
+            "The scene is idle, without processes, and does not count towards the limit. Requests "
+            "wake it. `state` remains valid."
+        ),
     )
-    archived: bool = Field(description="It takes no frames until that is taken back; all it has can be looked at.")
+    archived: bool = Field(
+        description="The scene accepts no frames until it is unarchived. Everything can still be viewed."
+    )
     degraded: bool = Field(
-        description="Whatever `state` says: the last frame lost a camera, was rejected, was fitted only in part or "
-        "failed; the worker is being restarted, the disk is full, or damage on it was found and is being "
-        "repaired. `error` says which.",
+        description=(
+            "The last frame lost a camera, was rejected, was fitted only in part or failed; the "
+            "worker is restarting, the disk is full, or damaged files are being repaired. `error` has "
+            "the reason. Independent of `state`."
+        ),
     )
-    open_frames: list[int] = Field(description="Frames not closed yet, whose cameras send one by one.")
-    failed: int = Field(description="Frames that were taken and could not be reconstructed.")
-    missing: int = Field(description="Frames that were declared missing.")
-    skipped: int = Field(description="Frames that were skipped because the queue was full.")
-    worker_deaths: int = Field(description="Since the scene woke or its reconstruction began.")
+    open_frames: list[int] = Field(description="Frames whose cameras are still sending.")
+    failed: int = Field(description="Frames that could not be reconstructed.")
+    missing: int = Field(description="Frames declared missing.")
+    skipped: int = Field(description="Frames skipped because the queue was full.")
+    worker_deaths: int = Field(description="Deaths of the worker since the scene woke or its reconstruction started.")
     frames_kept: int = Field(description="Frames whose pictures are in the frame log.")
-    frame_bytes: int = Field(description="Of the frame log on disk.")
-    states_deleted: int = Field(description="Committed states that retention has deleted.")
+    frame_bytes: int = Field(description="Size of the frame log on disk.")
+    states_deleted: int = Field(description="Number of committed states that retention has deleted.")
     effects: dict[str, EffectStatus] = Field(
-        description="The effects (docs/effects.md) for the next update, with their evidence."
+        description="Effects (docs/effects.md) of the next update, with their evidence."
     )
     damage: list[str] = Field(
-        description="What was found damaged on disk, and what came of it, a sentence each: at the start of the service "
-        "and since. The newest 100.",
+        description="Damage found on disk and its outcome, one sentence each; the newest 100.",
     )
     warnings: list[str] = Field(
-        description="What looks wrong and may be right, a sentence each: poses that seem to be the wrong way round; "
-        "after frame 0, cameras that its pictures show to be off, what came of refining them, first points that "
-        "no camera confirms, or that cover little of the pictures, what its time was too short for, and grey cameras "
-        "beside colour ones; and cameras that motion shows to be out of step.",
+        description=(
+            "Likely mistakes, one sentence each: poses that seem inverted, cameras that disagree with "
+            "their calibration, the outcome of refinement, first points that no camera confirms or "
+            "that cover little of the pictures, stages of frame 0 that were cut short, grey cameras "
+            "among colour ones, and cameras that are out of step."
+        ),
     )
-    created: str = Field(description="UTC, ISO 8601.")
+    created: str = Field(description="Creation time, UTC, ISO 8601.")
     ingest: IngestSettings
     nodes: dict[str, str] = Field(description="On a cluster: labels of the nodes on which its processes may run.")
     settings: dict[str, Any]
-    budget: Budget = Field(description="As it was put last; nulls: as `settings` say.")
+    budget: Budget = Field(description="The budget as last set; null fields take `settings`.")
 
 
 class SceneList(Model):
@@ -262,4 +291,4 @@ class PointsReceipt(Model):
 
     points: int
     sha256: str
-    reconstruction: int = Field(description="The number of the reconstruction that begins from them.")
+    reconstruction: int = Field(description="Number of the reconstruction that starts from the points.")

@@ -16,10 +16,10 @@ class Health(Model):
     version: str
     scenes: int
     ready_after: float | None = Field(
-        default=None, description="Seconds from the start of the service until its kernels were warmed up."
+        default=None, description="Seconds from the start of the service until its kernels were compiled."
     )
     ingest_ready: bool | None = Field(
-        default=None, description="The disk has room for frames; null where that was not looked at."
+        default=None, description="The disk has room for frames; null if it was not checked."
     )
 
 
@@ -27,8 +27,8 @@ class Ticket(Model):
     """Opens one WebSocket from a browser, which cannot send a bearer token with it."""
 
     ticket: str
-    subprotocol: str = Field(description="To offer in Sec-WebSocket-Protocol, beside that of the stream.")
-    seconds: float = Field(description="It lives so long.")
+    subprotocol: str = Field(description="Offer it in Sec-WebSocket-Protocol, in addition to the stream's protocol.")
+    seconds: float = Field(description="Lifetime of the ticket.")
 
 
 class ProblemDetails(BaseModel):
@@ -48,8 +48,12 @@ class ProblemDetails(BaseModel):
 class ShareRequest(Model):
     """A token that may only read."""
 
-    scene: str | None = Field(default=None, max_length=64, description="The only one that it shows; all where null.")
-    seconds: int = Field(default=7 * 86_400, ge=1, le=316_224_000, description="So long it holds; a week.")
+    scene: str | None = Field(
+        default=None, max_length=64, description="The only scene that the token can read; null: all scenes."
+    )
+    seconds: int = Field(
+        default=7 * 86_400, ge=1, le=316_224_000, description="Lifetime of the token; by default a week."
+    )
 
 
 class Share(Model):
@@ -57,8 +61,10 @@ class Share(Model):
 
     token: str = Field(description="For `Authorization: Bearer`.")
     scene: str | None
-    ends: str = Field(description="UTC, ISO 8601.")
-    address: str = Field(description="Behind the address of the service. What follows # is sent to no server.")
+    ends: str = Field(description="End of its validity, UTC, ISO 8601.")
+    address: str = Field(
+        description=("Address of the page, relative to the service. The part after # is never sent to a server.")
+    )
 
 
 class Node(Model):
@@ -66,23 +72,29 @@ class Node(Model):
 
     id: str
     host: str
-    labels: dict[str, str] = Field(default_factory=dict, description="Those it was started with; none of Ray's own.")
+    labels: dict[str, str] = Field(
+        default_factory=dict, description="Labels given when the node started, without Ray's own."
+    )
     alive: bool
     cpus: float
-    cpus_taken: float = Field(description="By processes of all services that answer, as estimated.")
+    cpus_reserved: float = Field(
+        description="CPUs reserved by the processes of all services that respond, by estimate."
+    )
     gpus: float
     memory_mb: float
-    memory_taken_mb: float
-    scenes: list[str] = Field(description="Those whose worker is here.")
+    memory_reserved_mb: float
+    scenes: list[str] = Field(description="Scenes whose worker runs here.")
 
 
-class Waiting(Model):
+class WaitingProcess(Model):
     """A process that no node has room for."""
 
     scene: str
     role: str
     needs: str
-    seconds: float = Field(default=0.0, description="So long it has waited; to start takes a few without waiting.")
+    seconds: float = Field(
+        default=0.0, description="Seconds that it has waited. A start without waiting takes a few seconds."
+    )
 
 
 class Cluster(Model):
@@ -90,7 +102,7 @@ class Cluster(Model):
 
     placement: Literal["local", "ray"]
     nodes: list[Node]
-    waiting: list[Waiting]
-    answers: bool = Field(
-        default=True, description="The head of the cluster answers; else the nodes are those of its last answer."
+    waiting: list[WaitingProcess]
+    head_responds: bool = Field(
+        default=True, description="The head of the cluster responds; otherwise the nodes are from its last answer."
     )

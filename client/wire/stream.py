@@ -32,10 +32,12 @@ SCENE_RESTARTS = 1012
 TOO_BIG = 1009
 """Close code: a message larger than `StreamLimits.message_bytes`."""
 
-SubscriptionId = Annotated[str, Field(min_length=1, max_length=64, description="Chosen by the client.")]
+SubscriptionId = Annotated[
+    str, Field(min_length=1, max_length=64, description="Name of the subscription, chosen by the client.")
+]
 Tag = Annotated[
     int | None,
-    Field(default=None, ge=0, le=2**53 - 1, description="Comes back with what was sent for this request."),
+    Field(default=None, ge=0, le=2**53 - 1, description="Returned with every message for this request."),
 ]
 
 
@@ -56,12 +58,14 @@ class NoRequest(Model):
 class PartsSubscription(Model):
     """Labels again and again."""
 
-    count: int | None = Field(default=None, ge=1, le=254, description="How many; chosen by a rule if not given.")
+    count: int | None = Field(
+        default=None, ge=1, le=254, description="Number of parts; by default chosen automatically."
+    )
     every: int = Field(
         default=1,
         ge=1,
         le=1_000_000,
-        description="Frames from one to the next: finding parts takes the reader a while.",
+        description="Frames between two messages. Finding the parts keeps the reader busy for a while.",
     )
 
 
@@ -114,10 +118,10 @@ CLIENT_MESSAGE: TypeAdapter[Subscribe | Update | Unsubscribe] = TypeAdapter(Clie
 class StreamLimits(Model):
     """Limits of the service for one client."""
 
-    subscriptions: int = Field(description="At a time.")
-    message_bytes: int = Field(description="Of one message of the client.")
-    render_pixels: int = Field(description="Of one view.")
-    track_points: int = Field(description="Points times frames of one tracks message.")
+    subscriptions: int = Field(description="Maximum number of subscriptions.")
+    message_bytes: int = Field(description="Maximum size of a client's message.")
+    render_pixels: int = Field(description="Maximum pixels per view.")
+    track_points: int = Field(description="Maximum points × frames per tracks message.")
 
 
 class Hello(Model):
@@ -157,7 +161,7 @@ class SceneMessage(Model):
 
     type: Literal["scene"] = "scene"
     id: SubscriptionId
-    missed: int = Field(description="Changes that this one took the place of, unsent.")
+    missed: int = Field(description="Number of unsent status changes that this message replaces.")
     status: SceneStatus
 
 
@@ -166,7 +170,7 @@ class FrameMessage(Model):
 
     type: Literal["frame"] = "frame"
     id: SubscriptionId
-    missed: int = Field(description="Finished frames that this one took the place of, unsent.")
+    missed: int = Field(description="Number of unsent frame reports that this message replaces.")
     report: FrameReportModel
 
 
@@ -189,18 +193,20 @@ SERVER_MESSAGE: TypeAdapter[
 # From the service, as the head of a binary message.
 
 
-class BulkHead(Model):
+class BinaryHead(Model):
     """FileHeader of a binary message: describes the bytes after it."""
 
     type: Literal["render", "tracks", "parts"]
     id: SubscriptionId
     tag: Tag = None
-    missed: int = Field(description="Frames and camera positions that this one took the place of.")
-    frame: int = Field(description="Of the render; the newest frame of the tracks; the newest that the parts know.")
-    first: int | None = Field(default=None, description="Of tracks: the first frame; earlier ones were sent before.")
-    media_type: str = Field(description="Of the bytes: as the same request over HTTP answers.")
+    missed: int = Field(description="Number of unsent messages that this one replaces: frames and camera positions.")
+    frame: int = Field(description="Frame of the render, last frame of the tracks, or newest frame of the parts.")
+    first: int | None = Field(
+        default=None, description="Tracks only: first frame in the message; earlier ones were sent before."
+    )
+    media_type: str = Field(description="Media type of the body, as for the same request over HTTP.")
     headers: dict[str, str] = Field(
-        default_factory=dict, description="Those of the HTTP answer, lower case: x-depth-near …"
+        default_factory=dict, description="Headers of the HTTP answer, in lower case: x-depth-near …"
     )
 
 
@@ -210,7 +216,7 @@ def pack(head: Model, body: bytes) -> bytes:
     return b"".join((_PREFIX.pack(MAGIC, len(text)), text, body))
 
 
-def unpack(message: bytes) -> tuple[BulkHead, bytes]:
+def unpack(message: bytes) -> tuple[BinaryHead, bytes]:
     """FileHeader and body of a binary message.
 
     Raises:
@@ -221,5 +227,5 @@ def unpack(message: bytes) -> tuple[BulkHead, bytes]:
     magic, length = _PREFIX.unpack_from(message)
     if magic != MAGIC or _PREFIX.size + length > len(message):
         raise ValueError(f"a binary message begins with {magic!r} and a head of {length} of its {len(message)} bytes")
-    head = BulkHead.model_validate_json(message[_PREFIX.size : _PREFIX.size + length])
+    head = BinaryHead.model_validate_json(message[_PREFIX.size : _PREFIX.size + length])
     return head, message[_PREFIX.size + length :]

@@ -16,17 +16,23 @@ from client.wire.rigs import CameraModel
 class TracksRequest(Model):
     """Trajectories of what exactly one of ids, pixels and points names."""
 
-    ids: Annotated[list[int], Field(min_length=1)] | None = Field(default=None, description="Of Gaussians.")
+    ids: Annotated[list[int], Field(min_length=1)] | None = Field(default=None, description="Ids of Gaussians.")
     pixels: Annotated[list[Pixel], Field(min_length=1)] | None = Field(
         default=None, description="u v in the picture of `camera`; (0.5, 0.5) is the centre of the first pixel."
     )
-    camera: CameraModel | str | None = Field(default=None, description="Where the pixels are: any, or one of the rig.")
+    camera: CameraModel | str | None = Field(
+        default=None, description="Camera of the pixels: any camera, or the name of one in the rig."
+    )
     points: Annotated[list[Row3], Field(min_length=1)] | None = Field(
         default=None, description="x y z in the rig's world and units."
     )
-    at: int | None = Field(default=None, ge=0, description="Frame of the pixels or points; the first committed.")
-    first: int | None = Field(default=None, ge=0, description="First frame; the first committed.")
-    last: int | None = Field(default=None, ge=0, description="Last frame, included; the last committed.")
+    at: int | None = Field(
+        default=None, ge=0, description="Frame of the pixels or points; default: the first committed frame."
+    )
+    first: int | None = Field(default=None, ge=0, description="First frame; default: the first committed frame.")
+    last: int | None = Field(
+        default=None, ge=0, description="Last frame, inclusive; default: the last committed frame."
+    )
     project: list[CameraModel | str] = Field(
         default_factory=list, max_length=64, description="Cameras to project into, with visibility."
     )
@@ -36,22 +42,23 @@ class TracksRequest(Model):
 class TracksModel(Model):
     """Trajectories of Q points over T frames, in the rig's world and units."""
 
-    frames: list[int] = Field(description="[T] indices.")
+    frames: list[int] = Field(description="[T] indices of frames.")
     times: list[float] = Field(description="[T] seconds.")
-    ids: list[int] = Field(description="[Q] the Gaussian that carries the point; −1 where the query met nothing.")
+    ids: list[int] = Field(description="[Q] the Gaussian that carries the point; −1 if the query met nothing.")
     confidence: list[list[float]] = Field(
-        description="[Q][T] 0…1: how much the Gaussians that carry the point agree in that frame; docs/tracks.md. 0 "
-        "where there is no position."
+        description=(
+            "[Q][T] 0…1: how well the Gaussians that carry the point agree in that frame; "
+            "docs/tracks.md. 0 without a position."
+        )
     )
     positions: list[list[list[float] | None]] = Field(
-        description="[Q][T] x y z; null where there is none: the query met nothing, or what carries it is not there, "
-        "not born yet or retired."
+        description="[Q][T] x y z; null if the query met nothing, or its Gaussian is not born yet or retired."
     )
     visible: dict[str, list[list[bool]]] = Field(
-        default_factory=dict, description="By camera asked for, [Q][T]: in the picture and nothing in front."
+        default_factory=dict, description="[Q][T] per requested camera: inside the picture with nothing in front."
     )
     pixels: dict[str, list[list[list[float] | None]]] = Field(
-        default_factory=dict, description="By camera asked for, [Q][T] u v; null behind the camera."
+        default_factory=dict, description="[Q][T] u v per requested camera; null behind the camera."
     )
 
 
@@ -59,15 +66,15 @@ class GaussianModel(Model):
     """The life of one Gaussian. It is there from its birth and from each revival on, until it is retired."""
 
     id: int
-    born: int = Field(description="Frame; the first one, for those that the scene began with.")
-    retired: list[int] = Field(description="Frames from which on it was not there.")
-    revived: list[int] = Field(description="Frames in which it came back.")
+    born: int = Field(description="Frame of birth; the first frame for the initial Gaussians.")
+    retired: list[int] = Field(description="Frames in which it was retired.")
+    revived: list[int] = Field(description="Frames in which it was revived.")
 
 
 class GaussiansModel(Model):
     """The lives of Gaussians, in the order asked for."""
 
-    frame: int = Field(description="The newest committed frame, up to which the lives are known.")
+    frame: int = Field(description="The newest committed frame.")
     gaussians: list[GaussianModel]
 
 

@@ -26,27 +26,34 @@ class TradeoffPoint(Model):
     """Milliseconds, error and PSNR of a frame with so many iterations."""
 
     kind: PointKind = Field(
-        description="measured: frames that the scene committed. replayed: frames of the scene, updated again in the "
-        "background with another number of iterations. extrapolated: by `model`, from what was measured."
+        description=(
+            "measured: on frames that the scene committed. replayed: on frames updated again in the "
+            "background with another number of iterations. extrapolated: computed by `model` from the "
+            "measured points."
+        )
     )
-    iterations: int = Field(description="A frame. Measured: what frames ran, to two significant digits.")
-    milliseconds: float = Field(description="A frame from decoding to the end of the commit; the median.")
+    iterations: int = Field(description="Iterations per frame. Measured points round to two significant digits.")
+    milliseconds: float = Field(description="Median milliseconds per frame, from decoding to the end of the commit.")
     error: float | None = Field(
-        description="Mean image loss of the probe views, at most four training views, of the committed state; null "
-        "where not measured. What is extrapolated has none."
+        description=(
+            "Mean image loss of the committed state on the probe views (at most four training views); "
+            "null if not measured or extrapolated."
+        )
     )
-    psnr: float | None = Field(description="dB, of training views as they were last rendered; null as `error`.")
-    frames: int = Field(description="That went into it; 0 for what is extrapolated.")
-    threads: int | None = Field(description="That the update ran on; compare times of equal ones.")
+    psnr: float | None = Field(
+        description="PSNR in dB on the training views as last rendered; null if not measured or extrapolated."
+    )
+    frames: int = Field(description="Number of frames measured; 0 for extrapolated points.")
+    threads: int | None = Field(description="Threads of the update. Compare times only for equal numbers.")
 
 
 class CurveMean(Model):
     """Mean progress of updates after so many of their iterations."""
 
-    planned: int = Field(description="Iterations in all.")
+    planned: int = Field(description="Total iterations of the update.")
     iterations: int
-    milliseconds: float = Field(description="Since the update began, after decoding; the median.")
-    loss: float = Field(description="Training loss of the iterations since the point before; the mean.")
+    milliseconds: float = Field(description="Median milliseconds since the update started, after decoding.")
+    loss: float = Field(description="Mean training loss of the iterations since the previous point.")
     frames: int
 
 
@@ -55,7 +62,7 @@ class TimeModel(Model):
 
     fixed: float
     per_iteration: float
-    frames: int = Field(description="That it was taken from.")
+    frames: int = Field(description="Number of frames used for the fit.")
 
 
 class ReplayState(StrEnum):
@@ -71,23 +78,25 @@ class ReplayStatus(Model):
     """The replay that was asked for last; it and its points are kept in memory, until the service ends."""
 
     state: ReplayState = ReplayState.NONE
-    iterations: list[int] = Field(default_factory=list, description="Its budgets; the scene's own is the first.")
-    frames: list[int] = Field(default_factory=list, description="That count.")
-    warm_up: int | None = Field(default=None, description="The frame before them: it starts cold, and is not counted.")
+    iterations: list[int] = Field(
+        default_factory=list, description="Numbers of iterations to measure; the scene's own comes first."
+    )
+    frames: list[int] = Field(default_factory=list, description="Number of frames that count.")
+    warm_up: int | None = Field(default=None, description="The frame before them, which warms up and does not count.")
     threads: int | None = None
-    done: int = Field(default=0, description="Updates that are over.")
+    done: int = Field(default=0, description="Number of finished updates.")
     total: int = 0
-    error: str | None = Field(default=None, description="Why it failed.")
+    error: str | None = Field(default=None, description="Why the replay failed.")
 
 
 class TradeoffModel(Model):
     """Accuracy against time, for this scene on this machine."""
 
     scene: str
-    points: list[TradeoffPoint] = Field(description="By kind, then by iterations.")
-    curve: list[CurveMean] = Field(description="Within updates, of the budgets that were measured.")
+    points: list[TradeoffPoint] = Field(description="Points by kind, then by iterations.")
+    curve: list[CurveMean] = Field(description="Mean progress within updates, for each measured budget.")
     model: TimeModel | None = Field(description="Null until an update was measured.")
-    budget: EffectiveBudget = Field(description="What frames that are not begun get.")
+    budget: EffectiveBudget = Field(description="The budget that applies to frames that have not started.")
     replay: ReplayStatus
 
 
@@ -95,12 +104,15 @@ class ReplayRequest(Model):
     """A request to measure budgets."""
 
     iterations: Annotated[list[Iterations], Field(min_length=1, max_length=MOST_BUDGETS)] = Field(
-        default=[25, 50, 200], description="A frame, each a replay. The scene's own number is always measured too."
+        default=[25, 50, 200],
+        description="Iterations per frame, one replay each. The scene's own number is always measured too.",
     )
     frames: int = Field(
         default=4,
         strict=True,
         ge=1,
         le=MOST_REPLAYED,
-        description="The newest so many; one more before them warms up. Their pictures must still be held.",
+        description=(
+            "Number of newest frames; one more before them warms up. The frame log must still have their pictures."
+        ),
     )

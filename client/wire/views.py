@@ -36,27 +36,34 @@ Unit = Annotated[float, Field(ge=0, le=1)]
 class RenderRequest(Model):
     """A novel view."""
 
-    camera: CameraModel | str = Field(description="Any camera in the rig's world, or the name of one of the rig.")
-    frame: int | None = Field(default=None, ge=0, description="Index of a committed frame; the last where not given.")
+    camera: CameraModel | str = Field(description="Any camera in the rig's world, or the name of a camera of the rig.")
+    frame: int | None = Field(default=None, ge=0, description="Index of a committed frame; by default the last one.")
     kinds: Annotated[list[RenderKind], Field(min_length=1, max_length=4)] = Field(
         default_factory=lambda: [RenderKind.COLOUR],
-        description="A picture holds one, npz and float32 several. Depth is along z in the rig's units, NaN where "
-        "nothing is; as PNG it is 16 bit, 0 where nothing is, else 1…65535 from X-Depth-Near to X-Depth-Far. Parts are "
-        "0 where nothing moves, else 1 + the part's label; as PNG they have a palette, a colour for each label.",
+        description=(
+            "A picture has one kind; npz and float32 may have several. Depth is along z in the rig's "
+            "units, NaN where nothing is visible; as PNG it has 16 bits: 0 for nothing, 1…65535 from "
+            "X-Depth-Near to X-Depth-Far. Parts are 0 for static Gaussians, else 1 + label; as PNG "
+            "they have a palette."
+        ),
     )
     format: RenderFormat = Field(
         default=RenderFormat.PNG,
-        description="JPEG and WebP take colour and alpha. float32: rows from the top, little-endian, X-Shape is "
-        "'height,width,channels' and X-Channels names the channels.",
+        description=(
+            "JPEG and WebP support colour and alpha. float32: rows from the top, little-endian; "
+            "X-Shape is 'height,width,channels' and X-Channels names the channels."
+        ),
     )
     width: int | None = Field(
         default=None,
         ge=1,
         le=MAX_PIXELS_A_SIDE,
-        description="Of the picture; the camera is scaled to it, the height in proportion.",
+        description="Width of the picture; the camera is scaled to it, and the height in proportion.",
     )
-    quality: int | None = Field(default=None, ge=1, le=100, description="Of JPEG and WebP; 92 where not given.")
-    background: tuple[Unit, Unit, Unit] | None = Field(default=None, description="RGB; the scene's where not given.")
+    quality: int | None = Field(default=None, ge=1, le=100, description="Quality of JPEG and WebP; by default 92.")
+    background: tuple[Unit, Unit, Unit] | None = Field(
+        default=None, description="RGB; by default the scene's background."
+    )
     parts: int | None = Field(
-        default=None, ge=1, le=254, description="Number of parts; chosen by the scene where not given."
+        default=None, ge=1, le=254, description="Number of parts; by default chosen by the scene."
     )

@@ -154,7 +154,7 @@ def _sizes(path: Path, key: str, value: Any, cameras: int) -> list[int]:
     if not isinstance(value, list):
         return [_parse_pixels(path, key, value)] * cameras
     if len(value) != cameras:
-        raise CaptureError(f"{path}: {key} lists {len(value)} sizes and cam_id {cameras} cameras; give one a camera")
+        raise CaptureError(f"{path}: {key} lists {len(value)} sizes and cam_id {cameras} cameras; give one per camera")
     return [_parse_pixels(path, f"{key}[{number}]", one) for number, one in enumerate(value)]
 
 
@@ -176,8 +176,8 @@ def _camera_names(path: Path, cam_id: Any) -> list[str]:
     for name in names:
         if not re.fullmatch(CAMERA_NAME, name):
             raise CaptureError(
-                f"{path}: cam_id {name!r} is no name: files are named after it; give a number, or letters, digits, "
-                "dots, dashes and underscores, at most 64"
+                f"{path}: cam_id {name!r} is not a valid name: files are named after it; give a number, or letters, "
+                "digits, dots, dashes and underscores, at most 64"
             )
     return names
 

@@ -43,5 +43,5 @@ def read_npz(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
     except KeyError as fault:
         raise CaptureError(f"{path}: has no array {fault}; needed: {', '.join(keys)}") from fault
     except Exception as fault:  # zipfile, zlib and numpy each raise their own on a damaged file
-        raise CaptureError(f"{path}: is no npz file without pickle ({type(fault).__name__}: {fault})") from fault
+        raise CaptureError(f"{path}: is not an npz file without pickle ({type(fault).__name__}: {fault})") from fault
     return arrays

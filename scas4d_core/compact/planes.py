@@ -116,7 +116,7 @@ def decompress(data: bytes | memoryview, size: int) -> bytes:
             raise PlaneError(f"{zstandard.frame_content_size(data)} bytes where {size} belong")
         content: bytes = zstandard.ZstdDecompressor().decompress(data, max_output_size=size)
     except zstandard.ZstdError as error:
-        raise PlaneError(f"no zstandard frame ({error})") from None
+        raise PlaneError(f"not a zstandard frame ({error})") from None
     if len(content) != size:
         raise PlaneError(f"{len(content)} bytes where {size} belong")
     return content

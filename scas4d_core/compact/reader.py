@@ -60,7 +60,7 @@ class CompactReader:
 
     >>> CompactReader("README.md")
     Traceback (most recent call last):
-    scas4d_core.compact.records.FileError: README.md: no compact 4D file: it does not begin with b's4dR'
+    scas4d_core.compact.records.FileError: README.md: not a compact 4D file: it does not begin with b's4dR'
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -80,7 +80,7 @@ class CompactReader:
         self._last: tuple[int, Columns] | None = None
         try:
             if (begin := self._file.read(len(MAGIC))) != MAGIC[: len(begin)] or not begin:
-                raise FileError(f"{self.path.name}: no compact 4D file: it does not begin with {MAGIC!r}")
+                raise FileError(f"{self.path.name}: not a compact 4D file: it does not begin with {MAGIC!r}")
             parts = read_index(self._file, self.path.name)
             if parts is not None:
                 records, self.about = parts

@@ -184,7 +184,7 @@ def note_bytes(note: Mapping[str, Any]) -> bytes:
         note: JSON values.
 
     Raises:
-        ValueError: it is no JSON, or longer than 16 MB.
+        ValueError: it is not valid JSON, or longer than 16 MB.
 
     >>> read_note(note_bytes({"psnr": 36.5}))
     {'psnr': 36.5}
@@ -207,7 +207,7 @@ def read_note(body: bytes) -> dict[str, Any]:
     try:
         note = json.loads(decompress(body[COUNT_BYTES:], size))
     except (ValueError, RecursionError) as error:
-        raise PlaneError(f"the note is no JSON ({error})") from None
+        raise PlaneError(f"the note is not valid JSON ({error})") from None
     if not isinstance(note, dict):
-        raise PlaneError("the note is no JSON object")
+        raise PlaneError("the note is not a JSON object")
     return note

@@ -148,7 +148,7 @@ def read_exact(body: bytes, offset: int, most: int, width: int) -> tuple[NDArray
 
 
 def _read_kind(body: bytes, offset: int) -> tuple[int, int]:
-    """The first byte of a section, and where the next is."""
+    """The first byte of a section, and where the next frame is."""
     if offset >= len(body):
         raise PlaneError(f"the data end at byte {len(body)}, before a section")
     kind = body[offset]

@@ -71,7 +71,7 @@ class CompactWriter:
     ) -> None:
         if key_every < 1:
             raise FileError(f"key_every is {key_every}; give 1 or more")
-        text = head.text()  # a head that is no JSON leaves no file
+        text = head.text()  # a head that is not valid JSON leaves no file
         self.path = Path(path)
         self.head = head
         self.errors: dict[str, float] = {}
@@ -100,9 +100,9 @@ class CompactWriter:
         """
         with CompactReader(path) as reader:
             if reader.is_closed:
-                raise FileError(f"{reader.path.name}: it is whole, with its index; begin another file")
+                raise FileError(f"{reader.path.name}: it is complete, with its index; start another file")
             if reader.damage is not None or not reader.frames:
-                raise FileError(f"{reader.path.name}: it cannot be gone on with ({reader.damage or 'it has no state'})")
+                raise FileError(f"{reader.path.name}: it cannot be continued ({reader.damage or 'it has no state'})")
             last = reader.encoder_state()
             known = [reader.note(index).get(ERRORS, {}) for index in reader.frames]
         writer = cls.__new__(cls)
@@ -139,7 +139,7 @@ class CompactWriter:
             note: JSON values about the frame, written before its state, with its ``errors``.
 
         Raises:
-            FileError: the frame cannot follow those before. ValueError: the note is no JSON.
+            FileError: the frame cannot follow those before. ValueError: the note is not valid JSON.
         """
         self._check(index, state)
         note_bytes(note or {})
@@ -211,7 +211,7 @@ class CompactWriter:
             wrong = np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))
             raise FileError(
                 f"{name}: frame {index}: {len(wrong)} Gaussians have {field} that are not finite, rows "
-                f"{wrong[:5].tolist()}; leave the frame out, or mend them"
+                f"{wrong[:5].tolist()}; leave the frame out, or repair them"
             )
 
     def close(self) -> None:

@@ -1,5 +1,5 @@
 """Effects: the named parts of an update, one file each.
 
-``scas4d_core.effect_names`` lists them, ``effect`` has their interface, ``switches`` decides which are on, and
-``scas4d_core.update.parts`` puts these together for the loop of an update, which knows none by name.
+``scas4d_core.effect_names`` lists them, ``effect`` defines their interface, and ``switches`` decides which are on.
+``scas4d_core.update.parts`` combines the active effects for the update loop, which is independent of any single effect.
 """

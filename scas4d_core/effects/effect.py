@@ -1,6 +1,6 @@
-"""The interface of an effect: its words for users, the part that it puts into an update, the evidence for it.
+"""The interface of an effect: its texts for users, its part of an update, and the evidence for it.
 
-Modules of effects load neither Numba nor torch when they are imported: settings are checked with them.
+Effect modules must not import Numba or torch at import time, because settings are validated with them.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class EffectGroup(StrEnum):
-    """The kinds of effects."""
+    """The groups of effects."""
 
     MOTION = "motion"
     COHERENCE = "coherence"
@@ -33,19 +33,19 @@ class EffectGroup(StrEnum):
 
 @dataclass(frozen=True)
 class Effect:
-    """An effect; its module has one instance, called ``EFFECT``.
+    """An effect; its module has one instance named ``EFFECT``.
 
     Attributes:
-        name: as in ``effect_names.EFFECTS``. group: of the effects that it stands beside.
-        description: a sentence for users. disambiguation: that which fixes it against the effects that could explain
-            the same pixels.
-        cost: of an update with it, against one without.
-        auto: whether it waits for evidence; else it is on wherever it is not refused.
-        on_above, off_below: share of ``Evidence`` from which it is switched on, and below which it is switched off.
-        without_masks: whether it is anything in a scene whose first frame has no masks.
-        committed_arrays: names of its arrays in ``Attempt.carried`` that are committed with each frame: a cold start,
-            without a
-            checkpoint, has these, and those of ``first_frame_arrays``. They are small.
+        name: key in ``effect_names.EFFECTS``. group: group of related effects.
+        description: a sentence for users. disambiguation: what separates it from other effects that could explain the
+            same pixels.
+        cost: of an update with the effect, compared with one without.
+        auto: whether the effect needs evidence; otherwise it is on unless it is refused.
+        on_above, off_below: values of ``Evidence.share`` at or above which it is switched on, and below which it is
+            switched off.
+        without_masks: whether the effect can be on in a scene whose first frame has no masks.
+        committed_arrays: names of its arrays in ``Attempt.carried`` that are committed with each frame. A cold start
+            without a checkpoint has these and those of ``first_frame_arrays``. They should be small.
     """
 
     name: str
@@ -60,48 +60,49 @@ class Effect:
     committed_arrays: tuple[str, ...] = ()
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Fault and remedy where it cannot be on under these settings; None: it can."""
+        """Returns fault and remedy if the effect cannot be on with these settings; None if it can."""
         return None
 
     def first_frame_arrays(self, seen: FrameObservation) -> Arrays | None:
-        """Arrays of frame 0 that evidence or part look back to; None: none. Not asked where it is pinned off."""
+        """Returns arrays of frame 0 for the evidence or the part, or None. Not called if the effect is pinned off."""
         return None
 
     def requirement(self, settings: Settings) -> tuple[str, str] | None:
-        """Fault and remedy where these settings pin it off and nothing else does its work; None: it can be off."""
+        """Returns fault and remedy if the effect cannot be off with these settings; None if it can."""
         return None
 
     def on_at_first(self, seen: FrameObservation) -> bool:
-        """True where it is on after the first frame until it is idle; it keeps arrays of that frame."""
+        """Returns true if the effect is on after the first frame until idle; it must keep arrays of that frame."""
         return False
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """The evidence of a frame that calls for it; None: the frame says nothing, and the switch stays."""
+        """Returns the evidence in a frame; None if the frame gives none, in which case the switch is unchanged."""
         return None
 
     def record(self, seen: FrameObservation, on: bool) -> Arrays | None:
-        """Its arrays for the frames after, beside what its part leaves; None: those that it has stay.
+        """Returns arrays for later frames in addition to those of its part; None keeps the existing arrays.
 
-        Called after each frame that was learnt, before evidence is taken, and also where it is off and not pinned so.
+        Called after each learnt frame, before the evidence is computed. Also called while the effect is off, unless it
+        is pinned off.
 
         Args:
-            on: whether it took part in the frame.
+            on: whether the effect took part in the frame.
         """
         return None
 
     def add_and_retire_gaussians(self, seen: FrameObservation) -> UpdateResult:
-        """The result of a frame with the Gaussians that are born, retired or revived in it.
+        """Returns the result of a frame with Gaussians added, retired or revived.
 
-        Called where it is on, after each frame that was learnt and before its commit; nowhere else may rows change.
-        Rows stay where they are: ``replace(seen.result, gaussians=..., parents=..., carried=...)``, the Gaussians made
-        by ``Gaussians.concatenate``, ``retire`` and ``revive``. ``parents`` has those of effects before, too. Arrays in
-        ``carried`` with a row for each Gaussian are lengthened afterwards: the born have the rows of their parents,
-        or zeros.
+        Called while the effect is on, after each learnt frame and before its commit. Rows may change nowhere else.
+        Existing rows keep their order: return ``replace(seen.result, gaussians=..., parents=..., carried=...)`` with
+        Gaussians from ``Gaussians.concatenate``, ``retire`` and ``revive``. ``parents`` includes those of previous
+        effects. Arrays in ``carried`` with a row per Gaussian are extended afterwards: new rows are copies of the
+        parents' rows, or zeros.
         """
         return seen.result
 
     def register(self, builder: PlanBuilder) -> None:
-        """Puts its part into the updates of a scene; called only where it is on."""
+        """Adds the effect's part to the updates of a scene; called only if the effect is on."""
         raise NotImplementedError
 
 
@@ -110,10 +111,10 @@ Refusal = tuple[str, str]
 
 
 def refusal_at_zero(settings: Settings, key: str) -> Refusal | None:
-    """Fault and remedy where a rate or weight of the update is 0.
+    """Returns fault and remedy if a rate or weight of the update is 0.
 
     Args:
-        key: in the settings of the update, as "rate_colour" and "weights.rigidity".
+        key: name in the update settings, such as "rate_colour" or "weights.rigidity".
     """
     if attrgetter(key)(settings.update) > 0:
         return None
@@ -122,10 +123,10 @@ def refusal_at_zero(settings: Settings, key: str) -> Refusal | None:
 
 @cache
 def effect(name: str) -> Effect:
-    """The effect of a name.
+    """Returns the effect with a name.
 
     Raises:
-        KeyError: there is none.
+        KeyError: there is no such effect.
 
     >>> effect("floor").group
     <EffectGroup.COHERENCE: 'coherence'>

@@ -1,4 +1,4 @@
-"""Evidence for an effect, and the committed frame that it is taken from."""
+"""Evidence for an effect, and the committed frame from which it is computed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Evidence:
 
     Attributes:
         share: 0…1, what the effect explains or would explain; compared with the thresholds of the effect.
-        text: for people, as "gains of the cameras differ by 8 %".
+        text: explanation for people, such as "gains of the cameras differ by 8 %".
     """
 
     share: float
@@ -29,12 +29,12 @@ class Evidence:
 
 @dataclass(eq=False)
 class FitTime:
-    """The time for fitting what is born in a frame, beside its update.
+    """The time for fitting the Gaussians added in a frame, outside the update.
 
     Attributes:
-        end: ``perf_counter`` by which fits have to be over; None: there is no limit.
-        spent: seconds that they took. postponed: what there was no time for, in words; it is found again in the next
-            frame.
+        end: ``perf_counter`` value at which fits must end; None for no limit.
+        spent: seconds used by fits. postponed: work that did not fit the time, in words; the next frame detects it
+            again.
     """
 
     end: float | None = None
@@ -44,13 +44,14 @@ class FitTime:
 
 @dataclass(frozen=True, eq=False)
 class FrameObservation:
-    """A frame as the evidence for effects is taken from it, once its state is committed.
+    """A learnt frame, as input for the evidence of effects.
 
     Attributes:
         index: of the frame. before: Θ_{t−1}. result: Θ_t, the trace of its update, arrays of the effects.
-        rig: the cameras inside, as they were posed. views: that were learnt from. renderer: draws states of the scene.
-        room: Gaussians that may still be born in the scene. time: for fitting them.
-        suspects: views that were not learnt from, of excluded cameras.
+        rig: the cameras in the internal world, with their current poses. views: that were learnt from. renderer:
+            renders states of the scene.
+        room: number of Gaussians that may still be added to the scene. time: for fitting them.
+        suspects: views of excluded cameras, which were not learnt from.
     """
 
     index: int

@@ -1,7 +1,7 @@
-"""Switches of the effects of a scene: pinned by its settings, or by the evidence of its frames, with hysteresis.
+"""Switches of a scene's effects: pinned by the settings, or decided from evidence with hysteresis.
 
-A switch changes between two frames. It is committed with the frame whose evidence changed it, and a scene that is
-resumed goes on with the switches of its checkpoint, so that a replay decides the same.
+A switch changes between two frames. It is committed with the frame whose evidence changed it. A resumed scene continues
+with the switches of its checkpoint, so that a replay makes the same decisions.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from scas4d_core.update.parts import Arrays, PlanBuilder
 
 IDLE = 8
-"""Frames in a row with too little evidence, after which an effect is switched off."""
+"""Number of consecutive frames with too little evidence after which an effect is switched off."""
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,9 @@ class Switch:
     """The switch of one effect.
 
     Attributes:
-        on: whether it takes part in the updates. since: the frame after which it does, or does not.
-        pinned: by the settings. share, text: the last evidence, see ``effect.Evidence``. idle: frames in a row in
-            which it would have been switched off.
+        on: whether the effect takes part in updates. since: frame after which the switch last changed.
+        pinned: whether the settings fix it. share, text: the latest evidence, see ``Evidence``. idle: number of
+            consecutive frames with evidence below the switch-off threshold.
     """
 
     on: bool
@@ -44,11 +44,11 @@ class Switch:
 
 Switches = Mapping[str, Switch]
 NO_EVIDENCE: Mapping[str, Evidence] = MappingProxyType({})
-"""No evidence."""
+"""Empty evidence."""
 
 
 def find_contradictions(settings: Settings) -> Iterator[tuple[str, Mode, str, str]]:
-    """Name, mode, fault and remedy of each effect whose pin the settings contradict."""
+    """Yields name, mode, fault and remedy of each effect whose pin contradicts the settings."""
     for name, mode in settings.effects.items():
         if mode == "on" and (refusal := effect(name).refusal(settings)) is not None:
             yield name, mode, f"effects.{name} cannot be 'on': {refusal[0]}", f"{refusal[1]}, or leave it 'auto'"
@@ -59,17 +59,17 @@ def find_contradictions(settings: Settings) -> Iterator[tuple[str, Mode, str, st
 def first_switches(
     settings: Settings, index: int, found: Mapping[str, Evidence] = NO_EVIDENCE, masked: bool = True
 ) -> dict[str, Switch]:
-    """The switches before any update: what is pinned, on in every scene whose settings allow it, or found in frame 0.
+    """Returns the switches before any update: pinned, on by default, or on because of evidence in frame 0.
 
     Args:
-        index: of the first frame. found: evidence in the fit of frame 0, by effect. masked: whether that has masks.
+        index: of the first frame. found: evidence in the fit of frame 0, by effect. masked: whether frame 0 has masks.
 
     Raises:
-        InputError: the settings contradict what is pinned.
+        InputError: a pinned effect contradicts the settings.
 
     >>> from scas4d_core.settings import Settings
     >>> switches = first_switches(Settings.model_validate({"effects": {"rigidity": "off"}}), 0)
-    >>> switches["rigidity"].on, switches["isometry"].on, switches["floor"].on  # no floor is named
+    >>> switches["rigidity"].on, switches["isometry"].on, switches["floor"].on  # no floor is given
     (False, True, False)
     """
     for _, _, fault, remedy in find_contradictions(settings):
@@ -91,12 +91,12 @@ def first_switches(
 
 
 def encode_switches(switches: Switches) -> dict[str, dict[str, Any]]:
-    """The switches as JSON, for reports and checkpoints."""
+    """Returns the switches as JSON data, for reports and checkpoints."""
     return {name: asdict(switch) for name, switch in switches.items()}
 
 
 def decode_switches(record: Mapping[str, Mapping[str, Any]]) -> dict[str, Switch]:
-    """The switches of a record.
+    """Returns the switches from JSON data.
 
     >>> decode_switches(encode_switches({"floor": Switch(on=True, since=3)}))["floor"].since
     3
@@ -105,10 +105,10 @@ def decode_switches(record: Mapping[str, Mapping[str, Any]]) -> dict[str, Switch
 
 
 def decide_switches(switches: Switches, settings: Settings, seen: FrameObservation) -> dict[str, Switch]:
-    """The switches for the frame after one that was committed.
+    """Returns the switches for the next frame.
 
     Args:
-        switches: with which it was updated. settings: of the scene. seen: the frame.
+        switches: used for the update of the frame. settings: of the scene. seen: the learnt frame.
     """
     return {name: _decide_switch(name, switch, settings, seen) for name, switch in switches.items()}
 
@@ -128,7 +128,7 @@ def _decide_switch(name: str, switch: Switch, settings: Settings, seen: FrameObs
 
 
 def first_frame_arrays(switches: Switches, settings: Settings, seen: FrameObservation) -> dict[str, Arrays]:
-    """Arrays that the effects keep of the first frame, by effect."""
+    """Returns the arrays that the effects keep from the first frame, by effect."""
     by_effect = {}
     for name, switch in switches.items():
         one = effect(name)
@@ -140,10 +140,10 @@ def first_frame_arrays(switches: Switches, settings: Settings, seen: FrameObserv
 
 
 def record_arrays(switches: Switches, settings: Settings, seen: FrameObservation) -> FrameObservation:
-    """A frame that was learnt, with the arrays that effects note of it.
+    """Returns the observation of a learnt frame with the arrays that the effects record.
 
     Args:
-        switches: with which it was updated. settings: of the scene. seen: the frame.
+        switches: used for the update of the frame. settings: of the scene. seen: the learnt frame.
     """
     by_effect = {}
     for name, switch in switches.items():
@@ -159,7 +159,7 @@ def record_arrays(switches: Switches, settings: Settings, seen: FrameObservation
 
 
 def committed_arrays(carried: Mapping[str, Arrays]) -> dict[str, Arrays]:
-    """The arrays that are committed with a frame after the first, of those that the effects leave, by effect."""
+    """Returns the carried arrays that are committed with later frames, by effect."""
     kept = {
         name: {key: own[key] for key in effect(name).committed_arrays if key in own} for name, own in carried.items()
     }
@@ -169,7 +169,7 @@ def committed_arrays(carried: Mapping[str, Arrays]) -> dict[str, Arrays]:
 def switches_after_first_frame(
     found: Mapping[str, Arrays], switches: Switches, seen: FrameObservation
 ) -> dict[str, Switch]:
-    """The switches after the first frame.
+    """Returns the switches after the first frame.
 
     Args:
         found: from ``first_frame_arrays``. seen: the first frame.
@@ -181,15 +181,15 @@ def switches_after_first_frame(
 
 
 def names_on(switches: Switches) -> tuple[str, ...]:
-    """The effects that are on, in the order of the registry."""
+    """Returns the active effects in registry order."""
     return tuple(name for name in EFFECTS if name in switches and switches[name].on)
 
 
 def register_effects(builder: PlanBuilder, effects: Sequence[str] | None = None) -> PlanBuilder:
-    """The builder once the effects have joined it.
+    """Registers effects with a builder and returns it.
 
     Args:
-        effects: those that are on; None: those that are on in a scene that shows no evidence for any.
+        effects: the active effects; None for those active in a scene without evidence.
     """
     if effects is None:
         effects = names_on(first_switches(Settings(scene=builder.scene, update=builder.update), 0))

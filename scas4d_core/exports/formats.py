@@ -211,16 +211,18 @@ def check_suffix(path: Path, format: Format) -> None:
 
 
 def table() -> str:
-    """The table as Markdown, one line a format.
+    """Returns the table as Markdown; formats that differ in nothing but their name share a line.
 
     >>> print(table().splitlines()[0])
     | name | suffixes | sequence | axes | unit | colour | scale | opacity | shape | ids | lost |
     """
     heads = [*COLUMNS[:2], "sequence", *COLUMNS[2:]]
-    lines = [f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
+    names: dict[tuple[str, ...], list[str]] = {}  # formats that share everything but the name share a line
     for each in FORMATS.values():
         cells = {column: str(getattr(each, column)) for column in COLUMNS}
-        cells |= {"name": f"`{each.name}`", "suffixes": " ".join(f"`{suffix}`" for suffix in each.suffixes)}
-        cells["sequence"] = "a file a frame" if each.numbered else "one file"
-        lines.append(f"| {' | '.join(cells[head] for head in heads)} |")
+        cells["suffixes"] = " ".join(f"`{suffix}`" for suffix in each.suffixes)
+        cells["sequence"] = "a file per frame" if each.numbered else "one file"
+        names.setdefault(tuple(cells[head] for head in heads if head != "name"), []).append(f"`{each.name}`")
+    lines = [f"| {' | '.join(heads)} |", f"|{'---|' * len(heads)}"]
+    lines += [f"| {' | '.join([', '.join(same), *cells])} |" for cells, same in names.items()]
     return "\n".join(lines)

@@ -211,7 +211,7 @@ def part_labels(labels: NDArray[Any], count: int) -> NDArray[np.int64]:
     given = np.asarray(labels)
     if given.ndim != 1 or not np.issubdtype(given.dtype, np.integer):
         raise InputError(
-            f"parts: labels have shape {given.shape} and type {given.dtype}", "give whole numbers [N], one a Gaussian"
+            f"parts: labels have shape {given.shape} and type {given.dtype}", "give whole numbers [N], one per Gaussian"
         )
     result = np.full(count, -1, np.int64)
     result[: len(given)] = given[:count]

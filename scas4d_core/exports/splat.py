@@ -64,15 +64,15 @@ def read_splat(path: Path | str) -> Splats:
 
     >>> read_splat("README.md")
     Traceback (most recent call last):
-    scas4d_core.errors.InputError: README.md: no .splat file (... bytes are no multiple of 32); ...
+    scas4d_core.errors.InputError: README.md: not a .splat file (... bytes are no multiple of 32); ...
     """
     try:
         content = Path(path).read_bytes()
     except OSError as error:
-        raise InputError(f"{path}: no .splat file ({error.strerror})", "give a path that can be read") from error
+        raise InputError(f"{path}: not a .splat file ({error.strerror})", "give a path that can be read") from error
     if len(content) % ROW.itemsize:
         raise InputError(
-            f"{path}: no .splat file ({len(content)} bytes are no multiple of {ROW.itemsize})",
+            f"{path}: not a .splat file ({len(content)} bytes are no multiple of {ROW.itemsize})",
             "give a whole file, one that no program compressed",
         )
     rows = np.frombuffer(content, ROW)

@@ -100,13 +100,13 @@ def read_spz(path: Path | str, metres_per_unit: float = 1.0) -> Splats:
 
     >>> read_spz("README.md")
     Traceback (most recent call last):
-    scas4d_core.errors.InputError: README.md: no SPZ file (...); ...
+    scas4d_core.errors.InputError: README.md: not an SPZ file (...); ...
     """
     gsply = import_optional("gsply", "spz")
     try:
         data = gsply.read_spz(path)
     except (OSError, ValueError) as error:
-        raise InputError(f"{path}: no SPZ file ({error})", "give a whole .spz file of version 1 to 4") from error
+        raise InputError(f"{path}: not an SPZ file ({error})", "give a whole .spz file of version 1 to 4") from error
     means, logs, quaternions, logits, base = (
         np.asarray(column, np.float64)
         for column in (data.means, data.scales, data.quats, data.opacities.reshape(-1), data.sh0)

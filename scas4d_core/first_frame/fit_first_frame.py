@@ -1,4 +1,4 @@
-"""Fits frame 0, and keeps the facts of it that every update needs."""
+"""Fits frame 0, and keeps the data of it that every update needs."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ Colour = tuple[float, float, float]
 
 
 def with_background(settings: Settings, images: Mapping[str, NDArray[np.uint8]]) -> Settings:
-    """The settings with the background that 'auto' stands for.
+    """Returns the settings with 'auto' replaced by the background colour.
 
-    It is the colour of a plain backdrop, else the mean colour. A background that the pictures do not have, as black in
-    a bright room, teaches the fit dark seams, and shows as a black hole where no camera has looked.
+    It is the colour of a plain backdrop, or else the mean colour. A background colour that is not in the images, such
+    as black in a bright room, causes dark seams in the fit. It also causes black holes in regions that no camera sees.
 
     Args:
         images: of frame 0.
@@ -48,7 +48,7 @@ def with_background(settings: Settings, images: Mapping[str, NDArray[np.uint8]])
         return settings
     pictures = [image for image in images.values() if image.ndim == 3 and image.shape[2] == 3]
     pictures = [image for image in pictures if min(image.shape[:2]) > PIXEL_STRIDE]
-    if not pictures:  # they are refused later, in words
+    if not pictures:  # rejected later with an error message
         return settings
     backdrop_colour = backdrop(pictures)
     return _set_background(settings, _colour(mean_colour(pictures) if backdrop_colour is None else backdrop_colour))
@@ -65,7 +65,7 @@ def _set_background(settings: Settings, background: Sequence[float]) -> Settings
 
 
 def with_recorded_background(settings: Settings, history: History) -> Settings:
-    """The settings with the background with which a scene began; as they are where its first frame cannot be read."""
+    """Returns the settings with the background recorded for a scene; unchanged if its first frame cannot be read."""
     if settings.scene.background != "auto":
         return settings
     with suppress(HistoryError):
@@ -75,11 +75,11 @@ def with_recorded_background(settings: Settings, history: History) -> Settings:
 
 @dataclass(frozen=True, eq=False)
 class FirstFrame:
-    """The facts of frame 0 that every update needs.
+    """The data of frame 0 that every update needs.
 
     Attributes:
-        masked: true where it had masks. exposures: [3, 2] gain and offset of each channel, by camera name.
-        lengths: [N, 3] metres, of the axes of the Gaussians. background: RGB in 0…1 behind everything.
+        masked: whether frame 0 has masks. exposures: [3, 2] gain and offset of each channel, by camera name.
+        lengths: [N, 3] axis lengths of the Gaussians, in metres. background: RGB in 0…1.
     """
 
     masked: bool
@@ -88,7 +88,7 @@ class FirstFrame:
     background: Colour
 
     def record(self) -> dict[str, Any]:
-        """The facts that the state of frame 0 does not hold, as JSON values; they are committed with its report."""
+        """Returns the data that are not in the state of frame 0, as JSON values; committed with its report."""
         return {
             "masked": self.masked,
             "exposures": {name: exposure.tolist() for name, exposure in self.exposures.items()},
@@ -97,10 +97,10 @@ class FirstFrame:
 
     @classmethod
     def of(cls, history: History) -> FirstFrame:
-        """Reads the facts from the first frame of a history.
+        """Reads the data from the first frame of a history.
 
         Raises:
-            HistoryError: it cannot be read. KeyError: its report lacks something.
+            HistoryError: the frame cannot be read. KeyError: its report is incomplete.
         """
         first = history.indices[0]
         report = history.report(first)
@@ -119,12 +119,12 @@ def fit_static_scene(
     settings: StaticSettings,
     progress: Callable[[FitProgress], None] | None = None,
 ) -> StaticResult:
-    """Fits Θ_0 to the views of frame 0, from a cloud of points.
+    """Fits Θ_0 to the views of frame 0, starting from a point cloud.
 
     Args:
-        factory: of the scene's views. views: of frame 0; their exposures are learnt in place.
-        positions: [P, 3] metres in the inside world. colours: [P, 3] in 0…1. foreground: [P] in 0…1, or None.
-        scene, settings: of the scene, of frame 0.
+        factory: creates the scene's views. views: of frame 0; their exposures are learnt in place.
+        positions: [P, 3] metres in the internal world. colours: [P, 3] in 0…1. foreground: [P] in 0…1, or None.
+        scene, settings: of the scene and of frame 0.
         progress: called after each iteration.
 
     Raises:
@@ -153,12 +153,13 @@ def fit_first_frame(
     world: WorldFrame,
     on_progress: Callable[[Progress], None],
 ) -> StaticResult:
-    """Fits frame 0 to its pictures, from a cloud that is given or made from the pictures.
+    """Fits frame 0 to its images, from a given point cloud or from one computed from the images.
 
-    The cloud is made in the inside world: the user's origin and unit do not change it.
+    The cloud is computed in the internal world, so that the user's origin and unit do not change it.
 
     Args:
-        frame: with pictures of the size of the factory's rig. points: in the user's world. world: user's to inside.
+        frame: with images of the size of the factory's rig. points: in the user's world. world: user to internal
+            transform.
         on_progress: called with the progress of each stage.
     """
     if points is None:
@@ -189,12 +190,12 @@ def fit_first_frame(
 
 
 def _remaining_time(limit: TimeLimit) -> dict[str, float]:
-    """The seconds after which frame 0 should be through, where that is known."""
+    """Returns the maximum remaining seconds of frame 0; empty without a limit."""
     return {"seconds_at_most": max(0.0, limit.seconds_left())} if limit.bounded else {}
 
 
 def _figures(now: FitProgress, limit: TimeLimit) -> dict[str, float]:
-    """The figures of a progress of the fit."""
+    """Returns the figures for a progress report of the fit."""
     left = {} if now.seconds is None else {"seconds_left": now.seconds}
     return {"loss": now.loss, **left, **_remaining_time(limit)}
 

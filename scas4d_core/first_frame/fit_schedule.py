@@ -1,9 +1,9 @@
-"""The schedule of frame 0's fit: every iteration of the settings, or as many as there is time for, all phases shorter.
+"""Iteration schedule of the fit of frame 0: all iterations of the settings or, with a time limit, fewer in all phases.
 
-Rates, density control and all else that happens at its time in the fit are counted in iterations of the full schedule.
-Where the time is short, an iteration goes on by more than one of these: the fit ends with all of its phases behind it,
-as a shorter fit would, and is not cut off. How much more follows from the pace measured so far, and is found anew
-while it goes on. Where there is time enough, each iteration counts one, and nothing differs from a fit without a limit.
+Learning rates, density control and other events are defined in iterations of the full schedule. If time is short, one
+iteration advances the schedule by more than one. The fit thus completes all of its phases, like a shorter fit, instead
+of being cut off. The stride follows from the measured pace and is updated during the fit. With enough time, every
+iteration counts as one, and the result is the same as without a limit.
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ from scas4d_core.first_frame.time_limit import TimeLimit
 from scas4d_core.fit.gaussian_fit import FitStep
 
 MIN_ITERATIONS = 500
-"""Iterations that are made however little time there is."""
+"""Minimum number of iterations, even without enough time."""
 FIRST_TIMED = 10
-"""Iterations before those that are timed: they load kernels and fill caches."""
+"""Number of initial iterations that are not timed, because they load kernels and fill caches."""
 PLAN_EVERY = 25
-"""Iterations between two plans; of so many the pace is measured."""
+"""Number of iterations between two plans, over which the pace is measured."""
 TIME_TOLERANCE = 1.03
-"""Predicted time over the time left, up to which nothing is shortened: predictions are not better."""
+"""Ratio of predicted to remaining time up to which nothing is shortened; predictions are not more accurate."""
 MIN_PLAN_CHANGE = 0.02
-"""Relative change of the number of iterations from which a plan is noted as another one."""
+"""Relative change of the number of iterations above which a new plan is recorded."""
 REPORTED_SHORTFALL = 0.05
-"""Share of the iterations from which on a report says that they were too few: fewer are lost
-in what the seed does. The sample at half size, two seeds each: 35.33 dB, with 5, 10 and 20 % fewer 35.20, 35.29 and
-35.24, with half of them 35.03; *cloth* at half size, one seed: 28.91 dB, with 5 and 20 % fewer 28.91 and 28.88."""
+"""Share of missing iterations above which the report mentions them; smaller losses are below the effect of the seed.
+The sample at half size, two seeds each: 35.33 dB; with 5, 10 and 20 % fewer 35.20, 35.29 and 35.24; with half of them
+35.03. *cloth* at half size, one seed: 28.91 dB; with 5 and 20 % fewer 28.91 and 28.88."""
 MIN_COUNT_RATIO = 1.3
-"""Ratio of numbers of Gaussians from which the cost of one can be separated from that of the pixels."""
+"""Minimum ratio of Gaussian counts for separating the cost per Gaussian from that of the pixels."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,8 @@ class FitProgress:
     """Progress of the fit.
 
     Attributes:
-        done, planned: iterations made, and in all. loss: of the last. seconds: predicted that remain; None: not known.
+        done, planned: completed and total iterations. loss: of the last iteration. seconds: predicted remaining time;
+            None if unknown.
     """
 
     done: int
@@ -51,17 +52,17 @@ class FitProgress:
 
 
 class FitSchedule:
-    """Plans the iterations of a fit.
+    """Plans the iterations of a fit within a time limit.
 
     Args:
-        iterations: of the full schedule. limit: of frame 0.
-        expected: Gaussians that there will be at a moment of the schedule.
+        iterations: of the full schedule. limit: time limit of frame 0.
+        expected: returns the expected number of Gaussians at a point of the schedule.
 
     Attributes:
-        done: iterations made. at: how far these are in the full schedule. stride: by how much the next goes on.
-        fits_again: whether another whole fit is to follow in the same time. end: of this fit, in the full schedule.
-        shortened: whether an iteration has gone on by more than one.
-        planned: (iteration, iterations in all) whenever what is planned changed.
+        done: completed iterations. at: position in the full schedule. stride: advance of the next iteration.
+        fits_again: whether another complete fit must follow in the same time. end: of this fit, in the full schedule.
+        shortened: whether any iteration has advanced by more than one.
+        planned: (iteration, total iterations) for each change of plan.
 
     >>> schedule = FitSchedule(4, TimeLimit(None), lambda at: 100.0)
     >>> [(step := schedule.begin_iteration()).begun for _ in range(2)], step.ended, schedule.planned
@@ -82,14 +83,14 @@ class FitSchedule:
         self._spent: list[float] = []
 
     def begin_iteration(self) -> FitStep:
-        """Begins the next iteration."""
+        """Starts the next iteration."""
         self._began = self._limit.clock()
         begun, self.at = self.at, min(float(self.iterations), self.at + self.stride)
         self.shortened |= self.stride != 1
         return FitStep(begun, self.at)
 
     def end_iteration(self, count: int) -> None:
-        """Ends an iteration of so many Gaussians, and plans anew from time to time."""
+        """Ends an iteration with ``count`` Gaussians, and updates the plan every ``PLAN_EVERY`` iterations."""
         self.done += 1
         if self.done <= FIRST_TIMED:
             return
@@ -102,20 +103,20 @@ class FitSchedule:
 
     @property
     def record(self) -> list[tuple[int, int]]:
-        """``planned``, and what came of it at last where an iteration went on by more than one.
+        """``planned``, and the final number of iterations if the fit was shortened.
 
-        A fit whose record has one entry has the bits of a fit without a limit.
+        A fit whose record has one entry is bit-identical to a fit without a limit.
         """
         last = (self.done, self.done)
         return self.planned + [last] * (self.shortened and self.planned[-1] != last)
 
     @property
     def total(self) -> int:
-        """Iterations in all, as planned now."""
+        """Total number of iterations in the current plan."""
         return self.done + ceil((self.iterations - self.at) / self.stride)
 
     def _plan(self) -> None:
-        """Sets the stride by the time that is left, and predicts the seconds that remain."""
+        """Sets the stride from the remaining time, and predicts the remaining seconds."""
         whole = self._seconds(self.at, self.end) + (self._seconds(0.0, self.iterations) if self.fits_again else 0.0)
         over = whole / max(self._limit.seconds_left_for_fit, 1e-3)
         longest = max(1.0, self.iterations / MIN_ITERATIONS)
@@ -125,12 +126,14 @@ class FitSchedule:
             self.planned.append((self.done, self.total))
 
     def _seconds(self, begin: float, end: float) -> float:
-        """Seconds of the iterations between two moments of the full schedule, with as many Gaussians as then."""
+        """Returns the predicted seconds between two points of the full schedule, with the expected numbers of
+        Gaussians.
+        """
         times, counts = np.array(self._times), np.array(self._counts)
         each, more = times[-1], 0.0
         if counts.max() >= MIN_COUNT_RATIO * counts.min():
-            # An iteration costs so much for its pixels, and so much for each Gaussian; one that was slow for what
-            # else ran beside it weighs little beside the many.
+            # The cost of an iteration is a constant for its pixels plus a term per Gaussian. In a linear fit over many
+            # iterations, one slowed by other processes has little weight.
             more = max(0.0, float(np.polyfit(counts, times, 1)[0]))
             more = min(more, each / counts[-1])
         moments = np.linspace(begin, end, 33)

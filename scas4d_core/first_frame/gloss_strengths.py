@@ -1,7 +1,7 @@
-"""Strengths of gloss from the pictures of frame 0: how far the colour of a surface follows what it would mirror.
+"""Gloss strengths from the images of frame 0: how strongly a surface's colour follows its predicted reflection.
 
-Steps along gradients leave matte things half as glossy as they began, for nothing pulls hard there; they then show
-highlights in views that no camera has had. Given normals and environment, the strength is the slope of a line.
+Gradient steps leave matte objects half as glossy as at the start, because the gradients there are small. Such objects
+then show highlights in novel views. For given normals and environment, the strength is the slope of a regression line.
 """
 
 from __future__ import annotations
@@ -21,34 +21,37 @@ Array = NDArray[np.float32]
 Float = NDArray[np.float64]
 
 ENOUGH = 0.05
-"""Pixels' worth of weight from which a camera's colour of a Gaussian counts."""
+"""Minimum blending weight, in pixels, for a camera's colour of a Gaussian to count."""
 WHITE = 0.97
-"""Colour from which a picture shows no more."""
+"""Colour above which an image is saturated."""
 FLATTEST = 0.2
-"""Cosine to the camera below which footprints reach beyond the outline."""
+"""Cosine to the camera below which footprints extend beyond the outline."""
 NEAR = 64
-"""Neighbours that share a slope: one alone is hardly in two highlights."""
+"""Number of neighbours that share a slope; a single Gaussian rarely reflects two highlights."""
 CLEAR = 0.3
-"""Share of the change of light that a line has to explain for its slope to be believed; less of it, as much less."""
+"""Share of the light variation that the line must explain for full confidence in its slope; confidence is proportional
+below it.
+"""
 ROUNDS = 3
-"""Of averages over neighbours, by which what is not clear takes its strength from what is clear about it."""
+"""Number of averaging rounds over neighbours, in which uncertain strengths follow from reliable ones nearby."""
 GLOSSY = 0.12
-"""Mean share about it from which something is glossy at all: on `gloss`, frame 0, the median is 0.005 on the matte
-stand, 0.25 and 0.17 on vase and ring. Where little is explained all around, strengths go to 0: as they were, from a
-guess of 0.5 wherever lamps were not mirrored, the stand had false highlights, and 0.3 dB of all pictures."""
+"""Minimum mean explained share in the neighbourhood of a glossy surface. On frame 0 of `gloss`, the median is 0.005 on
+the matte stand, and 0.25 and 0.17 on vase and ring. In neighbourhoods with little evidence, strengths go to 0. Without
+this, the stand kept the initial 0.5 in places that reflect no lamp, and false highlights cost 0.3 dB over all
+images."""
 FAINTEST, STRONGEST = 0.004, 1.0
-"""Bounds; what has no strength would have no normal."""
+"""Bounds of the strength; a strength of 0 would leave the normal undefined."""
 TINY = 1e-12
 
 
 def estimate_strengths(
     normals: Array, environment: Array, state: Gaussians, views: Sequence[TrainingView], renderer: Renderer
 ) -> Array:
-    """[N, 1] strengths of unit normals [N, 3] in an environment.
+    """Returns the [N, 1] strengths for unit normals [N, 3] in an environment.
 
-    Over the views, each Gaussian's light (its colour in the pictures, squared) is a line over what it would mirror; the
-    slope is taken over neighbours on the same side of the surface. Where the line explains little, the strength is that
-    of what is clear about it, or near 0 where nothing is.
+    Over the views, each Gaussian's light (its squared image colour) is a linear function of its predicted reflection.
+    The slope is estimated over neighbours on the same side of the surface. If the line explains little, the strength
+    follows from reliable neighbours, or is near 0 if there are none.
 
     Args:
         views: of the state.
@@ -57,7 +60,7 @@ def estimate_strengths(
 
     means, count = state.means, len(state)
     shown = np.zeros((count, 4), np.float32)
-    sums = np.zeros((6, count, 3))  # of weights, light, mirrored, mirrored × light, mirrored², light²
+    sums = np.zeros((6, count, 3))  # of weights, light, reflection, reflection × light, reflection², light²
     for view in views:
         gain, offset = view.exposure[:3, :1, None], view.exposure[:3, 1:, None]
         planes = np.ones((4, *view.target.shape[1:]), np.float32)
@@ -104,6 +107,6 @@ def estimate_strengths(
 
 
 def _over(values: Float, near: NDArray[np.int64], weights: Float) -> Float:
-    """[N, C] means of values [N, C] over neighbours [N, k], with weights [N, k] that sum to 1."""
+    """Returns [N, C] weighted means of values [N, C] over neighbours [N, k]; weights [N, k] sum to 1."""
     means: Float = np.einsum("nkc,nk->nc", values[near], weights)
     return means

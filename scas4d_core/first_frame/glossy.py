@@ -1,8 +1,8 @@
-"""Frame 0 of glossy things: whether there are any, and the fit with what they mirror.
+"""Frame 0 of glossy objects: a trial that detects them, and a fit with their reflections.
 
-Left alone, a fit explains each camera's highlights by Gaussians that only this camera sees, behind or before the
-surface, and they stay in what follows. So where a trial, early in the fit, finds that colours depend on direction, the
-environment is learnt on the surface found so far, and the fit begins anew with both.
+Without gloss, the fit explains each camera's highlights by Gaussians off the surface that only this camera sees. These
+remain in later frames. An early trial finds whether colours depend on the viewing direction. If so, the environment is
+learnt on the current surface, and the fit restarts with both.
 """
 
 from __future__ import annotations
@@ -30,35 +30,36 @@ from scas4d_core.fit.gaussian_fit import FitStep, GaussianFit
 Array = NDArray[np.float32]
 
 TRIAL = 0.15
-"""Share of the iterations after which the trial is made: there is a surface, and little has been made up behind it."""
+"""Share of the iterations after which the trial runs: a surface exists, but few false Gaussians lie behind it."""
 MIN_ITERATIONS = 100
-"""Of a fit, after which its residual shows what colours alone will not explain."""
+"""Minimum iterations of a fit for the trial; before, the residual is not limited by constant colours."""
 MIN_VIEWS = 12
-"""For the trial: of fewer cameras each has highlights that no other sees beside it, and anything explains them."""
+"""Minimum number of views for the trial; with fewer, highlights are seen by one camera only and anything explains them.
+"""
 MAX_STRIDE = 1.5
-"""Stride of the schedule from which there is no time for a trial: it takes as long as 350 of the iterations, and a
-surface that came about in a hurry explains less (basketball in 600 iterations: 7 % for direction, in 3000 none)."""
+"""Schedule stride above which there is no time for a trial. It takes as long as 350 iterations, and a surface from a
+shortened fit explains less (basketball in 600 iterations: 7 % for direction, in 3000 none)."""
 ROUNDS = 8
-"""Over all views, of the trial."""
+"""Number of passes over all views in the trial."""
 RATE = 2.5e-3
-"""Adam's rate of colours in the trial."""
+"""Adam learning rate of colours in the trial."""
 LEARN_UNTIL = 0.5
-"""Share of the iterations up to which the environment is learnt on the first surface; then the fit begins anew."""
+"""Share of the iterations until which the environment is learnt on the first surface; then the fit restarts."""
 NORMALS_EVERY = 0.1
-"""Share of the iterations between two estimates of the normals in that."""
+"""Share of the iterations between two estimates of the normals during this phase."""
 LEARN_NORMALS_FROM = 0.6
 """Share of the iterations after which normals are learnt; before, they are those of the first surface."""
 SMOOTH_EVERY = 10
-"""Iterations between two averages over neighbours."""
+"""Number of iterations between two averages over neighbours."""
 
 
 def fit_with_gloss_trial(
     make: Callable[[], StaticTrainer], mode: Mode, progress: Callable[[FitProgress], None] | None = None
 ) -> StaticResult:
-    """Fits Θ_0 with colours that depend on direction, where that is called for.
+    """Fits Θ_0, with view-dependent colours if they are needed.
 
     Args:
-        make: the trainer of the fit, before its first iteration. mode: "auto": where a trial says so.
+        make: creates a trainer that has not started. mode: "auto" decides by a trial.
         progress: called after each iteration.
     """
     trainer = make()
@@ -76,7 +77,7 @@ def fit_with_gloss_trial(
 
 
 def estimate_gloss(trainer: StaticTrainer, environment: Array | None) -> tuple[Array, Array]:
-    """[N, 3] normals times strengths of the surface that a fit has, and its means; without environment, the start's."""
+    """Returns [N, 3] normals times strengths of a fit's surface, and its means; None: initial strengths."""
     state, views, renderer = trainer.gaussians(), trainer.views, trainer.fit.renderer
     normals = surface_normals(state, views, renderer)
     if environment is None:
@@ -85,14 +86,15 @@ def estimate_gloss(trainer: StaticTrainer, environment: Array | None) -> tuple[A
 
 
 class GlossTrial:
-    """Finds whether colours depend on direction, on the surface of an unfinished fit.
+    """Decides whether colours depend on direction, using the surface of an unfinished fit.
 
     Args:
         trainer: of the fit. mode: "on" needs no evidence.
 
     Attributes:
-        on: once asked. out_of_time: whether there was no time for it.
-        evidence: share of the residual that direction explains and colours alone do not; None: no trial was made.
+        on: the decision, after the trial. out_of_time: whether there was no time for the trial.
+        evidence: share of the residual that direction explains in addition to constant colours; None if there was no
+            trial.
     """
 
     def __init__(self, trainer: StaticTrainer, mode: Mode) -> None:
@@ -101,7 +103,7 @@ class GlossTrial:
         self.evidence: Evidence | None = None
 
     def run_when_due(self, now: FitStep) -> bool:
-        """At the time of the trial, whether it speaks for direction; the fit is as it was."""
+        """Runs the trial when it is due and returns whether gloss is needed; the fit is not changed."""
         if not now.reaches(max(1, round(TRIAL * self._trainer.settings.iterations))):
             return False
         few = len(self._trainer.views) < MIN_VIEWS or self._trainer.settings.iterations < MIN_ITERATIONS
@@ -116,7 +118,7 @@ class GlossTrial:
         return self.on
 
     def _remaining_error(self, gloss: GlossShading | None) -> float:
-        """Mean squared error of the pictures after a few rounds in which colours, and a gloss, learn alone."""
+        """Returns the mean squared image error after fitting only colours, and a gloss if given, for a few passes."""
         trainer, rates = self._trainer, np.zeros(COLUMNS, np.float32)
         rates[COLOUR] = RATE
         parameters, cameras = trainer.fit.table.parameters.copy(), len(trainer.views)
@@ -125,7 +127,7 @@ class GlossTrial:
         return float(np.mean([10 ** (-psnr / 10) for psnr in fit.psnr[-cameras:]]))
 
     def learn_environment(self) -> StaticTrainer:
-        """The trainer once it has an environment, on the surface that it has."""
+        """Learns an environment on the trainer's current surface, and returns the trainer."""
         trainer, whole, schedule = self._trainer, self._trainer.settings.iterations, self._trainer.schedule
         every, began, until = max(1, round(NORMALS_EVERY * whole)), schedule.at, float(round(LEARN_UNTIL * whole))
         estimates, schedule.fits_again = 0, True
@@ -155,10 +157,10 @@ class GlossTrial:
 
 
 class GlossyFit:
-    """The fit of frame 0 with the surface and the environment of another.
+    """The fit of frame 0 with the surface and environment of a previous fit.
 
     Args:
-        trainer: that has not begun. before: the other.
+        trainer: that has not started. before: trainer of the previous fit.
     """
 
     def __init__(self, trainer: StaticTrainer, before: StaticTrainer) -> None:
@@ -170,7 +172,7 @@ class GlossyFit:
         trainer.fit.set_gloss(GlossShading.fresh(self._with_first_normals(None), means, environment))
 
     def _with_first_normals(self, gloss: Array | None) -> Array:
-        """[N, 3] gloss with the normals of the first surface; strengths as they are, at first those of it, too."""
+        """Returns [N, 3] gloss with normals of the first surface; for None, with its strengths too."""
         near = self._tree.query(self._trainer.fit.table.parameters[:, MEAN], 6)[1]
         normals = self._normals[near].mean(axis=1)
         normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
@@ -179,7 +181,7 @@ class GlossyFit:
         return placed
 
     def train(self, progress: Callable[[FitProgress], None] | None) -> list[float]:
-        """Runs all iterations, see ``StaticTrainer.train``."""
+        """Runs all iterations; see ``StaticTrainer.train``."""
         return self._trainer.train(progress, self._after)
 
     def _after(self, now: FitStep) -> bool:

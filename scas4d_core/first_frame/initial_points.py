@@ -1,4 +1,4 @@
-"""Initial points: a cloud from the pictures of frame 0 and calibrated cameras alone, by the best way that finds one."""
+"""Initial points: a point cloud from the images of frame 0 and calibrated cameras, by several methods."""
 
 from __future__ import annotations
 
@@ -32,31 +32,32 @@ from scas4d_core.posed_pictures import (
 )
 
 OnProgress = Callable[[str, int, int], None]
-"""Called with a stage, the steps done and the steps in all."""
+"""Called with a stage, the completed steps and the total steps."""
 
 MAX_POINTS = 60_000
-"""Points kept at most; where there are more, the spacing grows."""
+"""Maximum number of points; if there are more, the spacing is increased."""
 MIN_VIEWS = 3
-"""Cameras that must agree on a point: two always meet somewhere on an epipolar line."""
+"""Minimum number of cameras that must agree on a point: two always meet somewhere on an epipolar line."""
 CELLS = 32
-"""Cells along the longer side of a picture, in which points are looked for."""
+"""Number of cells along the longer side of an image, for measuring coverage."""
 ENOUGH_COVERAGE = COVERS_LITTLE
-"""Share of the cells of most pictures that hold a point, from which a cloud is enough and no other way is tried.
-Captures of eighteen cameras and more have 0.99 to 1, rigs of four to seven, wide apart, 0 to 0.4 without other ways."""
+"""Share of cells with a point, in most images, at which a cloud is sufficient and no other method is tried. Captures of
+at least eighteen cameras have 0.99 to 1; sparse rigs of four to seven have 0 to 0.4 without other methods."""
 LITTLE_COVERAGE = 0.05
-"""The same, up to which unconfirmed points are worth more than none."""
+"""Coverage up to which unconfirmed points are better than none."""
 
 
 @dataclass(eq=False)
 class InitialCloud(InitialPoints):
-    """Initial points, and how they were found.
+    """Initial points, and the method that found them.
 
     Attributes:
-        method: "agreement" (of three cameras or more), "backdrop" (silhouettes before a plain backdrop), "pairs" (two
-            cameras agree), "plane" (a floor or table on which pictures agree), "surroundings" (what each camera sees,
-            far behind) or "volume" (what cameras share; no point is confirmed); several are joined by " + ".
-        coverage: share of the pictures' cells that hold a point that cameras have agreed on, median over the cameras.
-        stage: that the surroundings lie beyond; None without these.
+        method: one or more of these, joined by " + ". "agreement": at least three cameras agree. "backdrop":
+            silhouettes in front of a plain backdrop. "pairs": two cameras agree. "plane": a floor or table on which
+            images agree. "surroundings": the images, far behind the scene. "volume": the volume that cameras share; no
+            point is confirmed.
+        coverage: share of image cells with a point that cameras agree on, median over the cameras.
+        stage: region that the surroundings enclose; None without surroundings.
     """
 
     method: str = "agreement"
@@ -76,32 +77,33 @@ def initial_points(
     seed: int = 0,
     limit: TimeLimit | None = None,
 ) -> InitialCloud:
-    """Finds points on the surfaces that the pictures of one moment show.
+    """Finds points on the surfaces that the images of one frame show.
 
-    Triangulated features bound the scene and support walls and floors; PatchMatch stereo, kept where at least
-    ``MIN_VIEWS`` cameras agree and few look through, gives what has texture; the visual hull (of the masks, or of
-    silhouettes before a plain background) and the fitted surfaces give the rest. Where that covers too little of the
-    pictures, as with a few cameras far apart, the ways that follow add to it: silhouettes before a backdrop that does
-    not fill the borders, points on which two cameras agree, a plane on which pictures agree, and what each camera sees,
-    painted far behind the stage. Where next to nothing is found, points fill the volume that cameras share.
+    Triangulated features bound the scene and support walls and floors. PatchMatch stereo adds textured surfaces; its
+    points are kept if at least ``MIN_VIEWS`` cameras agree and few see through them. The visual hull (of the masks, or
+    of silhouettes in front of a plain background) and fitted surfaces add the rest. These may cover too little of the
+    images, as with a few widely spaced cameras. In this case, further methods are tried in turn. They use silhouettes
+    in front of a backdrop that does not fill the image borders, points on which two cameras agree, and a plane on which
+    images agree. Finally, the images themselves are placed far behind the scene. If almost nothing is found, points
+    fill the volume that the cameras share.
 
     Args:
         rig: calibrated cameras, in the user's world.
-        images: [H, W, 3] uint8 by camera name; cameras without a picture are ignored.
+        images: [H, W, 3] uint8 by camera name; cameras without an image are ignored.
         masks: [H, W] uint8 by camera name, 1 = foreground; may be empty.
         progress: called with (stage, done, total).
-        max_points: points kept at most.
-        stereo: dense stereo where the pictures have texture.
+        max_points: maximum number of points.
+        stereo: whether to use dense stereo in textured regions.
         stereo_iterations: rounds of propagation and refinement.
         seed: of every random choice; the same seed gives the same points.
-        limit: of the time of frame 0; where it is short, pictures are looked at less finely (``limit.shortened``).
+        limit: time limit of frame 0; if time is short, the search is coarser (``limit.shortened``).
 
     Returns:
-        Points in the user's units; ``foreground`` is None where no masks were given.
+        Points in the user's units; ``foreground`` is None if there are no masks.
 
     Raises:
-        InitialPointsError: fewer than two pictures, a picture whose size is not its camera's, or cameras no two of
-            which look at one place.
+        InitialPointsError: there are fewer than two images, an image does not have its camera's size, or no two cameras
+            look at the same place.
 
     >>> from scas4d_core.captures import open_capture
     >>> capture = open_capture("samples/robot", image_scale=0.5)
@@ -138,7 +140,7 @@ def initial_points(
     confirmed = 0.0 if points is None else points.coverage
     if points is None or confirmed <= LITTLE_COVERAGE:
         points = merge_points(points, shared_volume(before, distances, seed), "volume", before, 4 * spacing)
-    if before is views and not first.backdrop:  # else the backdrop's colour is what lies behind
+    if before is views and not first.backdrop:  # otherwise the backdrop's colour is the background
         points = merge_points(points, surroundings(before, distances), "surroundings", before, 0.0)
         points = replace(points, stage=Stage.of(before, distances))
     return replace(points, coverage=confirmed)
@@ -151,7 +153,7 @@ def _add_points(
     views: Sequence[PosedPicture],
     spacing: float,
 ) -> InitialCloud | None:
-    """The points found before with those of a way; alone where it finds none."""
+    """Returns the previous points merged with those of a method; unchanged if it finds none."""
     try:
         return merge_points(found, search(), method, views, spacing)
     except InitialPointsError:
@@ -159,7 +161,7 @@ def _add_points(
 
 
 def _search_methods(first: PointSearch, masked: bool) -> list[tuple[str, PointSearch]]:
-    """The ways to points that cameras agree on, the surest first."""
+    """Returns the methods for points that cameras agree on, the most reliable first."""
     ways = [("agreement", first)]
     if not masked and not first.backdrop:
         colour = backdrop([view.image for view in first.labelled])
@@ -174,7 +176,7 @@ def _search_methods(first: PointSearch, masked: bool) -> list[tuple[str, PointSe
 def merge_points(
     found: InitialCloud | None, cloud: InitialPoints, method: str, views: Sequence[PosedPicture], spacing: float
 ) -> InitialCloud:
-    """The points found before, and those of a cloud that are farther from them than ``spacing``, world units."""
+    """Returns the previous points and those of a cloud that are farther than ``spacing`` (world units) from them."""
     if found is None:
         both = InitialCloud(cloud.positions, cloud.colours, cloud.foreground, method)
     else:
@@ -183,7 +185,7 @@ def merge_points(
         both = InitialCloud(
             np.concatenate([found.positions, cloud.positions[new]]),
             np.concatenate([found.colours, cloud.colours[new]]),
-            # Silhouettes that one way found for itself label its points alone: then nothing is known of what moves.
+            # Silhouettes found by one method label only its points, so the combined cloud has no labels.
             None if any(label is None for label in labels) else np.concatenate(labels),  # type: ignore[arg-type]
             f"{found.method} + {method}",
         )
@@ -191,10 +193,10 @@ def merge_points(
 
 
 def image_coverage(views: Sequence[PosedPicture], cloud: InitialPoints) -> float:
-    """Share of the cells of a picture, or of its mask, that hold a point; median over the views.
+    """Returns the share of image (or mask) cells that contain a point, median over the views.
 
     Args:
-        views: of the cameras. cloud: with points in the same world.
+        views: of the cameras. cloud: points in the same world.
     """
     shares = []
     for view in views:

@@ -1,4 +1,4 @@
-"""Result of fitting frame 0, and where its first cloud came from."""
+"""Result of the fit of frame 0, and the origin of its initial points."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ Array = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class FirstCloud:
-    """Where the first cloud of points came from.
+    """Origin of the initial point cloud.
 
     Attributes:
-        method: "given", or as in ``initial_points.InitialCloud``. points: how many.
-        coverage: share of the pictures that points cover on which cameras agree; None of a cloud that was given.
+        method: "given", or as in ``initial_points.InitialCloud``. points: number of points.
+        coverage: share of the images covered by points that cameras agree on; None for a given cloud.
     """
 
     method: str
@@ -31,17 +31,17 @@ class FirstCloud:
 
 @dataclass(frozen=True, eq=False)
 class StaticResult:
-    """Result of fitting frame 0.
+    """Result of the fit of frame 0.
 
     Attributes:
         gaussians: Θ_0. exposures: [3, 2] gain and offset of each training camera; empty without exposure terms.
-        losses: the training loss of every iteration. psnr: dB of the view that each iteration rendered.
-        cameras: by name, the fit of each camera's picture in its last iteration.
-        evidence: that was found for effects, by name.
-        cloud: where the first cloud came from; None where it is not known.
-        planned: (iteration, iterations in all) whenever the time that was left changed what was planned.
-        ran_short_of_time: whether an iteration has gone on by more than one of the schedule.
-        shortened: what the time of frame 0 was too short for, in words.
+        losses: training loss of every iteration. psnr: dB, of the view rendered in each iteration.
+        cameras: by name, fit of each camera's image in its last iteration.
+        evidence: found for effects, by name.
+        cloud: origin of the initial points; None if unknown.
+        planned: (iteration, total iterations) for each change of plan.
+        ran_short_of_time: whether any iteration advanced the schedule by more than one.
+        shortened: steps that had too little time, in words.
     """
 
     gaussians: Gaussians

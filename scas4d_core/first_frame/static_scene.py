@@ -1,4 +1,4 @@
-"""Frame 0: 3D Gaussian Splatting with adaptive density control (Kerbl et al. 2023), under a budget of Gaussians."""
+"""Frame 0: 3D Gaussian Splatting (Kerbl et al. 2023) with adaptive density control and a Gaussian budget."""
 
 from __future__ import annotations
 
@@ -37,41 +37,42 @@ from scas4d_core.update.view_factory import ViewFactory
 Array = NDArray[np.float32]
 
 INITIAL_SHARE = 0.6
-"""Share of the budget that the first cloud may take; of a larger cloud a random part is taken."""
+"""Maximum share of the budget for the initial points; a larger cloud is subsampled at random."""
 DENSIFY_FROM = 200
-"""First iteration that densifies; before, gradients are noise."""
+"""First iteration with densification; before, gradients are noise."""
 DENSIFY_EVERY = 100
 """Iterations between densifications (3DGS)."""
 DENSIFY_UNTIL = 0.6
-"""Share of the iterations after which none is added: the rest settles what is there."""
+"""Share of the iterations after which no Gaussians are added, so that the existing ones can converge."""
 DENSIFY_GRADIENT = 1e-6
-"""Mean screen gradient (per half picture, as in 3DGS) above which a Gaussian may be refined; the budget decides how
-many are, hardest pulled first."""
+"""Minimum mean screen-space gradient (per half image, as in 3DGS) of a Gaussian that is densified. The budget limits
+their number; those with the largest gradients come first."""
 PRUNE_OPACITY = 0.01
-"""Less opaque Gaussians are removed while densifying."""
+"""Opacity below which Gaussians are removed during densification."""
 MIN_VIEWS = 2
-"""Gaussians that fewer training cameras than this see are removed."""
+"""Minimum number of training cameras that see a Gaussian; others are removed."""
 SEEN_PIXELS = 0.05
-"""Pixels' worth of blending weight from which a camera counts as seeing a Gaussian."""
+"""Blending weight, in pixels, above which a camera counts as seeing a Gaussian."""
 RATE_POSITION, RATE_POSITION_END = 1.6e-4, 1.6e-6
-"""Adam rates of means at the start and at the end, per metre of scene radius; the decay is exponential (3DGS)."""
+"""Adam learning rates of means at the start and end, per metre of scene radius, with exponential decay (3DGS)."""
 RATE_COLOUR, RATE_OPACITY, RATE_SCALE, RATE_ROTATION, RATE_EXPOSURE = 2.5e-3, 5e-2, 5e-3, 2e-3, 1e-3
-"""Adam rates of colours, opacity logits, log scales, quaternions (those of 3DGS, rotation doubled), and of the cameras'
-gain and offset."""
+"""Adam learning rates of colours, opacity logits, log scales, quaternions (as in 3DGS, with doubled rotation), and of
+the cameras' gain and offset."""
 WEIGHT_MASK = 3.0
-"""Weight of the mask loss where masks are given; in frame 0 it teaches the labels only."""
+"""Weight of the mask loss if there are masks; in frame 0 it only trains the labels."""
 SPLIT_SHRINK = 1.6
-"""A split Gaussian's halves are smaller by this (3DGS)."""
+"""Factor by which the halves of a split Gaussian are smaller (3DGS)."""
 STOP_ROUNDS = 5
-"""Rounds over all views that the stop rule compares with as many before: in fewer the order of views is noise."""
+"""Number of passes over all views that the stopping rule compares with the previous ones; fewer are dominated by noise.
+"""
 
 
 class StaticTrainer:
-    """Fits Gaussians to the views of frame 0; density control changes their number.
+    """Fits Gaussians to the views of frame 0, with density control.
 
     Attributes:
-        fit: the loop with its parameters. schedule: of it. exposures: of the views, learnt in place.
-        budget: largest number of Gaussians. cameras: by name, the fit of each camera's last picture.
+        fit: the fitting loop with its parameters. schedule: of the fit. exposures: of the views, learnt in place.
+        budget: maximum number of Gaussians. cameras: by name, fit of each camera's last image.
     """
 
     def __init__(
@@ -104,10 +105,10 @@ class StaticTrainer:
         progress: Callable[[FitProgress], None] | None = None,
         should_stop: Callable[[FitStep], bool] | None = None,
     ) -> list[float]:
-        """Runs all iterations, or fewer by the stop rule or for want of time; returns their losses.
+        """Runs all iterations, or fewer because of the stopping rule or the time limit; returns their losses.
 
         Args:
-            progress: called after each iteration. should_stop: called after each; True ends the fit.
+            progress: called after each iteration. should_stop: called after each iteration; true ends the fit.
         """
         schedule = self.schedule
 
@@ -122,7 +123,7 @@ class StaticTrainer:
         return self.fit.losses
 
     def _after(self, now: FitStep, last: FitLoss) -> None:
-        """Change density, remove, assess and record, where an iteration is the time for it."""
+        """Runs density control, removal and exposure checks when they are due, and records the results."""
         settings, schedule, until = self.settings, self.schedule, self._until
         if last.colour_shift is not None:
             self.cameras[self.views[last.view].name] = camera_fit(last.psnr, last.colour_shift)
@@ -138,17 +139,19 @@ class StaticTrainer:
         schedule.end_iteration(len(self.fit))
 
     def _target(self, at: float) -> int:
-        """Gaussians that density control aims at, at a moment of the schedule."""
+        """Returns the target number of Gaussians at a point of the schedule."""
         share = (at - DENSIFY_FROM) / max(self._until - DENSIFY_FROM, 1)
         return round(self._start + (self.budget - self._start) * min(1.0, share + 0.1))
 
     def _expected(self, at: float) -> float:
-        """Gaussians at a moment of the schedule: of this fit where it is to come, else of another one like it."""
+        """Returns the expected number of Gaussians at a point of the schedule; past points predict another, similar
+        fit.
+        """
         aim, now = self._target(min(at, self._until)) if at >= DENSIFY_FROM else self._start, self.schedule.at
         return aim if at < now else len(self.fit) if now >= self._until else max(len(self.fit), aim)
 
     def _has_converged(self) -> bool:
-        """True once rounds over all views no longer lower the loss; one more round of them follows."""
+        """Returns true if passes over all views no longer lower the loss; one more pass follows."""
         losses, window = self.fit.losses, STOP_ROUNDS * len(self.views)
         if self.settings.stop_gain == 0 or len(losses) % window or len(losses) < 2 * window:
             return False
@@ -156,8 +159,8 @@ class StaticTrainer:
         return bool(before - now < self.settings.stop_gain * before)
 
     def scalars(self, now: FitStep) -> FitScalars:
-        """Rates of an iteration; in the last ones, each camera's colour shift is measured."""
-        # A shorter fit ends somewhere in a round: two hold every view.
+        """Returns the rates of an iteration; in the last ones, each camera's colour shift is also measured."""
+        # A shortened fit may end within a pass, but two passes include every view.
         rounds = 1 if self.schedule.stride == 1 else 2 * self.schedule.stride
         ending = now.begun >= self._last - len(self.views) * rounds
         return FitScalars(self._rates(now.begun), 1 - 0.9 * now.begun / self.settings.iterations, ending)
@@ -175,7 +178,7 @@ class StaticTrainer:
         return rates
 
     def control_density(self, target: int) -> None:
-        """Removes Gaussians that are all but transparent; clones or splits those with the largest screen gradients.
+        """Removes nearly transparent Gaussians; clones or splits those with the largest screen-space gradients.
 
         Args:
             target: number of Gaussians to reach.
@@ -200,8 +203,8 @@ class StaticTrainer:
     def remove_unseen(self) -> None:
         """Removes Gaussians that fewer than ``MIN_VIEWS`` cameras see.
 
-        A Gaussian that no camera sees is free to be anything and shows once the scene moves; one that a single camera
-        sees is a floater that explains this camera's picture and spoils all others.
+        A Gaussian that no camera sees is unconstrained and becomes visible when the scene moves. One that a single
+        camera sees is a floater that explains only this camera's image and degrades all others.
         """
         counts = np.zeros(len(self.fit), np.int64)
         state = self.gaussians()
@@ -209,7 +212,7 @@ class StaticTrainer:
             everywhere = np.ones((1, view.camera.height, view.camera.width), np.float32)
             counts += self.fit.renderer.gather(state, view.camera, everywhere)[:, 0] > SEEN_PIXELS
         needed = np.full(len(counts), min(MIN_VIEWS, len(self.views)))
-        if self.stage is not None:  # surroundings hide nothing from others
+        if self.stage is not None:  # points of the surroundings do not hide anything from other cameras
             needed[~self.stage.holds(state.means)] = 1
         keep = counts >= needed
         if keep.any():
@@ -217,7 +220,7 @@ class StaticTrainer:
             self.fit.replace_rows(np.flatnonzero(keep), np.zeros((0, COLUMNS), np.float32), none)
 
     def _half(self, half: Array, factors: Array) -> Array:
-        """Rows of parameters with smaller scales, each displaced by a sample of its own Gaussian."""
+        """Returns parameter rows with smaller scales, each displaced by a sample from its Gaussian."""
         offset = self.random.standard_normal((len(half), 3)).astype(np.float32)
         half = half.copy()
         half[:, MEAN] += np.einsum("nij,nj->ni", factors, offset)
@@ -225,12 +228,12 @@ class StaticTrainer:
         return half
 
     def gaussians(self) -> Gaussians:
-        """The state Θ_0; without masks every Gaussian may move."""
+        """Returns the state Θ_0; without masks, every Gaussian may move."""
         state = self.fit.state()
         return state if self._masked else state.replace(foreground=np.ones(len(state), np.float32))
 
     def result(self, losses: list[float]) -> StaticResult:
-        """Of the iterations so far."""
+        """Returns the result of the iterations so far."""
         exposures, planned, shortened = self.exposures.by_camera(), self.schedule.record, self.schedule.shortened
         return StaticResult(
             self.gaussians(),
@@ -255,9 +258,10 @@ def first_trainer(
     stage: Stage | None = None,
     device: str = "cpu",
 ) -> StaticTrainer:
-    """The trainer of ``fit_static_scene`` before its first iteration; arguments and errors are the same.
+    """Returns the trainer of ``fit_static_scene`` before its first iteration; arguments and errors are the same.
 
-    ``stage``: inside world, that surroundings lie beyond, which one camera alone may see; None without these.
+    ``stage``: region in the internal world; outside of it, points may be seen by a single camera. None without
+    surroundings.
     """
     if len(positions) == 0:
         raise ValueError("the first cloud holds no point; give points, masks, or more overlapping cameras")

@@ -1,4 +1,4 @@
-"""The seconds that frame 0 may take: how many are left for each of its parts, and what they were too few for."""
+"""The time limit of frame 0: remaining seconds for each step, and steps that had too little time."""
 
 from __future__ import annotations
 
@@ -7,27 +7,28 @@ from math import inf
 from time import perf_counter
 
 FEATURES = 0.15
-"""Share of the time after which features should be found,"""
+"""Share of the time by which features should be found."""
 MATCHES = 0.2
-"""their matches,"""
+"""Share of the time by which features should be matched."""
 STEREO = 0.35
-"""and stereo, each time that it is tried. Without a limit, all points of basketball, 27 cameras of 640x360, take a
-third of its frame 0, those of rigs of four to seven cameras less than a fifth."""
+"""Share of the time by which stereo should end, each time that it is tried. Without a limit, the initial points of
+basketball (27 cameras at 640x360) take a third of its frame 0. Those of rigs of four to seven cameras take less than a
+fifth."""
 AFTER_S = 2.5
-"""Seconds kept for what follows the fit: clusters, neighbours and the commit took 1 to 2 with 50,000 to 90,000
+"""Seconds reserved for the steps after the fit: clusters, neighbours and the commit took 1 to 2 with 50,000 to 90,000
 Gaussians."""
 AFTER_SHARE = 0.1
-"""Of the time, that is kept for it at most."""
+"""Maximum share of the time that is reserved for them."""
 
 
 class TimeLimit:
-    """Bounds the seconds of frame 0; asks for less work before it begins, by the pace that was measured.
+    """Limits the duration of frame 0 by selecting cheaper alternatives according to the measured pace.
 
     Args:
-        seconds: that frame 0 may take from now on; None: as many as it needs. clock: in seconds.
+        seconds: limit of frame 0 from now on; None for no limit. clock: returns seconds.
 
     Attributes:
-        shortened: what there was no time for, in words.
+        shortened: steps that had too little time, in words.
 
     >>> now = [0.0]
     >>> limit = TimeLimit(100.0, clock=lambda: now[0])
@@ -44,23 +45,24 @@ class TimeLimit:
 
     @property
     def bounded(self) -> bool:
-        """True where there is a limit."""
+        """True if there is a limit."""
         return self.seconds is not None
 
     def seconds_left(self, share: float = 1.0) -> float:
-        """Seconds until a share of the time is over, less than 0 once it is; infinity without a limit."""
+        """Returns the seconds until a share of the time has passed, negative afterwards; infinity without a limit."""
         return inf if self.seconds is None else self._began + share * self.seconds - self.clock()
 
     @property
     def seconds_left_for_fit(self) -> float:
-        """Seconds until the last iteration has to be over."""
+        """Seconds until the last iteration must end."""
         return inf if self.seconds is None else self.seconds_left() - min(AFTER_S, AFTER_SHARE * self.seconds)
 
     def choose(self, share: float, costs: Sequence[float]) -> int:
-        """Index of the first of several ways that ends before a share of the time is over; else their number.
+        """Returns the index of the first alternative that ends before a share of the time has passed; if none, their
+        number.
 
         Args:
-            costs: predicted seconds of each, the best way first.
+            costs: predicted seconds of each alternative, the best first.
         """
         left = self.seconds_left(share)
         return next((index for index, cost in enumerate(costs) if cost <= left), len(costs))

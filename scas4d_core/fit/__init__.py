@@ -1,1 +1,1 @@
-"""Fits Gaussians to the pictures of one frame: frame 0, and those that are added later."""
+"""Fits Gaussians to the images of one frame: those of frame 0 and those added later."""

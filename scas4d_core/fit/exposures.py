@@ -1,4 +1,4 @@
-"""Gain and offset of each camera, learnt while frame 0 is fitted, and given up where the cameras are alike."""
+"""Camera gains and offsets that are learnt with frame 0 and discarded if the cameras are alike."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from scas4d_core.kernels.adam import EVERY_ROW, adam
 Array = NDArray[np.float32]
 
 TRIAL, SPREAD = 0.3, 0.015
-"""Share of the iterations after which exposure terms are assessed, and the standard deviation of the gains over cameras
-below which they are given up. After 900 iterations it was 0.004 and 0.007 on equal cameras, 0.033 on a real rig."""
+"""Share of the iterations after which exposures are assessed, and standard deviation of the gains over cameras below
+which they are discarded. After 900 iterations it was 0.004 and 0.007 for equal cameras, and 0.033 for a real rig."""
 
 
 class Exposures:
     """Learns the exposures of the views of frame 0, in place.
 
     Args:
-        views: of the frame. rate: Adam's, of gain and offset. beta1, beta2: its decays.
+        views: of the frame. rate: Adam learning rate of gain and offset. beta1, beta2: Adam decays.
 
     Attributes:
-        on: whether they are learnt still.
+        on: whether exposures are still learnt.
     """
 
     def __init__(self, views: Sequence[TrainingView], on: bool, rate: float, beta1: np.float32, beta2: np.float32):
@@ -33,10 +33,10 @@ class Exposures:
         self._moments = {view.name: np.zeros((2, *view.exposure.shape), np.float32) for view in views}
 
     def step(self, view: TrainingView, gradient: Array, steps: int) -> None:
-        """Adam on a camera's gain and offset; afterwards their mean over cameras is brought back to 1 and 0.
+        """Applies an Adam step to a camera's gain and offset, then recentres their means over cameras to 1 and 0.
 
         Args:
-            gradient: [C, 2] of the loss; the label's does not count. steps: taken, this one too.
+            gradient: [C, 2] of the loss; that of the label is ignored. steps: number of steps including this one.
         """
         if not self.on:
             return
@@ -50,7 +50,7 @@ class Exposures:
             other.exposure[:3] -= centre
 
     def assess(self) -> None:
-        """Gives up gains and offsets that hardly differ from camera to camera."""
+        """Discards gains and offsets that hardly differ between cameras."""
         gains = np.array([view.exposure[:3, 0] for view in self._views])
         if gains.std(axis=0).mean() < SPREAD:
             self.on = False
@@ -58,5 +58,5 @@ class Exposures:
                 view.exposure[:] = (1, 0)
 
     def by_camera(self) -> dict[str, Array]:
-        """[3, 2] of each camera; none where they are not learnt."""
+        """Returns the [3, 2] exposure of each camera; empty if exposures are not learnt."""
         return {view.name: view.exposure[:3].copy() for view in self._views} if self.on else {}

@@ -1,7 +1,7 @@
-"""The one loop that fits Gaussians to pictures outside an update: in frame 0, when things are born, while they settle.
+"""The loop that fits Gaussians to images outside of updates: frame 0, new objects and their refinement.
 
-What differs between these is given to ``GaussianFit.run``: the order of the views, the rates of each iteration, where
-the schedule begins an iteration or ends the fit, and what is done after an iteration.
+Arguments of ``GaussianFit.run`` define the differences: the order of views, the rates of each iteration, the schedule,
+and actions after an iteration.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 Array = NDArray[np.float32]
 
 BETA1, BETA2 = np.float32(0.9), np.float32(0.999)
-"""Adam's decays, unless others are given: those of 3DGS."""
+"""Default Adam decays, as in 3DGS."""
 
 
 @dataclass(frozen=True)
 class FitStep:
-    """One iteration, in iterations of the full schedule: from ``begun`` to ``ended``.
+    """One iteration, from ``begun`` to ``ended`` in iterations of the full schedule.
 
     >>> step = FitStep(99.0, 101.5)
     >>> step.reaches(100), step.reaches(102), step.passes(100), step.passes(70)
@@ -39,38 +39,38 @@ class FitStep:
     ended: float
 
     def reaches(self, moment: float) -> bool:
-        """True where this iteration reaches a moment of the schedule."""
+        """Returns true if this iteration reaches the given point of the schedule."""
         return self.begun < moment <= self.ended
 
     def passes(self, every: float) -> bool:
-        """True where this iteration passes a multiple of ``every``."""
+        """Returns true if this iteration passes a multiple of ``every``."""
         return self.ended // every > self.begun // every
 
 
 def each_once(done: int) -> FitStep:
-    """The schedule of a fit that makes every iteration in full: iteration ``done``, counted from 0."""
+    """Returns the step for iteration ``done``, counted from 0, of a schedule that runs every iteration."""
     return FitStep(done, done + 1)
 
 
 def never(now: FitStep, last: FitLoss) -> bool:
-    """Ends no fit before its order of views is through."""
+    """Never ends a fit early."""
     return False
 
 
 class GaussianFit:
-    """Fits the rows of a table of parameters to views.
+    """Fits the rows of a parameter table to views.
 
     Args:
-        engine: of this fit alone. views: that are fitted.
-        parameters: [N, 15], columns as of ``engines.fit``; changed in place.
-        fixed: for each view, Gaussians that are drawn with the fitted ones and stay as they are; empty: none.
-        gloss: with which colours depend on direction, learnt as well.
-        exposures: of the views, learnt as well.
-        betas: Adam's decays. statistics: whether density control will ask for ``table.statistics``.
+        engine: used by this fit only. views: to fit.
+        parameters: [N, 15], with the columns of ``engines.fit``; changed in place.
+        fixed: for each view, fixed Gaussians that are rendered with the fitted ones; empty for none.
+        gloss: for view-dependent colours, learnt as well; None for constant colours.
+        exposures: of the views, learnt as well; None for fixed exposures.
+        betas: Adam decays. statistics: whether to collect ``table.statistics`` for density control.
 
     Attributes:
         views, exposures: as given. renderer: of the engine.
-        losses, psnr: of each iteration so far; dB of the view that it rendered.
+        losses, psnr: of each iteration so far; PSNR in dB of the rendered view.
 
     >>> from scas4d_core.captures import open_capture
     >>> from scas4d_core.engines.choose import fit_engine_of, renderer_of
@@ -117,11 +117,11 @@ class GaussianFit:
 
     @property
     def table(self) -> FitTable:
-        """Parameters, moments, statistics and gloss as they are now."""
+        """The current parameters, moments, statistics and gloss."""
         return self._engine.table()
 
     def state(self) -> Gaussians:
-        """The fitted Gaussians, without the fixed ones; their labels are between 0 and 1."""
+        """Returns the fitted Gaussians without the fixed ones; their labels are between 0 and 1."""
         return self._engine.state()
 
     def run(
@@ -131,12 +131,12 @@ class GaussianFit:
         begin: Callable[[int], FitStep | None] = each_once,
         end: Callable[[FitStep, FitLoss], bool] = never,
     ) -> None:
-        """Run iterations until the order of views is through, or ``begin`` or ``end`` says that the fit is over.
+        """Runs iterations until the order of views is exhausted, or until ``begin`` or ``end`` ends the fit.
 
         Args:
-            order: index of the view of each iteration. scalars: rates of an iteration.
-            begin: called before an iteration with the number of those of this run; None ends the fit.
-            end: called after an iteration with its loss; True ends the fit.
+            order: view index of each iteration. scalars: returns the rates of an iteration.
+            begin: called before an iteration with its number in this run; None ends the fit.
+            end: called after an iteration with its loss; true ends the fit.
         """
         for done, view in enumerate(order):
             now = begin(done)
@@ -151,14 +151,14 @@ class GaussianFit:
                 return
 
     def set_gloss(self, gloss: FitGloss) -> None:
-        """Continue with another gloss of the same Gaussians."""
+        """Continues with a different gloss for the same Gaussians."""
         self._engine.load_table(replace(self.table, gloss=gloss))
 
     def replace_rows(self, rows: NDArray[np.int64], added: Array, parents: NDArray[np.int64]) -> None:
-        """Keep some rows with their moments, and append others without; the statistics begin anew.
+        """Keeps some rows with their moments and appends new rows with zero moments; statistics are reset.
 
         Args:
-            added: [A, 15] parameters. parents: [A] rows that these come from, whose gloss they inherit.
+            added: [A, 15] parameters. parents: [A] source rows, whose gloss is inherited.
         """
         table, fresh = self.table, np.zeros_like(added)
         gloss = None if table.gloss is None else table.gloss.select_rows(rows, parents)

@@ -1,4 +1,4 @@
-"""Initial Gaussians: one for each point of the first cloud, and the budget of Gaussians that a scene may have."""
+"""Initial Gaussians, one per point of the initial cloud, and the maximum number of Gaussians in a scene."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ Array = NDArray[np.float32]
 
 INITIAL_OPACITY = 0.1
 PER_PIXEL, PER_COVERED_PIXEL, LARGEST_BUDGET = 0.34, 0.27, 100_000
-"""The rule for the budget of Gaussians where ``StaticSettings.max_gaussians`` is not set; ``detail`` is a share of it.
-Detail lies on objects: a picture that is mostly background needs nearly as many Gaussians as a full one. Beyond the
-largest an update takes seconds."""
+"""Parameters of the Gaussian budget if ``StaticSettings.max_gaussians`` is not set; ``detail`` scales it. Detail is on
+objects, but an image that is mostly background needs nearly as many Gaussians as a full one. Above the largest budget,
+an update takes seconds."""
 PLAIN = 2 / 255
-"""A pixel this near the background's colour is background."""
+"""Maximum colour difference from the background colour of a background pixel."""
 
 
 def budget(views: list[TrainingView], scene: SceneSettings, settings: StaticSettings) -> int:
-    """Largest number of Gaussians of the scene, by the setting or by the size and content of the pictures."""
+    """Returns the maximum number of Gaussians, from the setting or from the size and content of the images."""
     if settings.max_gaussians is not None:
         return settings.max_gaussians
     background = np.array(scene.background_rgb, np.float32)[:, None, None]
@@ -33,7 +33,7 @@ def budget(views: list[TrainingView], scene: SceneSettings, settings: StaticSett
 
 
 def logit(probability: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Inverse of the sigmoid, away from its ends."""
+    """Returns the inverse sigmoid, clamped near 0 and 1."""
     clipped = np.clip(probability, 1e-4, 1 - 1e-4)
     result: NDArray[np.floating] = np.log(clipped / (1 - clipped))
     return result
@@ -42,12 +42,12 @@ def logit(probability: NDArray[np.floating]) -> NDArray[np.floating]:
 def initial_parameters(
     positions: NDArray[np.float64], colours: Array, foreground: Array | None, limit: int, rng: np.random.Generator
 ) -> Array:
-    """A row of parameters per point: round Gaussians as wide as the mean distance to their three nearest neighbours.
+    """Returns one row per point: isotropic Gaussians whose width is the RMS distance to the three nearest neighbours.
 
     Args:
-        positions: [P, 3] metres inside. colours: [P, 3] in 0…1. foreground: [P] label or None.
-        limit: most Gaussians; of a larger cloud, points are left out at random.
-        rng: draws these.
+        positions: [P, 3] metres in the internal world. colours: [P, 3] in 0…1. foreground: [P] label or None.
+        limit: maximum number of Gaussians; a larger cloud is subsampled at random.
+        rng: for the subsampling.
     """
     if len(positions) > limit:
         keep = np.sort(rng.choice(len(positions), limit, replace=False))

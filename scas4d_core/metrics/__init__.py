@@ -1,4 +1,4 @@
-"""Scores of pictures, tracks and parts against the ground truth."""
+"""Metrics for images, tracks and parts compared with ground truth."""
 
 from scas4d_core.metrics.image import Score, flip, lpips, psnr, ssim
 from scas4d_core.metrics.parts import adjusted_rand_index

@@ -1,15 +1,16 @@
-"""Scores of a reconstruction on a capture: pictures, tracks, parts and flicker on its test cameras and ground truth.
+"""Evaluation of a reconstruction on the test cameras and ground truth of a capture: images, tracks, parts and flicker.
 
-Definitions, beside those in ``scas4d_core.metrics``:
+Definitions in addition to those in ``scas4d_core.metrics``:
 
-- A *moving* ground-truth point moves more than 1 % of the extent away from its place at frame 0 at some time.
-- *Foreground* pixels are those of the test camera's mask; *changed* pixels differ by more than 0.1 in some channel
-  from the true picture of frame 0.
-- 3D tracks start from the true points at frame 0. 2D tracks start from the pixels where a test camera has the moving
-  points that it sees at frame 0, go through rendered depth, and count where the camera truly sees the point.
-- Parts are rendered with as many labels as the scene has foreground parts, and compared where the true label is a part.
-- *Still* pixels of a test camera show something, and their true values stay within 6 of 255 levels over the frames that
-  are measured. *Flicker* is the standard deviation over time of what is rendered there, in levels.
+- A *moving* ground-truth point moves at some time more than 1 % of the extent away from its position at frame 0.
+- *Foreground* pixels are those of the test camera's mask. *Changed* pixels differ by more than 0.1 in some channel from
+  the ground-truth image of frame 0.
+- 3D tracks start from the ground-truth points at frame 0. 2D tracks start from the pixels of the moving points that a
+  test camera sees at frame 0, and use rendered depth. They count in frames in which the camera sees the point.
+- Parts are rendered with as many labels as the scene has foreground parts, and compared at pixels whose true label is a
+  part.
+- *Still* pixels of a test camera are not black, and their true values stay within 6 of 255 levels over the measured
+  frames. *Flicker* is the temporal standard deviation of the rendered values at these pixels, in levels.
 """
 
 from __future__ import annotations
@@ -31,16 +32,16 @@ if TYPE_CHECKING:
     from scas4d_core.reconstruction import Reconstruction
 
     Committed = Reconstruction | CommittedScene
-    """That has the frames which are measured."""
+    """A scene that has committed the measured frames."""
 
 MOVING_SHARE = 0.01
-"""Of the extent: a true point that moves less than this counts as standing."""
+"""Distance, as a share of the extent, up to which a ground-truth point counts as static."""
 CHANGED = 0.1
-"""In 0…1: a pixel that differs more from frame 0 in some channel has changed."""
+"""Difference from frame 0 in 0…1, in some channel, above which a pixel has changed."""
 STILL_LEVELS = 6
-"""Of 255: the true pictures' own noise; a pixel that stays within them in every channel does not change."""
+"""Range in levels of 255, in every channel, of a still pixel; covers the noise of the ground-truth images."""
 MIN_STILL = 500
-"""Still pixels over all test cameras from which flicker is measured; fewer are chance."""
+"""Minimum number of still pixels over all test cameras for a meaningful flicker."""
 
 Scores = dict[str, float | None]
 
@@ -48,13 +49,13 @@ Scores = dict[str, float | None]
 def measure_pictures(
     reconstruction: Committed, capture: Capture, index: int, *, with_lpips: bool = False
 ) -> tuple[Scores, dict[str, Scores]]:
-    """Scores of one committed frame on the test cameras: their mean, and by camera.
+    """Returns the scores of one committed frame on the test cameras: their mean, and by camera.
 
     Args:
         reconstruction: has committed the frame.
-        capture: opened at the scale at which it is measured, with masks.
-        index: the frame.
-        with_lpips: also LPIPS, which loads torch.
+        capture: opened at the measured image scale, with masks.
+        index: of the frame.
+        with_lpips: also computes LPIPS, which loads torch.
     """
     rig, truth, first = capture.test_rig, capture.test_frame(index), capture.test_frame(0)
     assert rig is not None
@@ -76,7 +77,7 @@ def measure_pictures(
 
 
 def measure_tracks(reconstruction: Committed, capture: Capture, indices: Sequence[int]) -> Scores:
-    """3D error, 2D error without and with oracle, and visibility accuracy over committed frames; the first is 0."""
+    """Returns 3D error, 2D error with and without oracle, and visibility accuracy; ``indices`` starts with frame 0."""
     truth, rig = capture.ground_truth, capture.test_rig
     assert truth is not None
     assert rig is not None
@@ -124,7 +125,7 @@ def measure_tracks(reconstruction: Committed, capture: Capture, indices: Sequenc
 
 
 def measure_parts(reconstruction: Committed, capture: Capture, indices: Sequence[int]) -> Scores:
-    """Adjusted Rand index of rendered part labels, pooled over the test cameras that have labels and the frames."""
+    """Returns the adjusted Rand index of rendered part labels, pooled over frames and test cameras with labels."""
     truth, rig = capture.ground_truth, capture.test_rig
     assert truth is not None
     assert rig is not None
@@ -136,19 +137,20 @@ def measure_parts(reconstruction: Committed, capture: Capture, indices: Sequence
     rendered, true = [], []
     for camera in cameras:
         for index in indices:
-            rendered.append(render_parts(reconstruction, camera, index, labels).ravel())  # cameras differ in size
+            # image sizes differ between cameras
+            rendered.append(render_parts(reconstruction, camera, index, labels).ravel())
             true.append(truth.labels(camera.name, index).ravel())
     index_of_all = metrics.adjusted_rand_index(np.concatenate(rendered), np.concatenate(true))
     return {"parts_ari": index_of_all, "parts_count": float(count)}
 
 
 def measure_flicker(reconstruction: Committed, capture: Capture, indices: Sequence[int]) -> Scores:
-    """Mean temporal standard deviation, in 255ths, of the still pixels of the test cameras; how many there are."""
+    """Returns the mean temporal standard deviation of still pixels in levels of 255, and the number of still pixels."""
     rig = capture.test_rig
     assert rig is not None
     deviations: list[NDArray[Any]] = []
     for camera in rig.cameras:
-        # Frame by frame: a long capture does not fit into memory.
+        # One frame at a time, because a long capture does not fit into memory.
         lowest = highest = capture.test_frame(indices[0]).images[camera.name]
         for index in indices[1:]:
             true = capture.test_frame(index).images[camera.name]
@@ -169,20 +171,20 @@ def measure_flicker(reconstruction: Committed, capture: Capture, indices: Sequen
 
 
 def render_parts(reconstruction: Committed, camera: Camera, index: int, labels: NDArray[Any]) -> NDArray[np.uint8]:
-    """[H, W] part labels of one view."""
+    """Returns the [H, W] part labels of one view."""
     parts: NDArray[np.uint8] | None = reconstruction.render(camera, index, labels=labels).parts
     assert parts is not None  # labels were given
     return parts
 
 
 def moving_points(points: NDArray[np.float64], extent: float) -> NDArray[np.bool_]:
-    """[P] of [T, P, 3]: which points leave their place of the first frame by more than 1 % of the extent."""
+    """Returns [P] true for points of [T, P, 3] that move more than 1 % of the extent from their first position."""
     moving: NDArray[np.bool_] = np.linalg.norm(points - points[:1], axis=-1).max(axis=0) > MOVING_SHARE * extent
     return moving
 
 
 def mean_scores(of: Iterable[Scores]) -> Scores:
-    """The mean of every score over those that have it."""
+    """Returns the mean of every score over the entries that have it."""
     table = list(of)
     names = dict.fromkeys(name for scores in table for name in scores)
     return {name: _mean([scores.get(name) for scores in table]) for name in names}
@@ -194,5 +196,7 @@ def _mean(values: list[float | None]) -> float | None:
 
 
 def _finite(value: float) -> float | None:
-    """JSON has no NaN; infinity (identical pixels, everything lost) would spoil a mean."""
+    """Returns None for non-finite values: JSON has no NaN, and infinity (identical pixels, all points lost) would spoil
+    a mean.
+    """
     return value if math.isfinite(value) else None

@@ -1,7 +1,6 @@
-"""Compares pictures with the truth: PSNR, SSIM, FLIP, LPIPS.
+"""Image metrics compared with ground truth: PSNR, SSIM, FLIP and LPIPS.
 
-Pictures are [H, W, 3]: floats in 0…1, or uint8 in 0…255. Rendered values outside 0…1 are clamped first, as a display
-does.
+Images are [H, W, 3]: floats in 0…1, or uint8 in 0…255. Rendered values outside 0…1 are clamped first, as on a display.
 """
 
 from __future__ import annotations
@@ -23,16 +22,16 @@ SSIM_C1 = 0.01**2
 SSIM_C2 = 0.03**2
 
 LPIPS_BACKBONES = {"vgg": "vgg16-397923af.pth", "alex": "alexnet-owt-7be5be79.pth"}
-"""The files of torchvision's weights that the lpips package loads, as torch.hub caches them."""
+"""Weight files of torchvision that the lpips package loads, as cached by torch.hub."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """A metric that may not be available here.
+    """The value of a metric that may be unavailable.
 
     Attributes:
-        value: None where the metric could not be computed.
-        reason: fault and remedy; empty where there is a value.
+        value: None if the metric could not be computed.
+        reason: fault and remedy; empty if there is a value.
     """
 
     value: float | None
@@ -40,18 +39,18 @@ class Score:
 
 
 def psnr(image: NDArray[Any], truth: NDArray[Any], mask: NDArray[Any] | None = None) -> float:
-    """Peak signal-to-noise ratio, −10 log10 of the mean squared error over pixels and channels, in dB.
+    """Returns the peak signal-to-noise ratio in dB: −10 log10 of the mean squared error over pixels and channels.
 
     Args:
         image: [H, W, 3] rendered.
         truth: [H, W, 3].
-        mask: [H, W]; only pixels where it is not zero count, for example the foreground's.
+        mask: [H, W]; only non-zero pixels count, such as those of the foreground.
 
     Returns:
-        dB; infinity for equal pictures; NaN for an empty mask.
+        PSNR in dB; infinity for equal images; NaN for an empty mask.
 
     Raises:
-        ValueError: shapes differ, or values are not finite.
+        ValueError: the shapes differ, or values are not finite.
 
     >>> truth = np.zeros((8, 8, 3))
     >>> round(psnr(truth + 0.1, truth), 6), psnr(truth, truth)
@@ -70,19 +69,20 @@ def psnr(image: NDArray[Any], truth: NDArray[Any], mask: NDArray[Any] | None = N
 
 
 def ssim(image: NDArray[Any], truth: NDArray[Any]) -> float:
-    """Structural similarity (Wang et al. 2004), mean over pixels and channels, as 3D Gaussian Splatting computes it.
+    """Returns the structural similarity (Wang et al. 2004), mean over pixels and channels, as in 3D Gaussian Splatting.
 
-    11×11 Gaussian window with σ = 1.5 px, zeros beyond the edges, C1 = 0.01², C2 = 0.03², biased variances, values 0…1.
+    It uses an 11×11 Gaussian window with σ = 1.5 px, zero padding, C1 = 0.01², C2 = 0.03², biased variances and values
+    in 0…1.
 
     Args:
         image: [H, W, 3] rendered.
         truth: [H, W, 3].
 
     Returns:
-        At most 1, for equal pictures.
+        At most 1, which means equal images.
 
     Raises:
-        ValueError: shapes differ, or values are not finite.
+        ValueError: the shapes differ, or values are not finite.
 
     >>> picture = np.random.default_rng(0).random((32, 32, 3))
     >>> ssim(picture, picture), round(ssim(1 - picture, picture), 2)
@@ -100,14 +100,14 @@ def ssim(image: NDArray[Any], truth: NDArray[Any]) -> float:
 
 
 def flip(image: NDArray[Any], truth: NDArray[Any]) -> Score:
-    """Mean LDR-ꟻLIP error (Andersson et al. 2020) at the 67 pixels per degree its authors recommend; 0 means equal.
+    """Returns the mean LDR-ꟻLIP error (Andersson et al. 2020) at the recommended 67 pixels per degree; 0 means equal.
 
     Args:
         image: [H, W, 3] rendered, sRGB.
         truth: [H, W, 3], sRGB.
 
     Raises:
-        ValueError: shapes differ, or values are not finite.
+        ValueError: the shapes differ, or values are not finite.
 
     >>> picture = np.full((16, 16, 3), 0.5)
     >>> flip(picture, picture)
@@ -130,7 +130,7 @@ def flip(image: NDArray[Any], truth: NDArray[Any]) -> Score:
 
 
 def lpips(image: NDArray[Any], truth: NDArray[Any], backbone: str = "vgg") -> Score:
-    """Learnt perceptual distance LPIPS (Zhang et al. 2018); 0 means equal. Nothing is downloaded.
+    """Returns the learned perceptual distance LPIPS (Zhang et al. 2018); 0 means equal. Nothing is downloaded.
 
     Args:
         image: [H, W, 3] rendered.
@@ -138,14 +138,14 @@ def lpips(image: NDArray[Any], truth: NDArray[Any], backbone: str = "vgg") -> Sc
         backbone: "vgg" (as 3D Gaussian Splatting reports) or "alex".
 
     Returns:
-        No value where the lpips package or the weights of its backbone are not on this machine.
+        A score without a value if the lpips package or its weights are not installed.
 
     Raises:
-        ValueError: shapes differ, values are not finite, or no such backbone.
+        ValueError: the shapes differ, values are not finite, or the backbone is unknown.
 
     >>> picture = np.full((64, 64, 3), 0.5)
     >>> score = lpips(picture, picture)
-    >>> score.value == 0 or score.reason != ""  # not where the network's weights are missing
+    >>> score.value == 0 or score.reason != ""  # the weights of the network may be missing
     True
     """
     first, second = _pair(image, truth)

@@ -1,4 +1,4 @@
-"""Compares part labels with the truth."""
+"""Comparison of part labels with ground truth."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from sklearn.metrics import adjusted_rand_score
 def adjusted_rand_index(
     labels: NDArray[Any], truth: NDArray[Any], foreground: NDArray[np.bool_] | None = None
 ) -> float:
-    """Agreement of two partitions of the foreground's pixels, corrected for chance (Hubert and Arabie 1985).
+    """Returns the agreement of two partitions of the foreground pixels, corrected for chance (Hubert and Arabie 1985).
 
-    Pixels of several frames and cameras are pooled when stacked, so a part must keep its label over them; the
-    numbers themselves do not matter. A foreground pixel without any rendered part counts with the label that ``labels``
-    has there, as one more part.
+    Stacked pixels of several frames and cameras are pooled, so a part must have the same label in all of them; the
+    label numbers do not matter. A foreground pixel without a rendered part counts with its value in ``labels``, as one
+    more part.
 
     Args:
         labels: [...] integers, rendered.
-        truth: [...] integers, the same shape.
-        foreground: [...] bool, the pixels that count; None: those where truth is not 0.
+        truth: [...] integers of the same shape.
+        foreground: [...] bool, pixels that count; None for those with non-zero truth.
 
     Returns:
-        1 for the same partition, about 0 for chance.
+        1 for the same partition, about 0 for random labels.
 
     Raises:
-        ValueError: shapes differ, or no pixel is foreground.
+        ValueError: the shapes differ, or no pixel is foreground.
 
     >>> truth = np.array([0, 1, 1, 2, 2])  # the first pixel is background
     >>> adjusted_rand_index(np.array([5, 7, 7, 4, 4]), truth)

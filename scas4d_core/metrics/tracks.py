@@ -1,7 +1,7 @@
-"""Compares point tracks with the truth.
+"""Comparison of point tracks with ground truth.
 
-A track without a finite position in a frame (behind the camera, lost) misses the point: in two dimensions by one whole
-diagonal, in three by infinity. The query's own frame does not count, for its answer is given.
+A track without a finite position in a frame (behind the camera, or lost) has an error of one image diagonal in 2D and
+infinity in 3D. The query frame does not count, because its position is given.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 ORACLE_RADIUS_PX = 10.0
-"""The paper's radius about the ground-truth point in the first frame (section "Point-Tracking")."""
+"""The paper's radius around the ground-truth point in the first frame (section "Point-Tracking"), in pixels."""
 
 LOST_PERCENT = 2.0
-"""Of the extent: a part is lost whose points are farther off, in the median."""
+"""Median error of a part's points, in percent of the extent, above which the part counts as lost."""
 
 
 @dataclass(frozen=True)
 class TrackError:
-    """Distances of tracks in percent of the extent, pooled over points and frames.
+    """Track errors in percent of the extent, pooled over points and frames.
 
     Attributes:
-        median: %; infinity where at least half of the positions are lost.
-        percentile_90: %; the smallest observed distance that 90 % do not exceed.
-        count: of positions.
+        median: in %; infinity if at least half of the positions are lost.
+        percentile_90: in %; the smallest observed error that 90 % do not exceed.
+        count: number of positions.
     """
 
     median: float
@@ -44,24 +44,24 @@ def median_trajectory_error(
     *,
     query: int = 0,
 ) -> float:
-    """2D MTE without oracle: median over frames of each track's pixel error, mean over tracks, in % of the diagonal.
+    """Returns the 2D MTE without oracle: median pixel error per track, mean over tracks, in % of the diagonal.
 
-    The definition is that of PointOdyssey (Zheng et al. 2023, ``median_l2``), which Dynamic 3D Gaussians follows,
-    without the query's frame; the paper (Point-Tracking) normalizes by the diagonal of the picture.
+    The definition follows PointOdyssey (Zheng et al. 2023, ``median_l2``), as in Dynamic 3D Gaussians, without the
+    query frame. The paper (Point-Tracking) normalizes by the image diagonal.
 
     Args:
-        tracks: [T, Q, 2] predicted pixels, NaN where lost.
+        tracks: [T, Q, 2] predicted pixels, NaN if lost.
         truth: [T, Q, 2] pixels.
-        counted: [T, Q] bool: frames in which the truth counts, visible in that camera. A track never counted is left
-            out.
-        diagonal: of the picture, pixels.
-        query: the frame in which the points were given; it does not count.
+        counted: [T, Q] bool: frames in which the point is visible in the camera and counts. Tracks that never count are
+            ignored.
+        diagonal: of the image, in pixels.
+        query: frame in which the points were given; it does not count.
 
     Returns:
-        %; NaN where nothing counts.
+        Error in %; NaN if nothing counts.
 
     Raises:
-        ValueError: shapes differ.
+        ValueError: the shapes differ.
 
     >>> truth = np.zeros((3, 1, 2))
     >>> tracks = truth + [[[0, 0]], [[3, 4]], [[3, 4]]]
@@ -81,28 +81,29 @@ def oracle_tracks(
     radius: float = ORACLE_RADIUS_PX,
     query: int = 0,
 ) -> NDArray[np.float64]:
-    """The paper's oracle: of the candidates near a point in the query frame, the one whose track fits the truth best.
+    """Returns the paper's oracle tracks: of the candidates near a point in the query frame, the one with the best
+    track.
 
-    The oracle uses the answer, so its error (`median_trajectory_error` of these tracks) bounds what the centroids can
-    reach and does not measure tracking; report it beside the error without oracle.
+    The oracle uses the ground truth. Its error (`median_trajectory_error` of these tracks) is a bound for the centroids
+    and does not measure tracking. Report it together with the error without oracle.
 
     Args:
         candidates: [T, N, 2] pixels of all Gaussian centroids, NaN behind the camera.
         truth: [T, Q, 2] pixels.
         counted: [T, Q] bool: frames in which the truth counts.
-        radius: pixels about the true point in the query frame. Where no candidate lies within it, the nearest is taken
-            (the paper does not say).
-        query: the frame in which candidates are chosen.
+        radius: in pixels around the true point in the query frame. If it contains no candidate, the nearest is used
+            (the paper does not specify this case).
+        query: frame in which candidates are selected.
 
     Returns:
-        [T, Q, 2] tracks of the chosen candidates.
+        [T, Q, 2] tracks of the selected candidates.
 
     Raises:
-        ValueError: shapes do not fit, or no candidate is in front of the camera.
+        ValueError: the shapes do not match, or no candidate is in front of the camera.
 
     >>> truth = np.zeros((2, 1, 2))
     >>> candidates = np.array([[[1, 0], [2, 0]], [[9, 0], [0, 0]]], float)  # [T, N, 2]
-    >>> oracle_tracks(candidates, truth, np.ones((2, 1), bool))[:, 0]  # the second stays nearer
+    >>> oracle_tracks(candidates, truth, np.ones((2, 1), bool))[:, 0]  # the second candidate has the better track
     array([[2., 0.],
            [0., 0.]])
     """
@@ -129,17 +130,17 @@ def oracle_tracks(
 def track_error_3d(
     tracks: NDArray[Any], truth: NDArray[Any], moving: NDArray[np.bool_], extent: float, *, query: int = 0
 ) -> TrackError:
-    """3D distance of tracks to the truth in % of the extent, pooled over moving points and all frames but the query's.
+    """Returns the 3D track error in % of the extent, pooled over moving points and all frames except the query frame.
 
     Args:
-        tracks: [T, P, 3] predicted, user's units; not finite where lost.
-        truth: [T, P, 3], user's units.
-        moving: [P] bool, the points that count: those that move at all (standing ones would flatter the median).
-        extent: longest side of the box of the foreground, user's units.
-        query: the frame in which the points were given; it does not count.
+        tracks: [T, P, 3] predicted, in user units; not finite if lost.
+        truth: [T, P, 3], in user units.
+        moving: [P] bool, points that count: only moving ones, because static points would lower the median.
+        extent: longest side of the foreground's bounding box, in user units.
+        query: frame in which the points were given; it does not count.
 
     Raises:
-        ValueError: shapes differ, extent not positive, or no point moves.
+        ValueError: the shapes differ, the extent is not positive, or no point moves.
 
     >>> truth = np.zeros((3, 4, 3))
     >>> track_error_3d(truth + [0, 0, 0.25], truth, moving=np.ones(4, bool), extent=2.0)
@@ -155,7 +156,7 @@ def track_error_3d(
     if pooled.size == 0:
         raise ValueError("no point moves, or there is only the query frame: nothing to measure")
     pooled = np.where(np.isfinite(pooled), pooled, np.inf) * (100.0 / extent)
-    # Inverted CDF: no interpolation, which would make NaN of two infinities.
+    # Inverted CDF, because interpolation between two infinities gives NaN.
     ninety = np.quantile(pooled, 0.9, method="inverted_cdf")
     return TrackError(float(np.median(pooled)), float(ninety), int(pooled.size))
 
@@ -163,15 +164,15 @@ def track_error_3d(
 def lost_parts(
     tracks: NDArray[Any], truth: NDArray[Any], part_id: NDArray[Any], moving: NDArray[np.bool_], extent: float
 ) -> list[int]:
-    """Ids of the parts that are lost in the last frame: their moving points are off by more than ``LOST_PERCENT``.
+    """Returns the ids of parts that are lost in the last frame: their median error exceeds ``LOST_PERCENT``.
 
     Args:
-        tracks: [T, P, 3] predicted, not finite where lost. truth: [T, P, 3]. Both in the user's units.
-        part_id: [P], the part of each point. moving: [P] bool, the points that count.
-        extent: user's units.
+        tracks: [T, P, 3] predicted, not finite if lost. truth: [T, P, 3]. Both in user units.
+        part_id: [P], part of each point. moving: [P] bool, points that count.
+        extent: in user units.
 
     Raises:
-        ValueError: as ``track_error_3d``.
+        ValueError: as in ``track_error_3d``.
 
     >>> truth = np.zeros((2, 4, 3))
     >>> tracks = truth + np.array([0.1, 0.0, 0.5, 0.4])[:, None]
@@ -195,20 +196,20 @@ def error_by_confidence(
     query: int = 0,
     groups: int = 4,
 ) -> list[float]:
-    """Median 3D error in % of the extent of equally large groups of positions, the most confident first.
+    """Returns the median 3D error in % of the extent for equal groups of positions, most confident first.
 
-    A meaningful confidence gives rising numbers. Positions count as in ``track_error_3d``.
+    The errors increase if the confidence is meaningful. Positions count as in ``track_error_3d``.
 
     Args:
-        tracks: [T, P, 3] predicted. truth: [T, P, 3]. Both in the user's units.
+        tracks: [T, P, 3] predicted. truth: [T, P, 3]. Both in user units.
         confidence: [T, P].
-        moving: [P] bool, the points that count.
-        extent: user's units.
-        query: the frame in which the points were given; it does not count.
-        groups: number of groups; the least confident positions beyond a multiple of it are left out.
+        moving: [P] bool, points that count.
+        extent: in user units.
+        query: frame in which the points were given; it does not count.
+        groups: number of groups; the least confident positions that do not fill the groups evenly are ignored.
 
     Raises:
-        ValueError: as ``track_error_3d``, or confidence of another shape.
+        ValueError: as in ``track_error_3d``, or the confidence has a different shape.
 
     >>> truth = np.zeros((2, 4, 3))
     >>> tracks = truth + np.array([1, 2, 3, 4])[:, None] * [1, 0, 0]
@@ -218,7 +219,7 @@ def error_by_confidence(
     """
     if confidence.shape != tracks.shape[:2]:
         raise ValueError(f"confidence has shape {confidence.shape}; give [T, P] = {tracks.shape[:2]}")
-    track_error_3d(tracks, truth, moving, extent, query=query)  # the same checks
+    track_error_3d(tracks, truth, moving, extent, query=query)  # validates the arguments
     chosen = np.ix_(np.arange(len(truth)) != query, moving)
     distances = np.linalg.norm(tracks.astype(np.float64) - truth.astype(np.float64), axis=-1)[chosen].ravel()
     distances = np.where(np.isfinite(distances), distances, np.inf) * (100.0 / extent)
@@ -228,18 +229,18 @@ def error_by_confidence(
 
 
 def visibility_accuracy(predicted: NDArray[np.bool_], truth: NDArray[np.bool_], *, query: int = 0) -> float:
-    """Share of points and frames, 0…1, whose visibility was predicted rightly: the occlusion accuracy of TAP-Vid.
+    """Returns the share of correct visibility predictions, 0…1: the occlusion accuracy of TAP-Vid.
 
     Args:
         predicted: [T, Q] bool.
         truth: [T, Q] bool.
-        query: the frame in which the points were given; it does not count.
+        query: frame in which the points were given; it does not count.
 
     Raises:
-        ValueError: shapes differ.
+        ValueError: the shapes differ.
 
     >>> truth = np.array([[True, True], [True, False]])
-    >>> visibility_accuracy(np.ones((2, 2), bool), truth)  # the query's frame does not count
+    >>> visibility_accuracy(np.ones((2, 2), bool), truth)  # the query frame does not count
     0.5
     """
     if predicted.shape != truth.shape or truth.ndim != 2:
@@ -268,6 +269,6 @@ def _without_query(counted: NDArray[np.bool_], shape: tuple[int, ...], query: in
 
 
 def _medians(errors: NDArray[np.float64], counts: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Median of each column over the rows that count; columns where none does are left out."""
+    """Returns the median of each column over the rows that count; columns without such rows are left out."""
     columns = [np.median(errors[counts[:, column], column]) for column in np.flatnonzero(counts.any(axis=0))]
     return np.array(columns, dtype=np.float64)

@@ -1,1 +1,1 @@
-"""Answers from committed states: views, tracks, parts, ply."""
+"""Queries on committed states: views, tracks, parts and PLY files."""

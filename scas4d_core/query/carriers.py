@@ -1,4 +1,4 @@
-"""The Gaussians that carry a point, and the point that follows from where they say that it is. Numpy only."""
+"""The Gaussians that carry a point, and the position that they give it. NumPy only."""
 
 from __future__ import annotations
 
@@ -10,29 +10,30 @@ from scas4d_core.gaussians import Gaussians
 Float = NDArray[np.float64]
 
 WEISZFELD_ROUNDS = 12
-"""Rounds of the geometric median: by then it moves by a small part of the carriers' spread."""
+"""Number of iterations of the geometric median; later changes are a small part of the carriers' spread."""
 BYTES_AT_ONCE = 64e6
-"""Working memory of the search for carriers."""
+"""Working memory for the search for carriers, in bytes."""
 ABSENT = -1e9
-"""Logarithm of the opacity of a retired Gaussian: it carries nothing, wherever it was."""
+"""Logarithm of the opacity of a retired Gaussian, so that it carries no points."""
 MIN_PRESENT_WEIGHT = 0.05
-"""Of the weight of a point's carriers, that has to be there: the few at its edge do not determine its place."""
+"""Minimum share of a point's carrier weight that must be present; a few carriers at its edge do not determine it."""
 
 
 def carriers(
     gaussians: Gaussians, points: Float, count: int, softening: float
 ) -> tuple[NDArray[np.intp], Float, Float]:
-    """Gaussians that points lie in most: those of largest o·exp(−½ m²), m the Mahalanobis distance.
+    """Returns the Gaussians that carry points: those with the largest o·exp(−½ m²), where m is the Mahalanobis
+    distance.
 
     Args:
         gaussians: the state, N Gaussians.
-        points: [Q, 3] metres, inside world.
-        count: K, Gaussians that carry a point (N where there are fewer).
-        softening: metres; m is taken in Σ + softening²·I.
+        points: [Q, 3] metres, in the internal world.
+        count: K, number of Gaussians that carry a point (at most N).
+        softening: in metres; m is computed with Σ + softening²·I.
 
     Returns:
-        Rows [Q, K], heaviest first; weights [Q, K] that sum to 1, in proportion to o·exp(−½ m²) (far from all,
-        the nearest alone carries); the opacity 1 − Π(1 − o·exp(−½ m²)) of the K at the point, [Q].
+        Rows [Q, K], largest weight first. Weights [Q, K] proportional to o·exp(−½ m²), which sum to 1; far from all
+        Gaussians, only the nearest counts. Opacity 1 − Π(1 − o·exp(−½ m²)) of the K carriers at the point, [Q].
 
     >>> state = Gaussians.of_points([[0, 0, 0], [1, 0, 0]], radius=0.2)
     >>> rows, weights, opacity = carriers(state, np.array([[0.1, 0, 0]]), count=1, softening=0.0)
@@ -66,19 +67,19 @@ def carriers(
 
 
 def geometric_median(points: Float, weights: Float) -> Float:
-    """Geometric median [Q, 3]: the point of least weighted distance to K others, by Weiszfeld's iteration.
+    """Returns the geometric median [Q, 3] of K points by Weiszfeld's iteration.
 
     Args:
         points: [Q, K, 3].
         weights: [Q, K], sum 1.
 
     >>> points = np.array([[[0, 0, 0], [0.1, 0, 0], [9, 9, 9]]])
-    >>> bool(np.linalg.norm(geometric_median(points, np.full((1, 3), 1 / 3))) < 0.2)  # the stray does not count
+    >>> bool(np.linalg.norm(geometric_median(points, np.full((1, 3), 1 / 3))) < 0.2)  # the outlier is ignored
     True
     """
     centre: Float = np.einsum("qk,qki->qi", weights, points)
     if points.shape[1] < 3:
-        return centre  # of two points every point between is a median
+        return centre  # any point between two points is a median
     for _ in range(WEISZFELD_ROUNDS):
         distance = np.linalg.norm(points - centre[:, None], axis=-1)
         pull = weights / np.maximum(distance, 1e-9)
@@ -87,7 +88,7 @@ def geometric_median(points: Float, weights: Float) -> Float:
 
 
 def drop_absent(answers: Float, weights: Float, there: NDArray[np.bool_]) -> tuple[Float, Float, NDArray[np.bool_]]:
-    """Answers [Q, K, 3] and weights of the carriers that are there, and [Q] whether any is that weighs."""
+    """Returns positions [Q, K, 3] and weights of the present carriers, and [Q] whether enough weight is present."""
     if there.all():
         return answers, weights, np.ones(len(answers), np.bool_)
     shares = np.where(there, weights, 0)

@@ -1,4 +1,4 @@
-"""Queries about the committed states of a scene: novel views, tracks, parts and exports of any frame."""
+"""Queries on the committed states of a scene: novel views, tracks, parts and exports of any frame."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from scas4d_core.storage.history import History
 
 
 class CommittedScene:
-    """Answers queries about a history. Cameras and points are in the user's world; ``index`` None is the newest frame.
+    """Queries on a history. Cameras and points are in the user's world; ``index`` None is the newest frame.
 
     >>> history = History()
     >>> history.append(0, 0.0, Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0]))
@@ -51,13 +51,13 @@ class CommittedScene:
         """Renders a novel view.
 
         Args:
-            camera: user's world. index: a committed frame.
-            background: RGB in 0…1 behind everything; the scene's where None.
-            labels: [N] part of each Gaussian, −1 for none; given where ``View.parts`` is wanted. Those of the newest
-                frame are for any: of Gaussians born later nothing is shown.
+            camera: in the user's world. index: of a committed frame.
+            background: RGB in 0…1; None for the scene's background.
+            labels: [N] part of each Gaussian, −1 for none; required for ``View.parts``. Labels of the newest frame are
+                valid for any frame: those of Gaussians added later are ignored.
 
         Raises:
-            HistoryError: the frame was not committed. ValueError: labels of another shape or range.
+            HistoryError: the frame was not committed. ValueError: the labels have a wrong shape or range.
         """
         gaussians = self._state(index)
         if labels is not None and np.shape(labels) == (self.history.count,):
@@ -73,30 +73,30 @@ class CommittedScene:
         return view.depth, view.alpha
 
     def tracks_of_points(self, points: NDArray[Any], index: int, indices: Sequence[int]) -> Tracks:
-        """Trajectories of points [Q, 3] of frame ``index`` over ``indices``; see ``tracks.tracks_of_points``."""
+        """Tracks points [Q, 3] of frame ``index`` over the frames ``indices``; see ``tracks.tracks_of_points``."""
         return tracks_of_history.tracks_of_points(self.history, self.world, points, index, indices)
 
     def tracks_of_pixels(self, camera: Camera, uv: NDArray[Any], index: int, indices: Sequence[int]) -> Tracks:
-        """Trajectories of the surface points at pixels [Q, 2] of frame ``index``; see ``tracks.tracks_of_pixels``."""
+        """Tracks the surface points at pixels [Q, 2] of frame ``index``; see ``tracks.tracks_of_pixels``."""
         return tracks_of_history.tracks_of_pixels(
             self.history, self.world, camera, uv, index, indices, self._depth, limits=self._limits
         )
 
     def tracks_of_ids(self, ids: NDArray[Any], indices: Sequence[int]) -> Tracks:
-        """Trajectories of Gaussians by id [Q]."""
+        """Returns the trajectories of Gaussians by id [Q]."""
         return tracks_of_history.tracks_of_ids(self.history, self.world, ids, indices)
 
     def with_visibility(self, tracks: Tracks, camera: Camera, index: int) -> Tracks:
-        """Adds the visibility in one more camera to tracks that were queried at frame ``index``."""
+        """Adds the visibility in another camera to tracks that were queried at frame ``index``."""
         tolerance = tracks_of_history.depth_tolerance(self.history, self.world, index)
         return tracks.with_visibility(camera, self._depth, tolerance)
 
     def parts(self, count: int | None = None, previous: NDArray[Any] | None = None) -> NDArray[np.int64]:
-        """Part labels [N], the largest part 0, and −1 for Gaussians that do not move; see ``parts.parts``.
+        """Returns part labels [N], sorted by size, and −1 for static Gaussians; see ``parts.parts``.
 
         Args:
-            count: of parts; None: chosen by silhouette.
-            previous: [N] labels found from fewer frames; parts that continue keep their labels.
+            count: number of parts; None to choose it by silhouette score.
+            previous: [N] labels from fewer frames; parts that persist keep their labels.
         """
         return parts_of_history.parts(self.history, count, previous=previous)
 

@@ -1,4 +1,4 @@
-"""Colours that depend on direction as spherical harmonics, the form of standard splat files."""
+"""View-dependent colours as spherical harmonics, the format of standard splat files."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from scas4d_core.gaussians import Gaussians
 Float = NDArray[np.float64]
 
 COUNT = 16
-"""Harmonics up to degree 3, all that the files have."""
+"""Number of harmonics up to degree 3, as in the files."""
 DIRECTIONS = 100
-"""Spread evenly, over which is integrated."""
+"""Number of evenly distributed directions for the integration."""
 FAR_M = 1e4
-"""Metres to a camera from which all Gaussians are seen in one direction."""
+"""Camera distance in metres from which all Gaussians are seen in the same direction."""
 
 
 def harmonics(gaussians: Gaussians) -> Float:
-    """[N, 16, 3] coefficients of each Gaussian's RGB − 0.5, by the direction from the camera, in the world's axes.
+    """Returns [N, 16, 3] coefficients of each Gaussian's RGB − 0.5 by viewing direction, in world axes.
 
-    They hold for this frame: highlights stay with the world while things turn. Degree 3 is too coarse for the highlight
-    of a lamp, which comes out wider and dimmer.
+    They are valid for this frame only, because highlights are fixed to the world while objects turn. Degree 3 is too
+    coarse for the highlight of a lamp, which becomes wider and dimmer.
 
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[0.5, 0.5, 1.0])
     >>> dull = state.replace(gloss=np.zeros((1, 3), np.float32), environment=np.zeros((259, 3), np.float32))
@@ -33,13 +33,13 @@ def harmonics(gaussians: Gaussians) -> Float:
     assert gaussians.gloss is not None
     assert gaussians.environment is not None
     from scas4d_core.engines.cpu.gloss import without_turn
-    from scas4d_core.kernels.appearance.direction import shade  # only what is glossy needs the kernels
+    from scas4d_core.kernels.appearance.direction import shade  # only glossy states need the kernels
 
     place = np.arange(DIRECTIONS) + 0.5
     z, turn = 1 - 2 * place / DIRECTIONS, np.pi * (1 + 5**0.5) * place
     away = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
     basis = basis_of(away)
-    project = np.linalg.pinv(basis)  # exact for what harmonics can hold, however the directions lie
+    project = np.linalg.pinv(basis)  # exact for band-limited functions, for any distribution of directions
     coefficients = np.zeros((len(gaussians), COUNT, 3))
     shown = np.empty((len(gaussians), 4), np.float32)
     given = gaussians.means, gaussians.gloss, without_turn(len(gaussians)), gaussians.colours, gaussians.environment
@@ -50,7 +50,7 @@ def harmonics(gaussians: Gaussians) -> Float:
 
 
 def basis_of(directions: NDArray[Any]) -> Float:
-    """[D, 16] the harmonics of unit directions [D, 3], signs and order as 3DGS has them (Kerbl et al. 2023)."""
+    """Returns the [D, 16] harmonics of unit directions [D, 3], with signs and order of 3DGS (Kerbl et al. 2023)."""
     x, y, z = np.asarray(directions, np.float64).T
     xx, yy, zz = x * x, y * y, z * z
     columns = [

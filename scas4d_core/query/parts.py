@@ -1,11 +1,11 @@
-"""Segments parts: Gaussians that move alike, by K-means on positions and material rotations over time.
+"""Part segmentation: Gaussians with similar motion, by K-means on positions and material rotations over time.
 
-The paper's section "Visualization of Part Segmentation": the feature of Gaussian i is
-``[λp·p_i(t), λR·R_i(t), λp0·p_i(0)]`` over the frames t. Here p is in units of the extent of the moving
-Gaussians, so that one set of λ serves every scene.
+This is the paper's section "Visualization of Part Segmentation". The feature of Gaussian i is ``[λp·p_i(t), λR·R_i(t),
+λp0·p_i(0)]`` over the frames t. Here p is in units of the extent of the moving Gaussians, so that one set of λ is
+suitable for every scene.
 
-Parts found again, after more frames, keep their labels: the clustering also starts from the previous parts and gives
-them up only for clearly better ones, and new labels are matched to previous ones by their overlap.
+When parts are computed again after more frames, they keep their labels. The clustering also starts from the previous
+parts and replaces them only by clearly better ones. New labels are matched to previous ones by their overlap.
 """
 
 from __future__ import annotations
@@ -25,33 +25,33 @@ from scas4d_core.storage.history import History
 Features = NDArray[np.float32]
 
 NO_PART = -1
-"""The label of Gaussians that do not move: they belong to no part."""
+"""Label of static Gaussians, which belong to no part."""
 SILHOUETTE_SAMPLE = 1000
-"""Gaussians on which the count of parts is chosen: the silhouette takes all distances between them."""
+"""Number of Gaussians for choosing the number of parts; the silhouette score needs all pairwise distances."""
 ROWS_AT_ONCE = 8192
-"""Rows whose features are held at once while every Gaussian is labelled."""
+"""Number of rows whose features are in memory at once when all Gaussians are labelled."""
 
 LAMBDA_POSITION = 0.25
-"""λp, of p over time; p in units of the extent."""
+"""λp, for p over time, with p in units of the extent."""
 LAMBDA_ROTATION = 1.0
-"""λR, of the entries of R over time; a turn of angle a moves them by 2.8 sin(a/2). Rotation separates parts,
-position only those that turn alike: with more of it long parts are cut across."""
+"""λR, for the entries of R over time; a rotation by angle a changes them by 2.8 sin(a/2). Rotation separates parts;
+position separates only those that rotate alike. A larger position weight would split long parts."""
 LAMBDA_INITIAL = 0.25
-"""λp0, of p at the first frame, repeated as in the paper."""
+"""λp0, for p at the first frame, repeated as in the paper."""
 MAX_FRAMES = 32
-"""Frames that the features take, evenly over the history: memory stays bounded."""
+"""Maximum number of frames in the features, evenly spaced over the history; bounds memory."""
 SAMPLE = 20_000
-"""Gaussians that are clustered, at most; all are labelled."""
+"""Maximum number of Gaussians that are clustered; all are labelled."""
 MAX_PARTS = 12
-"""Largest count that is tried when none is given."""
+"""Largest number of parts that is tried if none is given."""
 STAY = 0.05
-"""Share of the inertia that a fresh clustering has to gain for the previous parts to be given up."""
+"""Relative decrease of inertia by which a new clustering must improve to replace the previous parts."""
 STAY_COUNT = 0.02
-"""Mean silhouette that another count has to gain for that of the previous parts to be given up."""
+"""Advantage in mean silhouette score of the previous number of parts."""
 RESTARTS = 10
-"""Starts of K-means (n_init); the best is kept."""
+"""Number of K-means initializations (n_init); the best result is kept."""
 SEED = 0
-"""Of the starts and of the sample."""
+"""Seed of the initializations and of the sample."""
 
 
 def parts(
@@ -59,21 +59,21 @@ def parts(
     count: int | None = None,
     previous: NDArray[Any] | None = None,
 ) -> NDArray[np.int64]:
-    """Part labels of all Gaussians, [N] int64: 0…count−1, the largest part first; −1 for those that do not move.
+    """Returns part labels of all Gaussians, [N] int64: 0…count−1, largest part first; −1 for static Gaussians.
 
-    The newest committed frame decides which Gaussians move. A Gaussian weighs by its opacity times the area of its two
-    longest axes, about its area in a picture, so that swarms of small ones do not decide the borders.
+    The newest committed frame decides which Gaussians move. Each Gaussian is weighted by its opacity times the area of
+    its two longest axes, approximately its image area, so that many small Gaussians do not dominate.
 
     Args:
-        history: at least one committed frame; with a single frame only its positions separate parts.
-        count: of parts; None: the count from 2 to ``MAX_PARTS`` with the largest mean silhouette
+        history: with at least one committed frame; with a single frame, only positions separate parts.
+        count: number of parts; None for the number from 2 to ``MAX_PARTS`` with the largest mean silhouette score
             (Rousseeuw 1987) on up to 1,000 Gaussians.
-        previous: [N] labels found from fewer frames with the same ``count`` (or None). Parts that continue keep their
-            labels then, whatever their size; with a count chosen anew, a label may be left out.
+        previous: [N] labels from fewer frames with the same ``count`` (or None). Parts that persist then keep their
+            labels, regardless of size. If the number of parts is chosen again, labels may have gaps.
 
     Raises:
-        ValueError: nothing committed, nothing moves, count below 1 or above the number of moving Gaussians, or
-            ``previous`` of another number of Gaussians.
+        ValueError: nothing is committed or moving, count is below 1 or above the number of moving Gaussians, or
+            ``previous`` has a different number of Gaussians.
 
     >>> from scas4d_core.storage.history import History
     >>> boxes = np.random.default_rng(0).random((40, 3))
@@ -101,7 +101,7 @@ def parts(
         )
 
     if previous is not None and previous.shape != (len(newest),):
-        raise InputError(f"previous labels {previous.shape} must be [{len(newest)}], one a Gaussian")
+        raise InputError(f"previous labels {previous.shape} must be [{len(newest)}], one per Gaussian")
 
     rng = np.random.default_rng(SEED)
     chosen = rows if rows.size <= SAMPLE else np.sort(rng.choice(rows, SAMPLE, replace=False))
@@ -112,7 +112,7 @@ def parts(
     features = part_features(positions[:, inside], rotations[:, inside], extent)
     before = None if previous is None else previous[chosen]
     labels = np.empty(rows.size, dtype=np.int64)
-    with threadpool_limits(limits=1):  # threads would sum in another order and tip what lies between two parts
+    with threadpool_limits(limits=1):  # threads would change the summation order and flip Gaussians between two parts
         model = _cluster(features, weights[chosen], count, rng, before)
         for start in range(0, rows.size, ROWS_AT_ONCE):
             block = slice(start, start + ROWS_AT_ONCE)
@@ -126,20 +126,20 @@ def parts(
 
 
 def match_labels(labels: NDArray[Any], previous: NDArray[Any], weights: NDArray[Any]) -> NDArray[np.int64]:
-    """Renames parts to the previous labels that they overlap most, as a whole (Hungarian method).
+    """Renames parts to maximize their overlap with the previous labels (Hungarian method).
 
-    A part that overlaps no previous part, or whose match went to another, takes the lowest free label.
+    A part without overlap, or whose match was assigned to another part, gets the lowest free label.
 
     Args:
-        labels: [N] new labels from 0; negative ones belong to no part and stay.
-        previous: [N] labels found before.
+        labels: [N] new labels from 0; negative labels belong to no part and are unchanged.
+        previous: [N] previous labels.
         weights: [N] of the Gaussians.
 
     Returns:
         [N] labels.
 
     >>> previous = np.array([0, 0, 1, 1])
-    >>> match_labels(np.array([1, 1, 0, 0]), previous, weights=np.ones(4))  # the same parts, numbered otherwise
+    >>> match_labels(np.array([1, 1, 0, 0]), previous, weights=np.ones(4))  # the same parts with different numbers
     array([0, 0, 1, 1])
     """
     result = labels.astype(np.int64)
@@ -160,9 +160,10 @@ def match_labels(labels: NDArray[Any], previous: NDArray[Any], weights: NDArray[
 
 
 def motion(history: History, rows: NDArray[np.intp], frames: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Positions [T, M, 3] and material rotations [T, M, 4] of some Gaussians at up to ``frames`` even frames.
+    """Returns positions [T, M, 3] and material rotations [T, M, 4] of Gaussians at up to ``frames`` evenly spaced
+    frames.
 
-    Before its birth a Gaussian moves as if it had been there: with its parent, or not at all.
+    Frames before a Gaussian was added show it moving with its parent, or static without a parent.
     """
     indices = np.array(history.indices)
     even = np.unique(np.linspace(0, len(indices) - 1, min(frames, len(indices))).round().astype(np.intp))
@@ -178,7 +179,7 @@ def motion(history: History, rows: NDArray[np.intp], frames: int) -> tuple[NDArr
 
 
 def _before_birth(history: History, rows: NDArray[np.intp], indices: list[int]) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Positions [T, M, 3] and rotations [T, M, 4] of Gaussians that are led by what they descend from."""
+    """Returns positions [T, M, 3] and rotations [T, M, 4] of Gaussians that move with their ancestors."""
     roots, parents, ancestors = history.roots(), history.parents, rows.copy()
     while (up := parents[ancestors] != NO_PARENT).any():
         ancestors = np.where(up, parents[ancestors], ancestors)
@@ -196,15 +197,15 @@ def _before_birth(history: History, rows: NDArray[np.intp], indices: list[int]) 
 
 
 def part_features(positions: NDArray[Any], rotations: NDArray[Any], extent: float) -> Features:
-    """The features of M Gaussians over T frames, [M, 12 T + 3] float32.
+    """Returns the features of M Gaussians over T frames, [M, 12 T + 3] float32.
 
-    The paper repeats p(0) at every frame; here it stands once, times √T, which leaves every distance as it was.
-    All is divided by √T, so that distances do not grow with the number of frames.
+    The paper repeats p(0) at every frame. Here it is included once, times √T, which gives the same distances. All
+    features are divided by √T, so that distances do not grow with the number of frames.
 
     Args:
-        positions: [T, M, 3] metres.
+        positions: [T, M, 3] in metres.
         rotations: [T, M, 4] unit quaternions.
-        extent: metres.
+        extent: in metres.
     """
     frames, count = positions.shape[:2]
     p = positions.transpose(1, 0, 2) / extent
@@ -222,7 +223,7 @@ def part_features(positions: NDArray[Any], rotations: NDArray[Any], extent: floa
 
 
 def coverage(gaussians: Gaussians) -> NDArray[np.float64]:
-    """[N] opacity times the product of the two longest axes, m²: about the area of a Gaussian in a picture."""
+    """Returns [N] opacity times the product of the two longest axes, in m²: about the area in an image."""
     axes = np.linalg.svd(gaussians.factors.astype(np.float64), compute_uv=False)
     return gaussians.opacities * axes[:, 0] * axes[:, 1]
 
@@ -236,7 +237,7 @@ def _cluster(
 ) -> Any:
     known = np.empty(0, np.int64) if previous is None else np.unique(previous[previous >= 0])
     if count is None:
-        # Drawn by weight, so that the silhouette weighs Gaussians as pictures do.
+        # Sampling by weight makes the silhouette score weight Gaussians by their image area.
         drawn = rng.choice(len(features), size=SILHOUETTE_SAMPLE, p=weights / weights.sum())
         count = _best_count(features[np.unique(drawn)], len(known))
     fresh = _kmeans(count).fit(features, sample_weight=weights)
@@ -248,7 +249,7 @@ def _cluster(
 
 
 def _best_count(features: Features, known: int) -> int:
-    """Count with the largest mean silhouette; ``known``, that of the previous parts, has an advantage (0: none)."""
+    """Returns the count with the largest mean silhouette score; the previous count ``known`` is favoured (0: none)."""
     from sklearn.metrics import silhouette_score
 
     best, best_score = 1, 0.0
@@ -261,7 +262,7 @@ def _best_count(features: Features, known: int) -> int:
 
 
 def _kmeans(count: int, **given: Any) -> Any:
-    """K-means of scikit-learn, imported here: the import takes a second, and rendering views needs none."""
+    """Returns scikit-learn's K-means; the deferred import takes a second that rendering does not need."""
     from sklearn.cluster import KMeans
 
     return KMeans(n_clusters=count, **{"n_init": RESTARTS, "random_state": SEED, **given})

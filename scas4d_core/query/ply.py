@@ -1,8 +1,9 @@
 """Writes and reads a frame as a standard 3D Gaussian Splatting ``.ply`` (Kerbl et al. 2023), for any splat viewer.
 
-Binary little-endian, one float32 row a Gaussian: x y z, nx ny nz (zero), f_dc_0…2 (degree 0 of the spherical
-harmonics), opacity (logit), scale_0…2 (log), rot_0…3 (w, x, y, z). Where colours depend on direction, f_rest_0…44
-(degrees 1 to 3, channel by channel) follow. World and lengths are the user's.
+The format is binary little-endian with one float32 row per Gaussian. The columns are x y z, nx ny nz (zero), f_dc_0…2
+(degree 0 of the spherical harmonics), opacity (logit), scale_0…2 (log), rot_0…3 (w, x, y, z). If colours depend on
+direction, f_rest_0…44 (degrees 1 to 3, channel by channel) follow. Positions and lengths are in the user's world and
+units.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ from scas4d_core.query.harmonics import harmonics
 Float = NDArray[np.float64]
 
 SH_DEGREE_0 = 0.28209479177387814
-"""The constant spherical harmonic, 1/(2√π): colour = 0.5 + SH_DEGREE_0 · f_dc."""
+"""The constant spherical harmonic 1/(2√π): colour = 0.5 + SH_DEGREE_0 · f_dc."""
 OPACITY_MARGIN = 1e-6
-"""Opacities keep this far from 0 and 1, where the logit is infinite."""
+"""Minimum distance of opacities from 0 and 1, at which the logit is infinite."""
 JACOBI_SWEEPS = 12
-"""Sweeps of one-sided Jacobi; it converges quadratically, and 3×3 takes about five."""
+"""Sweeps of one-sided Jacobi; it converges quadratically, and a 3×3 matrix takes about five."""
 ORTHOGONAL = 1e-6
-"""Cosine below which two axes count as orthogonal: the precision of float32 factors."""
+"""Cosine below which two axes count as orthogonal, at the precision of float32 factors."""
 
 _FIELDS = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"),
@@ -41,7 +42,7 @@ _FIELDS = (
 
 
 class PlyError(InputError):
-    """Gaussians that cannot be exported, or a file without any; the message names rows or path, and the fault."""
+    """Gaussians that cannot be exported, or an invalid file. The message gives the rows or the path, and the fault."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +52,7 @@ class Splats:
     Attributes:
         means: [N, 3] float64.
         scales: [N, 3] float64 standard deviations along the axes.
-        rotations: [N, 4] float64 unit quaternions (w, x, y, z); the axes are the columns of the matrix.
+        rotations: [N, 4] float64 unit quaternions (w, x, y, z); the axes are the columns of the rotation matrix.
         opacities: [N] float64 in (0, 1).
         colours: [N, 3] float64 RGB.
     """
@@ -66,20 +67,20 @@ class Splats:
         return len(self.means)
 
     def covariances(self) -> Float:
-        """[N, 3, 3] Σ in the user's units squared."""
+        """Returns the [N, 3, 3] covariances Σ in square user units."""
         axes = Rotation.from_quat(np.roll(self.rotations, -1, axis=1)).as_matrix() * self.scales[:, None, :]
         result: Float = axes @ axes.transpose(0, 2, 1)
         return result
 
 
 def write_ply(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None:
-    """Writes one frame atomically; without the Gaussians that are retired in it.
+    """Writes one frame atomically, without its retired Gaussians.
 
     Args:
-        path: of the file. gaussians: in the inside world. world: user's world to inside.
+        path: of the file. gaussians: in the internal world. world: user to internal transform.
 
     Raises:
-        PlyError: rows that are not finite or have no volume, named by row and id; none is left out silently.
+        PlyError: some Gaussians are not finite or have no volume; the message gives their rows and ids.
 
     >>> from tempfile import TemporaryDirectory
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
@@ -109,23 +110,23 @@ def write_ply(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None
 
 
 def read_ply(source: Path | str | BinaryIO, name: str | None = None) -> Splats:
-    """Reads a splat file; of the spherical harmonics only degree 0.
+    """Reads a splat file; only degree 0 of the spherical harmonics is read.
 
     Args:
-        source: its path, or an open file. name: of it, for messages; None: the path.
+        source: path or open file. name: for error messages; None for the path.
 
     Raises:
-        PlyError: no splat file, or a property is missing.
+        PlyError: the file is not a splat file, or a property is missing.
 
     >>> read_ply("README.md")
     Traceback (most recent call last):
-    scas4d_core.query.ply.PlyError: README.md: no 3D Gaussian Splatting .ply (...)
+    scas4d_core.query.ply.PlyError: README.md: not a 3D Gaussian Splatting .ply (...)
     """
     try:
         vertex = PlyData.read(str(source) if isinstance(source, Path) else source)["vertex"]
         table = {name: np.asarray(vertex[name], dtype=np.float64) for name in _FIELDS if name[0] != "n"}
     except (OSError, KeyError, ValueError, PlyParseError) as error:
-        raise PlyError(f"{name or source}: no 3D Gaussian Splatting .ply ({error})") from error
+        raise PlyError(f"{name or source}: not a 3D Gaussian Splatting .ply ({error})") from error
 
     def columns(*names: str) -> Float:
         return np.stack([table[name] for name in names], axis=-1)
@@ -141,10 +142,10 @@ def read_ply(source: Path | str | BinaryIO, name: str | None = None) -> Splats:
 
 
 def splats(gaussians: Gaussians, world: WorldFrame) -> Splats:
-    """Converts a state to centres, axes and lengths in the user's world.
+    """Converts a state to centres, axes and scales in the user's world.
 
     Raises:
-        PlyError: rows that are not finite or have no volume.
+        PlyError: some Gaussians are not finite or have no volume.
     """
     _refuse(gaussians)
     axes, scales = split_factors(gaussians.factors)
@@ -158,11 +159,11 @@ def splats(gaussians: Gaussians, world: WorldFrame) -> Splats:
 
 
 def split_factors(factors: NDArray[Any]) -> tuple[Float, Float]:
-    """Splits factors into rotations Q [N, 3, 3] and lengths s [N, 3]: Q diag(s²) Qᵀ = F Fᵀ, Q nearest to F's columns.
+    """Splits factors into rotations Q [N, 3, 3] and lengths s [N, 3] with Q diag(s²) Qᵀ = F Fᵀ.
 
-    One-sided Jacobi: columns of F are turned pairwise, by at most 45°, until they are orthogonal. Columns that are
-    orthogonal already stay as they are, also where lengths are equal and eigenvectors would be arbitrary. Of the 24
-    ways to name the axes of a right-handed frame the one with the largest trace against the columns of F is taken.
+    This is one-sided Jacobi: columns of F are rotated pairwise, by at most 45°, until they are orthogonal. Columns that
+    are already orthogonal do not change, even if lengths are equal and eigenvectors would be arbitrary. Of the 24 ways
+    to label the axes of a right-handed frame, the one with the largest trace against the columns of F is used.
 
     Args:
         factors: [N, 3, 3], full rank.
@@ -178,7 +179,7 @@ def split_factors(factors: NDArray[Any]) -> tuple[Float, Float]:
             a, b = columns[:, :, i].copy(), columns[:, :, j].copy()
             off = np.einsum("ni,ni->n", a, b)
             difference = np.einsum("ni,ni->n", b, b) - np.einsum("ni,ni->n", a, a)
-            # tan of the angle, the smaller root of t² + 2 t (difference / 2 off) − 1 = 0 (Golub & Van Loan, 8.5).
+            # Tangent of the angle: the smaller root of t² + 2 t (difference / 2 off) − 1 = 0 (Golub & Van Loan, 8.5).
             sign = np.where(difference < 0, -1.0, 1.0)
             size = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
             off[np.abs(off) <= ORTHOGONAL * size] = 0
@@ -193,9 +194,9 @@ def split_factors(factors: NDArray[Any]) -> tuple[Float, Float]:
 
 
 def _nearest_naming(axes: Float, scales: Float, wanted: Float) -> tuple[Float, Float]:
-    """Permutes and flips axes to a right-handed frame with the largest trace(axesᵀ wanted)."""
+    """Permutes and flips axes to the right-handed frame with the largest trace(axesᵀ wanted)."""
     rows = np.arange(len(axes))
-    dots = np.einsum("nki,nkj->nij", axes, wanted)  # of axis i with wanted column j
+    dots = np.einsum("nki,nkj->nij", axes, wanted)  # axis i with wanted column j
     handed = np.linalg.det(axes)
     best = np.full(len(axes), -np.inf)
     order = np.zeros((len(axes), 3), dtype=np.intp)
@@ -241,5 +242,5 @@ def _name_rows(gaussians: Gaussians, bad: NDArray[np.bool_], fault: str) -> None
         raise PlyError(
             f"{rows.size} Gaussians have {fault}: rows {rows[:5].tolist()}, ids {gaussians.ids[rows[:5]].tolist()}"
             f"{' …' if rows.size > 5 else ''}",
-            "export an earlier frame, or mend them",
+            "export an earlier frame, or repair them",
         )

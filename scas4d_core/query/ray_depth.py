@@ -1,9 +1,8 @@
-"""Depth of the surface along single rays: for pixel queries, for which rendered depth is not sharp enough.
+"""Surface depth along single rays, for pixel queries that need more accuracy than rendered depth.
 
-The rendered depth is the weighted mean of the *centres* of a pixel's Gaussians. Here each Gaussian absorbs light along
-the queried ray itself, around the point where the ray passes it nearest (in its own metric), and the surface is at the
-depth by which the ray has lost half of the light that it loses. At an edge a mean lies between two surfaces; this
-median lies on one of them.
+Rendered depth is the weighted mean of the *centres* of a pixel's Gaussians. Here, each Gaussian absorbs light along the
+ray itself, around the point of the ray that is nearest to it in its own metric. The surface is at the depth at which
+half of the absorbed light is lost. At an edge, the mean lies between two surfaces, but this median lies on one of them.
 """
 
 from __future__ import annotations
@@ -21,16 +20,16 @@ from scas4d_core.gaussians import Gaussians
 Float = NDArray[np.float64]
 
 TILE_PX = 16
-"""Pixels: rays of one square of this size search their Gaussians together."""
+"""Size, in pixels, of the squares in which rays share a search for Gaussians."""
 RAYS_AT_ONCE = 64
-"""Rays whose Gaussians are held at once: working memory stays at some megabytes."""
+"""Number of rays that are processed at once; limits working memory to some megabytes."""
 DEEPEST = 96
-"""Gaussians that a ray's depth is computed from, those that absorb most: the others change nothing visible."""
+"""Maximum number of Gaussians per ray, those that absorb most; the others have no visible effect."""
 BISECTIONS = 26
-"""Halvings of the bracket: 10 m to less than a micrometre."""
+"""Number of bisections: reduces a bracket of 10 m to less than a micrometre."""
 REACH = 3.0
-"""Standard deviations that the place of absorption may lie off a Gaussian's centre in depth: where a ray only grazes
-the wide rim of a flat one, the nearest place on the ray can be anywhere."""
+"""Maximum distance in depth of the absorption from a Gaussian's centre, in standard deviations. For a ray that only
+grazes the rim of a flat Gaussian, the nearest point on the ray can be anywhere."""
 
 
 def ray_depths(
@@ -40,18 +39,18 @@ def ray_depths(
     limits: Limits = DEFAULT,
     softening: float = 0.0,
 ) -> tuple[Float, Float]:
-    """Depth of the surface at continuous pixel positions.
+    """Returns the depth of the surface at continuous pixel positions.
 
     Args:
-        gaussians: a state, N Gaussians, inside world.
-        camera: inside world.
+        gaussians: a state, N Gaussians in the internal world.
+        camera: in the internal world.
         uv: [Q, 2] pixels; (0.5, 0.5) is the centre of the first pixel.
-        limits: the rasterizer's constants, so that a ray meets what a pixel shows.
-        softening: metres, added to every axis (root of the sum of squares): the precision of the surface.
+        limits: constants of the rasterizer, so that a ray meets what a pixel shows.
+        softening: precision of the surface, added to every axis in quadrature, in metres.
 
     Returns:
-        z [Q] metres along the camera's axis, NaN where the ray meets nothing; covered [Q] in 0…1, the share of light
-        lost.
+        z [Q] in metres along the camera's axis, NaN if the ray meets nothing; covered [Q] in 0…1, share of light that
+        is lost.
 
     >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
@@ -80,7 +79,7 @@ def ray_depths(
 
 
 class _Splats:
-    """The Gaussians in front of a camera, front to back, prepared for rays."""
+    """The Gaussians in front of a camera, sorted by depth and prepared for ray queries."""
 
     def __init__(self, gaussians: Gaussians, camera: Camera, limits: Limits, softening: float) -> None:
         turn, shift = camera.world_to_camera[:3, :3], camera.world_to_camera[:3, 3]
@@ -100,7 +99,7 @@ class _Splats:
             -principal / focal - margin,
             (np.array([camera.width, camera.height]) - principal) / focal + margin,
         )
-        # Projected covariance: the rasterizer's, low-pass included.
+        # The projected covariance of the rasterizer, including its low-pass filter.
         rows_of = (
             focal[:, None] / self.z[:, None, None] * (factors[:, :2] - tangents[:, :, None] * factors[:, 2:3])
         )  # [n, 2, 3]
@@ -114,7 +113,7 @@ class _Splats:
         self.spread = np.sqrt(softened[:, 2, 2])
 
     def depths(self, near: NDArray[np.intp], uv: Float) -> tuple[Float, Float]:
-        """Depth and coverage of a few rays by Gaussians that may lie on them, given front to back."""
+        """Returns the depth and coverage of rays for candidate Gaussians in front-to-back order."""
         limits = self.limits
         off = uv[:, None] - self.centre[near]
         power = 0.5 * np.einsum("qni,nij,qnj->qn", off, self.conic[near], off, optimize=True)
@@ -122,10 +121,10 @@ class _Splats:
         alpha[alpha < limits.alpha_floor] = 0
         after = np.cumprod(1 - alpha, axis=1)
         before = np.concatenate([np.ones((len(uv), 1)), after[:, :-1]], axis=1)
-        alpha[after <= limits.transmittance_stop] = 0  # the rasterizer stops before it blends this one
+        alpha[after <= limits.transmittance_stop] = 0  # the rasterizer stops before it blends this Gaussian
         covered = 1 - np.prod(1 - alpha, axis=1)
 
-        # Each Gaussian absorbs around the place of least distance to the ray in its own metric.
+        # Each Gaussian absorbs around the ray point that is nearest in its own metric.
         most = min(DEEPEST, alpha.shape[1])
         chosen = np.argpartition(-alpha * before, most - 1, axis=1)[:, :most]
         absorbs = -np.log1p(-np.take_along_axis(alpha, chosen, axis=1))

@@ -1,8 +1,8 @@
-"""Lays out tracks as TAPVid-3D's npz files, so that its tools read them as predictions.
+"""Exports tracks in the npz format of TAPVid-3D, so that its tools can read them as predictions.
 
-The names and axes are those that the benchmark's own evaluation reads (google-deepmind/tapnet,
-``tapvid3d/evaluation/evaluate_model.py``). Points are in the axes of one camera (OpenCV: x right, y down, z forward),
-in metres.
+Names and axes are those of the benchmark's evaluation (google-deepmind/tapnet,
+``tapvid3d/evaluation/evaluate_model.py``). Points are in metres, in the axes of one camera (OpenCV: x right, y down, z
+forward).
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ def tapvid3d(
     metres_per_unit: float = 1.0,
     pixels: NDArray[Any] | None = None,
 ) -> dict[str, NDArray[Any]]:
-    """Makes the arrays of one file, without pictures (``images_jpeg_bytes``), which predictions need not have.
+    """Returns the arrays of one file, without images (``images_jpeg_bytes``), which predictions do not need.
 
     Args:
-        positions: [T, Q, 3] user's world and units, NaN where unknown.
+        positions: [T, Q, 3] in the user's world and units, NaN if unknown.
         visibility: [T, Q] in the camera.
-        camera: user's world.
-        queried: row of T in which the points were queried; −1 where that frame is not among them.
-        metres_per_unit: metres in a unit of the user's world.
-        pixels: [Q, 2] queried; None: the projections of the points in that row.
+        camera: in the user's world.
+        queried: row of T in which the points were queried; −1 if that frame is not included.
+        metres_per_unit: metres per user unit.
+        pixels: [Q, 2] queried pixels; None for the projections of the points in that row.
 
     Returns:
-        ``tracks_XYZ`` [T, Q, 3] float32, metres in the camera's axes. ``visibility`` [T, Q] bool. ``queries_xyt``
-        [Q, 3] float32: u, v (pixel centres at +0.5) and the row of T; NaN where u, v are unknown.
-        ``fx_fy_cx_cy`` [4] float32. ``extrinsics_w2c`` [T, 4, 4] float32: user's world, in metres, to camera.
+        ``tracks_XYZ`` [T, Q, 3] float32, metres in camera axes. ``visibility`` [T, Q] bool. ``queries_xyt`` [Q, 3]
+        float32: u, v (pixel centres at +0.5) and the row of T; u and v are NaN if unknown. ``fx_fy_cx_cy`` [4] float32.
+        ``extrinsics_w2c`` [T, 4, 4] float32: from the user's world in metres to the camera.
 
     Raises:
-        ValueError: shapes do not fit.
+        ValueError: the shapes do not match.
 
     >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
     >>> arrays = tapvid3d(np.array([[[0, 0, 2.0]]]), np.array([[True]]), camera, queried=0)

@@ -1,9 +1,9 @@
-"""Tracks points: each is carried rigidly by the Gaussians that it lies in (paper, Point-Tracking).
+"""Point tracking: each point is carried rigidly by the Gaussians that contain it (paper, Point-Tracking).
 
-A point p, given at frame q, is carried by Gaussian i to frame t as ``μ_i(t) + R_i(t) R_i(q)ᵀ (p − μ_i(q))``, R the
-material rotation. Several Gaussians carry every point, and the geometric median of their answers is the track, so
-that a single stray Gaussian does not take the point with it. A pixel becomes a point by ``ray_depth``. docs/tracks.md
-has the definitions and their accuracy.
+Gaussian i carries a point p from frame q to frame t as ``μ_i(t) + R_i(t) R_i(q)ᵀ (p − μ_i(q))``, where R is the
+material rotation. Several Gaussians carry each point, and the track is the geometric median of their positions. This
+prevents a single outlier from displacing the point. ``ray_depth`` converts a pixel to a point. See docs/tracks.md for
+definitions and accuracy.
 """
 
 from __future__ import annotations
@@ -26,26 +26,26 @@ from scas4d_core.storage.history import History
 
 Float = NDArray[np.float64]
 RenderDepth = Callable[[Camera, int], tuple[NDArray[Any], NDArray[Any]]]
-"""(camera in the user's world, frame) to z depth [H, W] in the user's units and alpha [H, W]."""
+"""Function of a camera (in the user's world) and a frame that returns z depth [H, W] in user units and alpha [H, W]."""
 
 ALPHA_OF_A_SURFACE = 0.5
-"""A pixel shows a surface where at least half of it is covered."""
+"""Minimum coverage of a pixel that shows a surface."""
 CARRIERS = 32
-"""Gaussians that carry a point; 1 is the single nearest. Against 1, the median 3D error falls by 6 % (cloth) to 25 %
-(stage)."""
+"""Number of Gaussians that carry a point; with 1, only the nearest. Compared with 1, the median 3D error decreases by 6
+% (cloth) to 25 % (stage)."""
 SOFTENING = 0.01
-"""Of the extent; added to the axes of a Gaussian (root of the sum of squares) for its distance to a point: surface
-Gaussians are flatter than the surface is known, and a wider circle of carriers averages more of their noise. Against
-0.001, the median 3D error falls by 2 % (cloth) to 18 % (stage)."""
+"""Added in quadrature to a Gaussian's axes for its distance to a point, as a share of the extent. Gaussians are thinner
+than the uncertainty of the surface, and more carriers average out more noise. Compared with 0.001, the median 3D error
+decreases by 2 % (cloth) to 18 % (stage)."""
 RAY_SOFTENING = 0.003
-"""Of the extent; the same for the place of a Gaussian along the ray of a pixel query."""
+"""The same for the position of a Gaussian along the ray of a pixel query."""
 AGREEMENT = 0.01
-"""Of the extent; carriers whose answers lie this far from the track, on average, halve the confidence."""
+"""Mean deviation of the carriers from the track, as a share of the extent, that halves the confidence."""
 DEPTH_TOLERANCE = 0.0075
-"""Of the extent; a point counts as seen up to this far behind the rendered depth, which lies about that far from the
-surface."""
+"""Depth behind the rendered surface, as a share of the extent, up to which a point counts as visible. The error of the
+rendered depth has about this size."""
 PIXEL_REACH = 2.0
-"""Pixels; a pixel query that misses a silhouette by less takes the nearest covered pixel's depth."""
+"""Distance in pixels within which a pixel query that misses a silhouette uses the nearest covered pixel's depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,15 +53,15 @@ class Tracks:
     """Trajectories of Q points over T frames.
 
     Attributes:
-        positions: [T, Q, 3] float64, user's world and units; NaN for a pixel query that met no surface, and in frames
-            in which none of the Gaussians that carry the point is there (not born yet, or retired).
-        confidence: [T, Q] float64 in 0…1: (1 − Π(1 − oᵢ exp(−½ mᵢ²))) / (1 + (s/a)²), the opacity of the carriers at
-            the query point (m the Mahalanobis distance) over what their disagreement s in that frame takes away: the
-            weighted mean distance of their answers from the track (a = ``AGREEMENT``). 0 for a query that met nothing,
-            and where the position is NaN.
-        ids: [Q] int64: the Gaussian that carries the point most; −1 for a pixel query that met no surface.
+        positions: [T, Q, 3] float64, in the user's world and units. NaN for a pixel query without a surface, and in
+            frames in which none of the carriers is present (not yet added, or retired).
+        confidence: [T, Q] float64 in 0…1: (1 − Π(1 − oᵢ exp(−½ mᵢ²))) / (1 + (s/a)²). The numerator is the opacity of
+            the carriers at the query point, where m is the Mahalanobis distance. The disagreement s in that frame is
+            the weighted mean distance of the carriers' positions from the track, and a = ``AGREEMENT``. The confidence
+            is 0 for a query without a surface, and if the position is NaN.
+        ids: [Q] int64: the Gaussian with the largest weight; −1 for a pixel query without a surface.
         indices: [T] int64 frames.
-        visibility: by camera name, [T, Q] bool, for the cameras queried; see ``find_visibility``.
+        visibility: by camera name, [T, Q] bool, for the queried cameras; see ``find_visibility``.
     """
 
     positions: Float
@@ -71,11 +71,11 @@ class Tracks:
     visibility: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
 
     def pixels(self, camera: Camera) -> Float:
-        """[T, Q, 2] projections into a camera (user's world), pixels; NaN behind the camera."""
+        """Returns the [T, Q, 2] projections into a camera (user's world) in pixels; NaN behind the camera."""
         return camera.project(self.positions)[0]
 
     def with_visibility(self, camera: Camera, render_depth: RenderDepth, tolerance: float) -> Tracks:
-        """Adds the visibility in one more camera; the arguments are those of ``find_visibility``."""
+        """Adds the visibility in another camera; for the arguments see ``find_visibility``."""
         visible = find_visibility(self.positions, self.indices, camera, render_depth, tolerance)
         return replace(self, visibility={**self.visibility, camera.name: visible})
 
@@ -88,18 +88,18 @@ def tracks_of_points(
     indices: Sequence[int],
     count: int = CARRIERS,
 ) -> Tracks:
-    """Carries 3D points through the frames.
+    """Tracks 3D points over frames.
 
     Args:
         history: the committed states.
-        world: user's world to inside.
+        world: user to internal transform.
         points: [Q, 3] in the user's world at frame ``index``.
-        index: the committed frame that the points are given in.
-        indices: the committed frames of the tracks, any order.
-        count: Gaussians that carry a point.
+        index: committed frame of the points.
+        indices: committed frames of the tracks, in any order.
+        count: number of Gaussians that carry a point.
 
     Raises:
-        ValueError: points not [Q, 3] or not finite.
+        ValueError: points are not [Q, 3] or not finite.
         HistoryError: a frame was not committed.
 
     >>> from scas4d_core.gaussians import Gaussians
@@ -150,28 +150,28 @@ def tracks_of_pixels(
     render_depth: RenderDepth,
     limits: Limits = DEFAULT,
 ) -> Tracks:
-    """Carries the surface points at given pixels of one frame of a camera; with their visibility in that camera.
+    """Tracks the surface points at pixels of one frame of a camera, with their visibility in that camera.
 
     Args:
         history: the committed states.
-        world: user's world to inside.
+        world: user to internal transform.
         camera: in the user's world.
-        uv: [Q, 2] pixels, continuous: (0.5, 0.5) is the centre of the first pixel. The depth is that of ``ray_depth``;
-            a ray that loses less than half of its light takes the rendered depth of the nearest covered pixel within
-            ``PIXEL_REACH``.
-        index: the committed frame that ``uv`` is given in.
-        indices: the committed frames of the tracks.
-        render_depth: rendered depth and alpha.
-        limits: the constants that ``render_depth`` renders with.
+        uv: [Q, 2] continuous pixel positions: (0.5, 0.5) is the centre of the first pixel. The depth is from
+            ``ray_depth``. A ray that loses less than half of its light uses the rendered depth of the nearest covered
+            pixel within ``PIXEL_REACH``.
+        index: committed frame of ``uv``.
+        indices: committed frames of the tracks.
+        render_depth: returns rendered depth and alpha.
+        limits: rasterizer constants that ``render_depth`` uses.
 
     Raises:
-        ValueError: uv not [Q, 2], not finite or outside the picture.
+        ValueError: uv is not [Q, 2], not finite or outside the image.
 
     >>> from scas4d_core.gaussians import Gaussians
     >>> history = History()
     >>> history.append(0, 0.0, Gaussians.of_points([[0, 0, 2]], radius=0.1))
     >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
-    >>> def render_depth(camera, index):  # ``CommittedScene`` renders it
+    >>> def render_depth(camera, index):  # normally rendered by ``CommittedScene``
     ...     return np.full((48, 64), 2.0), np.ones((48, 64))
     >>> world = WorldFrame(np.zeros(3))
     >>> tracks = tracks_of_pixels(history, world, camera, np.array([[32, 24]]), 0, [0], render_depth)
@@ -212,10 +212,10 @@ def tracks_of_pixels(
 
 
 def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indices: Sequence[int]) -> Tracks:
-    """The trajectories of Gaussians' means by id; their confidence is 1, and 0 where they are not there.
+    """Returns the trajectories of Gaussian means by id; their confidence is 1, or 0 in frames without the Gaussian.
 
     Raises:
-        ValueError: an unknown id. HistoryError: a frame was not committed.
+        ValueError: an id is unknown. HistoryError: a frame was not committed.
 
     >>> from scas4d_core.gaussians import Gaussians
     >>> history = History()
@@ -232,25 +232,25 @@ def tracks_of_ids(history: History, world: WorldFrame, ids: NDArray[Any], indice
 
 
 def depth_tolerance(history: History, world: WorldFrame, index: int) -> float:
-    """Tolerance of ``find_visibility``, user's units: ``DEPTH_TOLERANCE`` × extent of the moving Gaussians."""
+    """Returns the tolerance of ``find_visibility``, user units: ``DEPTH_TOLERANCE`` × extent of moving Gaussians."""
     return DEPTH_TOLERANCE * moving_extent(history.gaussians(index)) / world.metres_per_unit
 
 
 def find_visibility(
     positions: Float, indices: Sequence[int] | NDArray[Any], camera: Camera, render_depth: RenderDepth, tolerance: float
 ) -> NDArray[np.bool_]:
-    """Visibility of points in a camera, [T, Q] bool: inside the picture, in front of the camera, and not hidden.
+    """Returns the visibility of points in a camera, [T, Q] bool: in the image, in front of the camera and not occluded.
 
-    A point is hidden where it lies more than ``tolerance`` behind the rendered depth, the farthest of the 3×3 pixels
-    around its own (tracks are easily off by a pixel, which decides at an edge; on true positions this is right more
-    often too). A pixel that is less than half covered hides nothing.
+    A point is occluded if it is more than ``tolerance`` behind the rendered depth, where the farthest of the 3×3 pixels
+    around it counts. Tracks are often off by a pixel, which matters at edges; with true positions this rule is also
+    correct more often. A pixel that is less than half covered does not occlude.
 
     Args:
-        positions: [T, Q, 3] user's world; NaN is never visible.
+        positions: [T, Q, 3] in the user's world; NaN is never visible.
         indices: [T] committed frames.
         camera: in the user's world.
-        render_depth: rendered depth and alpha.
-        tolerance: user's units.
+        render_depth: returns rendered depth and alpha.
+        tolerance: in user units.
     """
     uv, z = camera.project(positions)
     inside = (z > 0) & ((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=-1)
@@ -268,7 +268,7 @@ def find_visibility(
 def _covered_near(
     depth: NDArray[Any], alpha: NDArray[Any], row: NDArray[np.intp], column: NDArray[np.intp], reach: float
 ) -> tuple[NDArray[np.bool_], NDArray[np.intp], NDArray[np.intp]]:
-    """Finds the covered pixel nearest to each pixel: true where it is within reach, its row, its column."""
+    """Finds the nearest covered pixel of each pixel; returns whether it is within reach, its row and its column."""
     covered = (alpha >= ALPHA_OF_A_SURFACE) & np.isfinite(depth)
     if not covered.any():
         return np.zeros(len(row), dtype=np.bool_), row, column

@@ -1,4 +1,4 @@
-"""Pictures of one state from any camera: colour, depth, alpha, and the part that covers each pixel."""
+"""Rendered views of a state from any camera: colour, depth, alpha, and the part that covers each pixel."""
 
 from __future__ import annotations
 
@@ -19,23 +19,22 @@ from scas4d_core.query.tracks import ALPHA_OF_A_SURFACE
 Array = NDArray[np.float32]
 
 MAX_LABEL = 254
-"""Parts are painted into 8 bits; 0 means no part."""
+"""Largest label; parts are stored in 8 bits, and 0 means no part."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A rendered picture.
+    """A rendered view.
 
     Attributes:
         colour: [H, W, 3] float32, nominally 0…1, over the background. alpha: [H, W] float32.
-        depth: [H, W] float32, alpha-weighted mean z along the camera's axis in the user's units; NaN where less than
-            half of the pixel is covered.
-        parts: [H, W] uint8, or None where no labels were given: 0 for no part, else 1 + the label that covers the pixel
-            most.
+        depth: [H, W] float32, alpha-weighted mean z along the camera's axis, in user units; NaN if less than half of
+            the pixel is covered.
+        parts: [H, W] uint8, or None without labels: 0 for no part, otherwise 1 + the label that covers the pixel most.
 
     >>> black = np.zeros((2, 2), np.float32)
     >>> view = View(np.zeros((2, 2, 3), np.float32), alpha=black, depth=np.full_like(black, np.nan))
-    >>> view.colour.shape, view.parts is None  # no labels were given
+    >>> view.colour.shape, view.parts is None  # rendered without labels
     ((2, 2, 3), True)
     """
 
@@ -46,10 +45,10 @@ class View:
 
 
 class ViewRenderer:
-    """Renders states, each given with its camera; buffers are kept from one picture to the next.
+    """Renders views of states; buffers are reused between views.
 
     Args:
-        world: the user's world to that of the states. limits: of the rasterizer.
+        world: transform from the user's world to the internal world of the states. limits: of the rasterizer.
 
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
     >>> camera = Camera("front", [[100, 0, 8], [0, 100, 8], [0, 0, 1]], np.eye(4), 16, 16)
@@ -77,12 +76,12 @@ class ViewRenderer:
         """Renders a view of a state.
 
         Args:
-            gaussians: N Gaussians in the inside world. camera: user's world. background: RGB in 0…1 behind everything.
-            colours: [N, 3] float32 RGB in place of the state's own; None: its own, as this camera sees them.
-            labels: [N] part of each Gaussian, −1 for none; given where ``View.parts`` is wanted.
+            gaussians: N Gaussians in the internal world. camera: in the user's world. background: RGB in 0…1.
+            colours: [N, 3] float32 RGB instead of the state's colours; None for its colours as this camera sees them.
+            labels: [N] part of each Gaussian, −1 for none; required for ``View.parts``.
 
         Raises:
-            ValueError: labels of another shape or range.
+            ValueError: the labels have a wrong shape or range.
         """
         inside = self.world.camera_to_inside(camera)
         arrays = CameraArrays.of(inside)
@@ -90,7 +89,7 @@ class ViewRenderer:
             gaussians,
             arrays,
             None if colours is None else gaussians.features(colours),
-            depth_channel=LABEL,  # no view shows the label
+            depth_channel=LABEL,  # the label channel is not needed in a view
             background=np.array([*background, 0.0], np.float32),
         )
         colour = np.moveaxis(picture.features[:3], 0, -1).copy()
@@ -102,10 +101,10 @@ class ViewRenderer:
         return View(colour, alpha, depth, parts)
 
     def _parts_picture(self, gaussians: Gaussians, labels: NDArray[Any], camera: CameraArrays) -> NDArray[np.uint8]:
-        """[H, W] uint8: the label whose Gaussians weigh most in the pixel, plus 1. A pass has ``CHANNELS`` labels."""
+        """Returns [H, W] uint8: 1 + the label with the largest weight. Each pass renders ``CHANNELS`` labels."""
         if labels.shape != (len(gaussians),) or not ((labels >= -1) & (labels <= MAX_LABEL)).all():
             raise ValueError(
-                f"labels {labels.shape} must be [{len(gaussians)}], one a Gaussian, each in -1...{MAX_LABEL}"
+                f"labels {labels.shape} must be [{len(gaussians)}], one per Gaussian, each in -1...{MAX_LABEL}"
             )
         painted = np.zeros((camera.height, camera.width), np.uint8)
         most = np.full(painted.shape, -1.0, np.float32)

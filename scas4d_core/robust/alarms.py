@@ -1,8 +1,9 @@
-"""Alarms point a person to what needs a look after a frame. They are made here alone, and only shown everywhere else.
+"""Alarms point out conditions that need attention after a frame. They are raised only here; other modules show them.
 
-They are derived from the figures that an update has anyway. A camera is compared with its own past and with the other
-cameras of the frame, so what all see together is no camera's fault. One frame may be noise: what is not far off has to
-stay so for two. The thresholds were read off the captures: docs/stability.md has the distributions.
+They are derived from figures that an update computes anyway. A camera is compared with its own past and with the other
+cameras of the frame. A change that all cameras see is not attributed to one. Because a single frame may be noise, small
+deviations must persist for two frames. The thresholds follow from the captures; docs/stability.md has the
+distributions.
 """
 
 from __future__ import annotations
@@ -19,25 +20,25 @@ from scas4d_core.robust.outliers import LAST_DB, MAX_OUT, Past, allowed, in_doub
 from scas4d_core.update.result import CameraFit
 
 TINT = (0.05, 0.1)
-"""By how much more than its past and the others a camera's red, green or blue may differ from what is rendered, beside
-its two other colours: two frames in a row, and one. Clean: 0.03."""
+"""Maximum deviation of one colour channel from the other two, relative to the camera's past and the other cameras. The
+values are for two consecutive frames, and for one. Clean captures: 0.03."""
 GAIN = (0.15, 0.25)
-"""The same of all its colours together. Clean: 0.09, where a sheet is seen from its edge."""
+"""Maximum common deviation of all channels, likewise. Clean captures: 0.09, for a sheet seen edge-on."""
 SPREAD = 4.0
-"""Times what half of the cameras differ by in this frame, up to which ``TINT`` and ``GAIN`` are widened: where all are
-met badly, as in a few pixels, colours say little."""
+"""Multiple of the deviation of half of the cameras in this frame to which ``TINT`` and ``GAIN`` are widened. If all
+cameras fit badly, as on small images, colours are unreliable."""
 SHARPNESS = (0.12, 0.2)
-"""The same of the logarithm of a picture's sharpness. Clean: 0.07; blurred by a pixel: 0.42."""
+"""Maximum deviation of the log sharpness, likewise. Clean captures: 0.07; a blur of one pixel: 0.42."""
 FOLLOWS = 0.2
-"""How fast the usual colours and sharpness of a camera follow, as its usual place does; not while they are in doubt."""
+"""Rate at which the usual colours and sharpness of a camera follow new values; suspended while they are suspect."""
 ROW = 2
-"""Frames in a row with a doubt, from which it is an alarm."""
+"""Number of consecutive suspect frames that raise an alarm."""
 DARKEST = 0.02
-"""Mean of a colour, 0…1, below which it is not held against itself."""
+"""Mean channel value, 0…1, below which a channel is not compared."""
 FLAT = 0.5
-"""Levels of 255, mean difference of neighbouring pixels, below which a picture has no sharpness."""
+"""Minimum mean difference of neighbouring pixels, in levels of 255, for measuring sharpness."""
 ROWS = 64
-"""Pixels of a picture, about, from which its sharpness is measured."""
+"""Approximate number of pixel rows used for measuring sharpness."""
 COLOURS = ("red", "green", "blue")
 
 Numbers = NDArray[np.float64]
@@ -48,9 +49,9 @@ class CameraFigures:
     """Figures from which the alarms of one camera are derived.
 
     Attributes:
-        colours: [3] usual ``colours_of``, less the median over the cameras; NaN where not known. sharp: usual
-            ``sharpness_of``, NaN where not known.
-        misfit, tint, gain, blur, same: frames in a row with a doubt, or with the same picture.
+        colours: [3] usual ``colours_of`` minus the median over cameras; NaN if unknown. sharp: usual ``sharpness_of``;
+            NaN if unknown.
+        misfit, tint, gain, blur, same: numbers of consecutive suspect frames, or of identical images.
     """
 
     colours: tuple[float, float, float] = (nan, nan, nan)
@@ -63,7 +64,7 @@ class CameraFigures:
 
     @classmethod
     def of(cls, past: Past, name: str) -> CameraFigures:
-        """Of a camera, as ``row`` left it."""
+        """Returns a camera's figures from the row that ``row`` created."""
         row = past.camera_figures.get(name)
         if row is None:
             return cls()
@@ -71,7 +72,7 @@ class CameraFigures:
         return cls((red, green, blue), sharp, *(int(count) for count in counts))
 
     def row(self) -> tuple[float, ...]:
-        """As ``Past.camera_figures`` has it."""
+        """Returns the figures as a row of ``Past.camera_figures``."""
         return (*self.colours, self.sharp, self.misfit, self.tint, self.gain, self.blur, self.same)
 
 
@@ -88,18 +89,18 @@ def alarms_of(
     same: Collection[str],
     left_out: Collection[str] = (),
 ) -> tuple[list[Alarm], Past]:
-    """The alarms of an update, but for the cameras that were left out; and the past with the figures of the next ones.
+    """Returns the alarms of an update, except those of excluded cameras, and the past with figures for the next frame.
 
     Args:
-        past, after: the usual figures before and after it. outcome, reason, exposure: of the frame.
-        offsets: dB by camera above (+) or below its usual place. colours: ``colours_of`` each that was rendered.
-        sharp: ``sharpness_of`` each picture of the frame. same: cameras whose picture is that of the frame before, bit
-            by bit. left_out: cameras that were not believed; that is their alarm.
+        past, after: usual values before and after the frame. outcome, reason, exposure: of the frame.
+        offsets: by camera, dB above (+) or below its usual fit. colours: ``colours_of`` each rendered camera.
+        sharp: ``sharpness_of`` each image of the frame. same: cameras whose image is bit-identical to the previous one.
+            left_out: excluded cameras, which have a separate alarm.
     """
     count = len(sharp)
     found = _frame_alarms(outcome, reason, exposure, same, count)
     if outcome.rejected or not offsets:
-        return found, after  # nothing that a camera could be held against
+        return found, after  # there is nothing to compare cameras with
     watch, raised = dict(after.camera_figures), dict[AlarmKind, dict[str, Alarm]]()
     beside, watches = _minus_median(colours), {name: CameraFigures.of(past, name) for name in sharp}
     changes = {name: value - watches[name].sharp for name, value in sharp.items()}
@@ -118,7 +119,7 @@ def alarms_of(
         watch[name] = now.row()
         if name not in left_out:
             for alarm in alarms:
-                raised.setdefault(alarm.what, {})[name] = alarm
+                raised.setdefault(alarm.kind, {})[name] = alarm
     found += [alarm for of_kind in raised.values() for alarm in unless_most(of_kind, count).values()]
     return found, replace(after, camera_figures=watch)
 
@@ -134,12 +135,14 @@ def _check_camera(
     same: bool,
     spread: tuple[float, float],
 ) -> tuple[CameraFigures, list[Alarm]]:
-    """A camera's figures for the next frame, and its alarms.
+    """Returns a camera's figures for the next frame, and its alarms.
 
     Args:
-        before: its figures. past: of all. offset: dB; None: not rendered. colours: beside the others'.
-        sharp: of its picture; ``sharper``: than usual, beside the others. same: as in the frame before, and others not.
-        spread: tint and gain that half of the cameras differ by.
+        before: the camera's previous figures. past: of all cameras. offset: in dB; None if not rendered. colours:
+            relative to the other cameras.
+        sharp: of its image. sharper: change from its usual sharpness, relative to the other cameras. same: whether its
+            image is unchanged while those of other cameras are not.
+        spread: tint and gain deviations that half of the cameras do not exceed.
     """
     now, alarms = replace(before, same=before.same + 1 if same else 0), list[Alarm]()
     if now.same >= ROW:
@@ -182,32 +185,32 @@ def _check_camera(
 
 
 def odd_channel_change(change: Numbers) -> float:
-    """By how much one of three colours changed beside the two others."""
+    """Returns how much one of three channels changed relative to the other two."""
     return float(np.abs(change - np.median(change)).max())
 
 
 def common_change(change: Numbers) -> float:
-    """By how much three colours changed together."""
+    """Returns how much three channels changed together."""
     return float(np.median(change))
 
 
 def _known(usual: tuple[float, float, float], now: Numbers) -> Numbers:
-    """[3] the usual colours, where they are not known those of now."""
+    """Returns the [3] usual colours, replaced by the current ones if unknown."""
     known: Numbers = np.where(np.isnan(usual), now, usual)
     return known
 
 
 def _upper_median(sizes: Iterable[float]) -> float:
-    """The size that half of them, rounded up, do not exceed; 0 of none."""
+    """Returns the size that half of them, rounded up, do not exceed; 0 if there are none."""
     ordered = sorted(abs(size) for size in sizes)
     return ordered[(len(ordered) - 1) // 2] if ordered else 0.0
 
 
 def left_out_alarms(names: Sequence[str], shown: Collection[str], dropped: Mapping[str, str]) -> list[Alarm]:
-    """Alarms of the cameras that a frame was reconstructed without.
+    """Returns the alarms of cameras that were not used for a frame.
 
     Args:
-        names: of the rig's cameras. shown: those with a picture. dropped: left out, with the reason.
+        names: of the rig's cameras. shown: those with an image. dropped: excluded, with the reason.
     """
     reasons = {name: "no picture came" for name in names if name not in shown} | dict(dropped)
     return [
@@ -217,10 +220,10 @@ def left_out_alarms(names: Sequence[str], shown: Collection[str], dropped: Mappi
 
 
 def colours_of(shift: Sequence[float], mean: Sequence[float] | Numbers) -> Numbers:
-    """[3] by how much brighter a camera's red, green and blue are than they are rendered, of 1.
+    """Returns the [3] relative brightness difference between a camera's channels and their rendering.
 
     Args:
-        shift: ``CameraFit.colour_shift``. mean: of the camera's picture, 0…1.
+        shift: ``CameraFit.colour_shift``. mean: of the camera's image, 0…1.
 
     >>> colours_of((0.05, 0.0, -0.02), (0.3, 0.2, 0.18)).round(3).tolist()
     [0.2, 0.0, -0.1]
@@ -231,15 +234,16 @@ def colours_of(shift: Sequence[float], mean: Sequence[float] | Numbers) -> Numbe
 
 
 def colours_by_camera(fits: Mapping[str, CameraFit], means: Mapping[str, Numbers]) -> dict[str, Numbers]:
-    """``colours_of`` each camera whose shift was measured and whose picture's mean is given."""
+    """Returns ``colours_of`` each camera with a measured shift and a given image mean."""
     shifts = {name: (fit["colour_shift"], means[name]) for name, fit in fits.items() if name in means}
     return {name: colours_of(shift, mean) for name, (shift, mean) in shifts.items() if shift is not None}
 
 
 def sharpness_of(picture: NDArray[np.uint8]) -> float:
-    """Logarithm of how large second differences along the rows of a picture [H, W, 3] are, of the first.
+    """Returns the log ratio of second to first differences along the rows of an image [H, W, 3].
 
-    How much there is to see in it cancels out, so what moves through it is no sign; NaN where there is nothing.
+    The ratio cancels the amount of texture, so objects that move through the image do not affect it; NaN without
+    texture.
     """
     rows = picture[:: max(1, len(picture) // ROWS)].astype(np.int16)
     first = np.diff(rows, axis=1)
@@ -248,19 +252,19 @@ def sharpness_of(picture: NDArray[np.uint8]) -> float:
 
 
 def sharpness(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, float]:
-    """Of each camera's picture."""
+    """Returns the sharpness of each camera's image."""
     return {name: sharpness_of(picture) for name, picture in pictures.items()}
 
 
 def with_first_figures(past: Past, pictures: Mapping[str, NDArray[np.uint8]]) -> Past:
-    """The past after frame 0, with the figures of its pictures for the alarms."""
+    """Returns the past after frame 0, with figures of its images for the alarms."""
     return replace(
         past, camera_figures={name: CameraFigures(sharp=value).row() for name, value in sharpness(pictures).items()}
     )
 
 
 def _minus_median(colours: Mapping[str, Numbers]) -> dict[str, Numbers]:
-    """Colours less the median over the cameras: a light that all see is no camera's."""
+    """Returns colours minus the median over cameras, which removes a lighting change that all cameras see."""
     if not colours:
         return {}
     common = np.median(list(colours.values()), axis=0)
@@ -270,7 +274,7 @@ def _minus_median(colours: Mapping[str, Numbers]) -> dict[str, Numbers]:
 def _frame_alarms(
     outcome: FrameOutcome, reason: str, exposure: float, same: Collection[str], count: int
 ) -> list[Alarm]:
-    """Alarms of no camera."""
+    """Returns the alarms that do not concern a single camera."""
     text = degraded_text(outcome, reason)
     if text is not None:
         return [Alarm(AlarmKind.FRAME_REJECTED if outcome.rejected else AlarmKind.FRAME_IN_PART, None, text)]

@@ -1,17 +1,18 @@
-"""Checks of a frame: of its pictures before they are learnt from, and of the state that came of them.
+"""Checks of a frame's images before they are used, and of the resulting state.
 
-A black frame is finite, and 100 iterations would paint the scene black. Lights flicker, and cameras that choose their
-own exposure do it together: learnt as colours, that would be unlearnt a frame later, so the gain is taken out of the
-pictures. It is measured against the earlier scene: the median over the pixels is that of the many in which nothing but
-the light changed. A light that stays, or that goes on from frame to frame as a lamp that dims, is another one
-(``solve_frame``): then the scene's colours take the gain, and its pictures are as they are.
+A black frame is finite, and 100 iterations would turn the scene black. Lights flicker, and auto-exposure changes all
+cameras together. If such a change were learnt as colours, it would have to be unlearnt in the next frame. Its gain is
+therefore removed from the images. It is measured relative to the previous scene: the median over pixels is that of the
+many pixels in which only the lighting has changed. A lighting change that persists, or continues from frame to frame
+like a dimming lamp, is treated differently (``solve_frame``). The scene's colours take the gain, and the images are not
+changed.
 
-A frame that shows the pictures of the one before comes from a camera at half the rate of its rig, or from a rig that
-sends its last frame while it waits. Nothing is learnt from it, and that nothing moved is not believed either: the next
-frame is looked for where the motion before them leads.
+A frame may repeat the images of the previous frame: a camera runs at half the rate of its rig, or a waiting rig resends
+its last frame. Nothing is learnt from it, and it does not count as a pause of the motion: the next frame starts from
+the motion before the repeated images.
 
-A state that is not finite, bounded and plausible is never committed. Single Gaussians that are not are held as they
-were before; where more than a few are, the whole attempt has failed.
+A state that is not finite, bounded and plausible is never committed. Single faulty Gaussians keep their previous state.
+If there are more than a few of them, the whole attempt has failed.
 """
 
 from __future__ import annotations
@@ -34,55 +35,55 @@ from scas4d_core.update.view_factory import ViewFactory
 Array = NDArray[np.float32]
 
 EXPOSURE = 1.05
-"""Times brighter or darker, median over the cameras, from which a frame is exposed otherwise; clean captures: 1.04."""
+"""Brightness ratio, median over cameras, above which the exposure of a frame differs; clean captures: 1.04."""
 ALIKE = 1.03
-"""Times that the light's step to a frame differs at most from the step before, where it goes on: a lamp that crosses a
-room and dims to a half in ten frames: 1.017; of lights that flicker, no step is like the one before."""
+"""Maximum ratio between consecutive brightness steps of a light that changes continuously. A lamp that crosses a room
+and dims to a half in ten frames has 1.017; flickering lights have no similar steps."""
 ENOUGH = 8
-"""Cameras that the exposure needs: an object that turns changes the brightness of one picture by a third."""
+"""Minimum number of cameras for estimating exposure: a turning object changes the brightness of one image by a third.
+"""
 UNUSABLE = 2.0
-"""Times brighter or darker, as above, from which the light is another and nothing is learnt from the frame."""
+"""Brightness ratio above which the lighting is too different and nothing is learnt from the frame."""
 BLIND = 0.05
-"""Share of its usual brightness, against the other cameras, below which a camera shows nothing."""
+"""Share of a camera's usual brightness, relative to the other cameras, below which its image is dark."""
 DARKEST = 1e-3
-"""Mean of a picture, 0…1, below which its brightness says nothing."""
+"""Mean of an image, 0…1, below which its brightness is not meaningful."""
 
 DARK = 0.05
-"""Of a channel, 0…1, from which it measures how bright the light is."""
+"""Channel value, 0…1, above which a pixel is used for measuring the brightness."""
 PIXELS = 100
-"""Of every other row and column that a camera needs to have a say."""
+"""Minimum number of usable pixels of a camera, on a grid of every other row and column."""
 SATURATED = 0.99
-"""Of a channel, 0…1, from which a pixel says only that it is at least so bright."""
+"""Channel value, 0…1, from which a pixel is saturated and gives only a lower bound."""
 
 EVERY = 4
-"""Rows and columns apart of the pixels that fingerprints compare: pictures of a camera are never alike by chance."""
+"""Row and column stride of the pixels in a fingerprint; images of a camera are never identical by chance."""
 
 
 def fingerprints(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, int]:
-    """CRC-32 of every fourth pixel of every fourth row of each camera's picture [H, W, 3]."""
+    """Returns the CRC-32 of every fourth pixel of every fourth row of each camera's image [H, W, 3]."""
     return {name: crc32(picture[::EVERY, ::EVERY].tobytes()) for name, picture in pictures.items()}
 
 
 def brightness_of(picture: NDArray[np.uint8]) -> float:
-    """Mean of every fourth pixel of every fourth row of a picture [H, W, 3], 0…1."""
+    """Returns the mean of every fourth pixel of every fourth row of an image [H, W, 3], 0…1."""
     return float(picture[::4, ::4].mean()) / 255
 
 
 def brightness(pictures: Mapping[str, NDArray[np.uint8]]) -> dict[str, float]:
-    """Of each camera's picture."""
+    """Returns the brightness of each camera's image."""
     return {name: brightness_of(picture) for name, picture in pictures.items()}
 
 
 def check_brightness(past: Past, bright: Mapping[str, float]) -> tuple[float, dict[str, str], str | None]:
-    """Compare the brightness of a frame's pictures with the usual one, before anything is rendered.
+    """Compares the brightness of a frame's images with the usual one, before anything is rendered.
 
     Args:
-        past: of the scene; cameras that were left out before stay so (``outliers.past_after_update``). bright: by
-            camera.
+        past: of the scene; excluded cameras stay excluded (``outliers.past_after_update``). bright: by camera.
 
     Returns:
-        Times that the frame is brighter than usual (1 where it is not seen to differ); the cameras to leave out, with
-        the reason; and the reason why nothing can be learnt from the frame, or None.
+        The brightness ratio of the frame, 1 if it is within the usual range. The cameras to exclude, with the reason.
+        The reason why nothing can be learnt from the frame, or None.
     """
     left_out = {
         name: "it has not fitted the other cameras since it was left out" for name in bright if past.is_left_out(name)
@@ -104,7 +105,7 @@ def check_brightness(past: Past, bright: Mapping[str, float]) -> tuple[float, di
 
 
 def measure_brightness_ratio(past: Past, bright: Mapping[str, float]) -> float:
-    """Brightness over that of the frame before, median over the cameras; 1 where too few pixels are usable."""
+    """Returns the brightness relative to the previous frame, median over cameras; 1 if too few cameras are usable."""
     ratios = [
         value / past.last_brightness[name]
         for name, value in bright.items()
@@ -114,9 +115,10 @@ def measure_brightness_ratio(past: Past, bright: Mapping[str, float]) -> float:
 
 
 def light_continues(past: Past, bright: Mapping[str, float]) -> bool:
-    """True where a frame's light goes on as it went to the frame before, faster than noise explains.
+    """Returns true if a lighting change continues at the same rate as in the previous frame, faster than noise.
 
-    The scene's own light does so, and is followed at once. A flicker comes back, and a jump has no step before it.
+    In this case the scene's own lighting changes, and the colours follow at once. Flicker returns, and a jump has no
+    previous step.
     """
     step = measure_brightness_ratio(past, bright)
     if 1 / EXPOSURE <= step <= EXPOSURE or (step > 1) != (past.brightness_ratio > 1):
@@ -125,7 +127,7 @@ def light_continues(past: Past, bright: Mapping[str, float]) -> bool:
 
 
 def record_brightness(past: Past, bright: Mapping[str, float]) -> Past:
-    """The past with how bright the pictures of a frame are, and how much brighter than the frame before."""
+    """Returns the past with the brightness of a frame's images and its ratio to the previous frame."""
     return replace(
         past,
         last_brightness={**past.last_brightness, **bright},
@@ -134,7 +136,7 @@ def record_brightness(past: Past, bright: Mapping[str, float]) -> Past:
 
 
 def with_light(past: Past, light: float) -> Past:
-    """The past with the light of a frame: for how many frames it has been brighter, or darker; darkness is none."""
+    """Returns the past with the lighting of a frame and the number of consecutive brighter or darker frames."""
     if light == 1.0 or not BLIND <= light <= 1 / BLIND:
         return replace(past, light=1.0, light_frames=0)
     same = past.light_frames > 0 and (light > 1) == (past.light > 1)
@@ -148,13 +150,13 @@ def compensate_exposure(
     views: Sequence[TrainingView],
     others: Sequence[TrainingView] = (),
 ) -> tuple[float, list[TrainingView], list[TrainingView]]:
-    """Find how many times brighter than usual a frame is, and take that out of its views.
+    """Estimates how much brighter than usual a frame is, and removes this gain from its views.
 
     Args:
-        state: Θ_{t−1}, as the frame before shows it. views: of the frame. others: of the frame, without a say.
+        state: Θ_{t−1}, as in the previous frame. views: of the frame. others: further views, not used for the estimate.
 
     Returns:
-        1 and the views as they are, where they turn out not to differ.
+        The gain, and both lists of views without it; 1 and the unchanged views if the gain is within the usual range.
     """
     shown = [_shown(renderer, state, view) for view in views]
     gain = _gain(views, shown)
@@ -167,38 +169,38 @@ def compensate_exposure(
 
 
 def measure_light_gain(renderer: Renderer, state: Gaussians, views: Sequence[TrainingView]) -> float | None:
-    """Times that a frame is brighter than Θ_{t−1} shows it; None where no camera can say."""
+    """Returns the brightness of a frame relative to a rendering of Θ_{t−1}; None if no camera is usable."""
     return _gain(views, [_shown(renderer, state, view) for view in views])
 
 
 def with_light_gain(state: Gaussians, gain: float) -> Gaussians:
-    """The state in a light so many times as bright; colours beyond white are white."""
+    """Returns the state with colours scaled by ``gain``; colours are clipped at white."""
     colours = state.colours
     return state.replace(colours=np.minimum(np.float32(gain) * colours, np.maximum(colours, np.float32(1))))
 
 
 def _shown(renderer: Renderer, state: Gaussians, view: TrainingView) -> Array:
-    """[3, H, W] the state as the view's camera would show it."""
+    """Returns the [3, H, W] rendering of the state with the camera's exposure."""
     planes = renderer.render(state, view.camera).features[:LABEL]
     shown: Array = view.exposure[:LABEL, 0, None, None] * planes + view.exposure[:LABEL, 1, None, None]
     return shown
 
 
 def _gain(views: Sequence[TrainingView], shown: Sequence[Array]) -> float | None:
-    """Median over the cameras that have a say; None where there is none."""
+    """Returns the median ratio over usable cameras; None if there are none."""
     ratios = [ratio for view, now in zip(views, shown, strict=True) for ratio in _ratio(view.target[:LABEL], now)]
     return float(np.median(ratios)) if ratios else None
 
 
 def _ratio(picture: Array, shown: Array) -> list[float]:
-    """Median over pixels and channels of how much brighter a picture is than what was shown; none of too few."""
+    """Returns a list with the median brightness ratio over pixels and channels; empty if there are too few pixels."""
     here, there = picture[:, ::2, ::2], shown[:, ::2, ::2]
     says = (there > DARK) & (there < SATURATED) & (here > DARK / 2) & (here < SATURATED)
     return [float(np.median(here[says] / there[says]))] if says.sum() >= 3 * PIXELS else []
 
 
 def _without(view: TrainingView, gain: float, shown: Array) -> Array:
-    """The view's planes over the gain; saturated pixels are taken to be as bright as the scene says, or more."""
+    """Returns the view's planes divided by the gain; saturated pixels are at least as bright as the rendering."""
     target = view.target.copy()
     saturated = target[:LABEL] >= SATURATED
     target[:LABEL] /= np.float32(gain)
@@ -207,20 +209,21 @@ def _without(view: TrainingView, gain: float, shown: Array) -> Array:
 
 
 FARTHEST = 1.0
-"""Radii of the rig that a Gaussian may move in one update."""
+"""Maximum displacement of a Gaussian in one update, in rig radii."""
 LONGEST = 1.0
-"""Radii of the rig that an axis may become long."""
+"""Maximum length of an axis, in rig radii."""
 SHRUNK, STRETCHED = 0.1, 10.0
-"""Times its length in frame 0 that an axis may become short or long: thousands of updates add up what each leaves, and
-the axes would wander without end (docs/stability.md, Long runs). Such an axis is set to the bound, and counted."""
+"""Bounds of an axis length relative to its length in frame 0. Over thousands of updates, small residuals add up and
+lengths would drift without limit (docs/stability.md, Long runs). An axis outside the bounds is set to the bound and
+counted."""
 BRIGHTEST = 8.0
-"""Size that a colour may have; 0…1 is what a camera shows, a gain of a camera stretches it."""
+"""Maximum absolute value of a colour; cameras show 0…1, and camera gains extend this range."""
 FEW = 0.01
-"""Share of the moving Gaussians that may be held one by one; more, and the update is not plausible."""
+"""Maximum share of moving Gaussians that keep their previous state; with more, the update is implausible."""
 
 
 def axis_lengths(gaussians: Gaussians) -> Array:
-    """[N, 3] metres."""
+    """Returns the [N, 3] axis lengths in metres."""
     lengths: Array = np.sqrt(np.square(gaussians.factors).sum(axis=1))
     return lengths
 
@@ -228,20 +231,21 @@ def axis_lengths(gaussians: Gaussians) -> Array:
 def check_plausible(
     before: Gaussians, result: UpdateResult, rows: NDArray[np.int64], radius: float, first: Array | None = None
 ) -> tuple[UpdateResult, str | None]:
-    """Hold what is not finite, bounded and plausible as it was before.
+    """Restores the previous state of Gaussians that are not finite, bounded and plausible.
 
     Args:
-        before: Θ_{t−1}. result: of an attempt. rows: [M] the moving. radius: of the rig, metres.
-        first: [N, 3] ``axis_lengths`` of frame 0; None: axes may have any length up to ``LONGEST``.
+        before: Θ_{t−1}. result: of an attempt. rows: [M] rows of the moving Gaussians. radius: of the rig, in metres.
+        first: [N, 3] ``axis_lengths`` of frame 0; None to limit axes only by ``LONGEST``.
 
     Returns:
-        The result with a state that may be committed, and None; or with ``before``, and the fault of its state.
+        The result with a state that may be committed, and None; or the result with ``before``, and the fault of its
+        state.
     """
     after = result.gaussians
     bad = np.zeros(len(after), np.bool_)
     with np.errstate(over="ignore", invalid="ignore"):
         colours = np.abs(after.colours).max(axis=1, initial=0)
-        bad |= ~(colours <= BRIGHTEST)  # NaN is not at most anything
+        bad |= ~(colours <= BRIGHTEST)  # comparisons with NaN are false
         moved = np.square(after.means[rows] - before.means[rows]).sum(axis=1)
         squares = np.square(after.factors[rows]).sum(axis=1)
         lengths = squares.max(axis=1, initial=0)
@@ -263,10 +267,10 @@ def check_plausible(
 
 
 def _bounded(after: Gaussians, rows: NDArray[np.int64], squares: Array, first: Array) -> tuple[Gaussians, int]:
-    """Axes set to the bounds of their length, and how many were.
+    """Clamps the axis lengths to their bounds, and returns how many were changed.
 
     Args:
-        squares: [M, 3] of the axes' lengths. first: [N, 3] lengths in frame 0.
+        squares: [M, 3] squared axis lengths. first: [N, 3] lengths in frame 0.
     """
     least, most = np.square(SHRUNK * first[rows]), np.square(STRETCHED * first[rows])
     which, axis = np.nonzero((squares < least) | (squares > most))
@@ -280,13 +284,13 @@ def _bounded(after: Gaussians, rows: NDArray[np.int64], squares: Array, first: A
 
 
 def _oriented(before: NDArray[np.float32], after: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """[M] whether the map between two factors [M, 3, 3] has not turned the Gaussian inside out."""
+    """Returns [M] true if the map between two factors [M, 3, 3] preserves orientation."""
     same: NDArray[np.bool_] = ~(np.sign(_det(before)) * np.sign(_det(after)) < 0)
     return same
 
 
 def _det(factors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[M] of [M, 3, 3]; scaled by nothing, so a sign is all that is read from it."""
+    """Returns [M] determinants of [M, 3, 3]; unscaled, because only the sign is used."""
     a, b, c = factors[:, 0], factors[:, 1], factors[:, 2]
     det: NDArray[np.float32] = (a * np.cross(b, c)).sum(axis=1)
     return det
@@ -299,5 +303,5 @@ def _pairs(before: Gaussians, after: Gaussians) -> list[tuple[str, NDArray[np.fl
 
 
 def _like(rows: NDArray[np.bool_], array: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """[N, 1, …] for an array [N, …]."""
+    """Returns the rows reshaped to [N, 1, …] for an array [N, …]."""
     return rows.reshape(-1, *[1] * (array.ndim - 1))

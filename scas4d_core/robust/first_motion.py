@@ -1,8 +1,9 @@
-"""The first update of a scene, in several orders of its views: no motion leads it, and it decides for all after it.
+"""The first update of a scene, in several view orders: it has no previous motion, and later updates depend on it.
 
-Which basin it ends in is chance: with a bad order it ends 1 to 5 dB below others, and later updates do not find what it
-missed. Orders differ in their rates, too, for what one scene's steps pass over, another's do not reach. The errors of
-the ends in all training views decide which is best; a few small pictures do not (docs/method.md).
+The basin in which it ends is a matter of chance. With a bad order it ends 1 to 5 dB below others, and later updates do
+not recover. The orders also differ in their learning rates, because steps that are too large for one scene are too
+small for another. The errors in all training views decide which result is best; a few small images are not sufficient
+(docs/method.md).
 """
 
 from __future__ import annotations
@@ -17,19 +18,19 @@ from scas4d_core.frame_outcome import OTHER_ORDERS, Candidate
 from scas4d_core.update.result import UpdateResult
 
 FASTER = (1.0, 2.0, 2.0)
-"""Factors on the rates of the layers (``UpdateSettings.cold_start_rates``), one for each order that may be tried."""
+"""Factors on the layers' rates (``UpdateSettings.cold_start_rates``), one for each order that may be tried."""
 AGREE = 0.04
-"""Two orders whose errors lie within this share of each other ended in the same basin: no third one is tried."""
+"""Relative difference of errors below which two orders ended in the same basin, and no third order is tried."""
 ANOTHER_ORDER = 1_000_003
-"""Added to the seed of an update for each order after the first."""
+"""Added to the update's seed for each further order."""
 
 
 class OrderResult(NamedTuple):
-    """The end of one order.
+    """The result of one order.
 
     Attributes:
-        result, fault: of the update, and what is wrong with its state, or None.
-        fits: dB by camera of that state; without those that the update left out.
+        result, fault: of the update, and the fault of its state, or None.
+        fits: PSNR in dB of that state by camera; without excluded cameras.
     """
 
     result: UpdateResult
@@ -38,12 +39,12 @@ class OrderResult(NamedTuple):
 
 
 def best_order(run: Callable[[int, float], OrderResult], seed: int) -> tuple[OrderResult, int]:
-    """Runs an update in two orders of its views, or three; returns the best end, and how many ran.
+    """Runs an update in two or three view orders; returns the best result and the number of orders.
 
-    An update that needed no iteration is not tried again.
+    An update that needs no iteration is not repeated.
 
     Args:
-        run: the update, with a seed and a factor on the rates of the layers. seed: of the first order.
+        run: runs the update with a seed and a factor on the layers' rates. seed: of the first order.
     """
     ends: list[OrderResult] = []
     while len(ends) < len(FASTER) and not _agree(errors_of(ends)):
@@ -57,9 +58,9 @@ def best_order(run: Callable[[int, float], OrderResult], seed: int) -> tuple[Ord
 
 
 def errors_of(ends: Sequence[OrderResult]) -> list[float]:
-    """Root mean square error, 0…1, of each end: the mean over the cameras that all orders believed.
+    """Returns the RMS error, 0…1, of each result, averaged over cameras that no order excluded.
 
-    Infinite where a state is not plausible, or no better than not moving.
+    The error is infinite if a state is implausible, or no better than the previous state.
     """
     names = set.intersection(*(set(end.fits) for end in ends)) if ends else set()
     return [_error(end, sorted(names)) for end in ends]
@@ -73,7 +74,7 @@ def _error(end: OrderResult, names: Sequence[str]) -> float:
 
 
 def _agree(errors: Sequence[float]) -> bool:
-    """True where two errors or more are finite and lie within ``AGREE`` of the least.
+    """Returns true if at least two errors are finite and all are within ``AGREE`` of the smallest.
 
     >>> _agree([1.0]), _agree([1.0, 1.03]), _agree([1.05, 1.0]), _agree([np.inf, np.inf])
     (False, True, False, False)

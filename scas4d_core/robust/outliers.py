@@ -1,9 +1,9 @@
-"""Outlying cameras and frames: each camera is compared with its own past and with the others of the frame.
+"""Outlying cameras and frames: each camera is compared with its own past and with the other cameras of the frame.
 
-The figures are those that an update has anyway: how well each camera was met when it was rendered first and last, and
-the mean brightness of its picture (``checks``). One camera that fits much worse than the others is left out; a
-frame that all cameras agree on is believed as long as it can be met as a whole. The thresholds were read off the
-captures: docs/stability.md has the distributions.
+The comparison uses figures that an update computes anyway. These are the fit of each camera when it was first and last
+rendered, and the mean brightness of its image (``checks``). A camera that fits much worse than the others is excluded.
+A change that all cameras show is accepted if the frame can be fitted as a whole. The thresholds follow from the
+captures; docs/stability.md has the distributions.
 """
 
 from __future__ import annotations
@@ -17,69 +17,68 @@ import numpy as np
 from numpy.typing import NDArray
 
 FIRST_DB = -9.0
-"""Against its usual place among the cameras when first rendered: such a camera is left out at once; clean: -6.1."""
+"""Offset from a camera's usual level, when first rendered, below which it is excluded at once; clean: -6.1."""
 LAST_DB = -5.0
-"""The same when last rendered: left out from the next frame on. Clean: -3.7; moved by one or two pixels: -6 to -15."""
+"""The same when last rendered; excluded from the next frame on. Clean: -3.7; moved by one or two pixels: -6 to -15."""
 NEAR_DB = -4.0
-"""The same, from which a camera is in doubt: its usual place does not follow, so that what lasts is seen to last; two
-frames in a row are an alarm. Clean: -3.7."""
+"""Offset below which a camera is suspect. Its usual level is then not updated, so that a lasting fault remains visible;
+two consecutive frames raise an alarm. Clean: -3.7."""
 FITS_DB = -4.0
-"""From which a camera that was left out is believed again: colours that follow the others do not follow it."""
+"""Offset above which an excluded camera is accepted again; colours that follow the other cameras do not follow it."""
 NEW_DB = (-4.0, -2.0, -2.0)
-"""More is allowed for in the first updates: a camera's place is known from frame 0 alone, or from one update."""
+"""Additional tolerance in the first updates, in which a camera's level is known only from frame 0 or one update."""
 DROP_DB = 6.0
-"""Of the cameras' median below its usual, from which an update has not met its frame."""
+"""Drop of the cameras' median below its usual value at which an update has not fitted its frame."""
 DROPS_DB = (14.0, 9.0, 9.0)
-"""The same in the first updates: what is usual is known from frame 0 alone, or from an update that took longer."""
+"""The same in the first updates, in which the usual value is known only from frame 0 or from a longer update."""
 HALVED_DB = 3.0
-"""More is allowed for each halving of the iterations: 100 to 50 cost 1.7 dB on the captures, 50 to 25 3.2."""
+"""Additional tolerance per halving of the iterations: 100 to 50 cost 1.7 dB on the captures, 50 to 25 cost 3.2."""
 BEHIND_DB = 1.5
-"""The same, from which the first frames after held ones are sought longer: what moved on unseen is further away."""
+"""The same drop for the first frames after rejected ones, above which the update is continued: objects have moved on.
+"""
 RESTS_DB = 3.0
-"""The same, up to which a scene in which nothing is seen to move may stand: noise that frame 0 fits costs 1 to 2 dB."""
+"""Drop up to which a scene without visible motion counts as static; noise that frame 0 fits costs 1 to 2 dB."""
 CATCH_UP = 3
-"""Frames that are, at most."""
+"""Maximum number of consecutive frames after a rejected or skipped one that count as lagging."""
 MAX_OUT = 0.5
-"""Share of the cameras that are left out at most; where more do not fit, it is the frame that changed."""
+"""Maximum share of excluded cameras; if more do not fit, the frame itself has changed."""
 
 CLEAN_DB = 40.0
-"""All that is met better counts as this: beyond, 5 dB are a thousandth of the range, and no sign of a fault."""
+"""Upper limit of PSNR values: above it, 5 dB are a thousandth of the value range and do not indicate a fault."""
 
 ERROR_RISE = 1.02
-"""Times that the usual error of a probe view rises at most in an update."""
+"""Maximum ratio by which the usual error of a probe view rises in an update."""
 OTHER_EFFORT = 1.5
-"""Times more or fewer iterations than the update before, from which the usual level begins anew."""
+"""Ratio of iterations between updates above which the usual level is reset."""
 
 PLACE_RATE, LEVEL_RATE = 0.2, 0.3
-"""How fast a camera's usual place and the usual level follow."""
+"""Rates at which a camera's usual level and the overall level follow new values."""
 
 CAMERA_FIGURES, TIMING_FIGURES = 9, 6
-"""Figures of ``alarms.CameraFigures`` and of ``timing.CameraTimingSums`` by camera."""
+"""Numbers of figures per camera in ``alarms.CameraFigures`` and ``timing.CameraTimingSums``."""
 
 Fault = TypeVar("Fault")
 
 
 @dataclass(frozen=True)
 class Past:
-    """The usual figures of a scene and its cameras; carried from commit to commit.
+    """The usual values of a scene and its cameras; carried from commit to commit.
 
     Attributes:
-        camera_levels: by camera, dB of its last rendering, less the level of its frame; NaN where not known.
-        brightness: by camera, mean of its picture, 0…1, in the exposure of frame 0; NaN where not known.
-        frames_left_out: by camera, frames in a row that it has been left out, 0 when it is believed.
-        level: dB at the end of an update, see ``level_of``; NaN where not known.
-        updates: that went into it. rejected: consecutive frames that were rejected with usable pictures.
-            fitted: seconds, time of the last frame that was learnt from. lagging_frames: frames since some were
-                rejected or
-            skipped, 0 once the PSNR is as usual again.
-        iterations: of the last update. error: usual at the end of an update, by probe view.
-        light: times that the last frame was brighter, see ``checks.check_brightness``. light_frames: frames in a row
-            that were brighter, or that were darker.
-        last_brightness: by camera, mean of its picture in the last frame, in whatever light. brightness_ratio: times
-            that the last frame was
-            brighter than the one before it.
-        camera_figures: by camera, what its alarms are derived from, see ``alarms.CameraFigures``.
-        timing: by camera, the moments of its pictures, see ``timing.CameraTimingSums``.
+        camera_levels: by camera, PSNR in dB of its last rendering minus the level of its frame; NaN if unknown.
+        brightness: by camera, mean of its image, 0…1, at the exposure of frame 0; NaN if unknown.
+        frames_left_out: by camera, number of consecutive frames for which it has been excluded; 0 if it is used.
+        level: PSNR in dB at the end of an update, see ``level_of``; NaN if unknown.
+        updates: number of updates included. rejected: number of consecutive rejected frames with usable images. fitted:
+            time in seconds of the last learnt frame. lagging_frames: number of frames since a rejected or skipped one,
+            0 when the PSNR is back to normal.
+        iterations: of the last update. error: usual error at the end of an update, by probe view.
+        light: brightness ratio of the last frame, see ``checks.check_brightness``. light_frames: number of consecutive
+            brighter, or darker, frames.
+        last_brightness: by camera, mean of its image in the last frame, in any lighting. brightness_ratio: brightness
+            of the last frame relative to the one before it.
+        camera_figures: by camera, figures for alarms, see ``alarms.CameraFigures``.
+        timing: by camera, figures for timing, see ``timing.CameraTimingSums``.
     """
 
     camera_levels: Mapping[str, float] = field(default_factory=dict)
@@ -101,14 +100,14 @@ class Past:
 
     @classmethod
     def of_first(cls, psnr: Mapping[str, float], bright: Mapping[str, float]) -> Past:
-        """After frame 0: how well its fit met each camera, dB, and how bright the pictures are."""
+        """Returns the past after frame 0, from the PSNR in dB and the image brightness of each camera."""
         psnr = _capped(psnr)
         level = float(np.median(list(psnr.values()))) if psnr else nan
         places = {name: psnr.get(name, nan) - level for name in bright}
         return cls(places, dict(bright), dict.fromkeys(bright, 0), level, last_brightness=dict(bright))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """As arrays, for a checkpoint."""
+        """Returns the values as arrays, for a checkpoint."""
         rows = [
             (place, self.brightness[name], self.frames_left_out[name]) for name, place in self.camera_levels.items()
         ]
@@ -139,10 +138,10 @@ class Past:
 
     @classmethod
     def of_arrays(cls, arrays: Mapping[str, NDArray[Any]]) -> Past:
-        """From ``arrays``.
+        """Creates a past from ``arrays``.
 
         Raises:
-            KeyError, ValueError: some are missing, or do not fit.
+            KeyError, ValueError: arrays are missing or do not match.
         """
         rows = list(zip(arrays["names"].tolist(), arrays["cameras"].tolist(), strict=True))
         places = {name: place for name, (place, _, _) in rows}
@@ -159,28 +158,28 @@ class Past:
         )  # fmt: skip
 
     def camera_level(self, name: str) -> float:
-        """Usual place of a camera, dB; NaN where not known."""
+        """Returns the usual level of a camera in dB; NaN if unknown."""
         return self.camera_levels.get(name, nan)
 
     def is_left_out(self, name: str) -> bool:
-        """True for a camera that is left out."""
+        """Returns true if a camera is excluded."""
         return self.frames_left_out.get(name, 0) > 0
 
 
 def _rows(arrays: Mapping[str, NDArray[Any]], names: str, rows: str) -> dict[str, tuple[float, ...]]:
-    """Figures by camera."""
+    """Returns figures by camera."""
     return {name: tuple(row) for name, row in zip(arrays[names].tolist(), arrays[rows].tolist(), strict=True)}
 
 
 def past_in_light(past: Past, gain: float) -> Past:
-    """The past once another light is the usual one: in a brighter light, errors are brighter, too."""
+    """Returns the past with a new usual lighting; errors are larger in brighter light."""
     brightness = {name: gain * value for name, value in past.brightness.items()}
     level = past.level - max(0.0, 20 * log10(gain))
     return replace(past, brightness=brightness, level=level, error={}, light=1.0, light_frames=0)
 
 
 def offsets(past: Past, psnr: Mapping[str, float]) -> dict[str, float]:
-    """DB by camera, above (+) or below its usual place among the cameras; of those whose place is known."""
+    """Returns each known camera's offset above (+) or below its usual level relative to the other cameras, in dB."""
     known = {name: value for name, value in _capped(psnr).items() if past.camera_level(name) == past.camera_level(name)}
     if not known:
         return {}
@@ -190,10 +189,10 @@ def offsets(past: Past, psnr: Mapping[str, float]) -> dict[str, float]:
 
 
 def misfits(past: Past, psnr: Mapping[str, float], limit: float) -> dict[str, str]:
-    """Cameras whose rendering fits so much worse than usual, of all that were rendered, with the reason.
+    """Returns the cameras that fit much worse than usual, with the reason.
 
     Args:
-        psnr: dB by camera. limit: ``FIRST_DB`` or ``LAST_DB``.
+        psnr: in dB by camera. limit: ``FIRST_DB`` or ``LAST_DB``.
     """
     limit += allowed(past)
     outlying = {
@@ -205,21 +204,21 @@ def misfits(past: Past, psnr: Mapping[str, float], limit: float) -> dict[str, st
 
 
 def allowed(past: Past) -> float:
-    """DB that are allowed for beside every limit, by how well the cameras' places are known: ``NEW_DB``, or 0."""
+    """Returns the additional tolerance in dB: ``NEW_DB`` in the first updates, then 0."""
     return NEW_DB[past.updates] if past.updates < len(NEW_DB) else 0.0
 
 
 def in_doubt(past: Past, offset: float) -> bool:
-    """True where a camera is met so much worse than usual, dB, that one more such frame is an alarm."""
+    """Returns true if a camera's offset, in dB, is so low that a second such frame raises an alarm."""
     return offset < NEAR_DB + allowed(past)
 
 
 def misfit_reason(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | None:
-    """Why an update has not met its frame, or None.
+    """Returns why an update has not fitted its frame, or None.
 
     Args:
-        psnr: dB by camera when last rendered. iterations: of the update; one that took fewer than the one
-            before may meet its frame less well. 0: as many.
+        psnr: in dB by camera, when last rendered. iterations: of the update; fewer than in the previous one allow a
+            lower PSNR. 0: the same number.
     """
     if not psnr or past.level != past.level:
         return None
@@ -231,8 +230,9 @@ def misfit_reason(past: Past, psnr: Mapping[str, float], iterations: int = 0) ->
 
 
 def lag_reason(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> str | None:
-    """Why an update after frames that were held or not moved should be sought longer, or None. See
-    ``misfit_reason``.
+    """Returns why an update after rejected or skipped frames should be continued, or None.
+
+    The arguments are those of ``misfit_reason``.
     """
     if not (past.rejected or past.lagging_frames) or not psnr or past.level != past.level:
         return None
@@ -241,19 +241,19 @@ def lag_reason(past: Past, psnr: Mapping[str, float], iterations: int = 0) -> st
 
 
 def _shorter(past: Past, iterations: int) -> float:
-    """DB that an update of so many iterations may be worse by, as it took fewer than the one before."""
+    """Returns the additional tolerance in dB for an update with fewer iterations than the previous one."""
     return HALVED_DB * log2(past.iterations / iterations) if 0 < iterations < past.iterations else 0.0
 
 
 def level_of(past: Past, psnr: Mapping[str, float]) -> float:
-    """DB, median over the cameras, each less its usual place: a short update renders a few of them; NaN of none."""
+    """Returns the median PSNR in dB over cameras, each relative to its usual level; NaN without cameras."""
     places = {name: past.camera_level(name) for name in psnr}
     values = [value - (places[name] if isfinite(places[name]) else 0.0) for name, value in _capped(psnr).items()]
     return float(np.median(values)) if values else nan
 
 
 def health(past: Past, off: float) -> float:
-    """0…1: 1 where a camera fits as usual or better, 0 from where it will be left out; ``off`` is its offset, dB."""
+    """Returns 0…1: 1 if a camera fits as usual or better, 0 at the exclusion limit; ``off`` is its offset in dB."""
     return float(np.clip(1 - off / (LAST_DB + allowed(past)), 0, 1))
 
 
@@ -265,12 +265,13 @@ def past_after_update(
     iterations: int = 0,
     moved: bool = True,
 ) -> Past:
-    """The past after an update was committed.
+    """Returns the past after a committed update.
 
     Args:
-        psnr: dB by camera, of those learnt from when last rendered, of those left out as the update ended.
-        bright: of every picture of the frame. exposure: of the frame. iterations: of the update, 0: as many as before.
-        moved: whether it gave another state, or one before did: else no update's usual figures are known.
+        psnr: in dB by camera: of learnt cameras when last rendered, of excluded ones at the end of the update.
+        bright: of every image of the frame. exposure: of the frame. iterations: of the update; 0: as in the previous
+            one.
+        moved: whether this or an earlier update changed the state; otherwise no update's usual values are known.
     """
     psnr = _capped(psnr)
     off = offsets(past, psnr)
@@ -279,7 +280,7 @@ def past_after_update(
     level = level_of(past, believed) if believed else past.level
     places, brightness, outs = dict(past.camera_levels), dict(past.brightness), dict(past.frames_left_out)
     for name, value in bright.items():
-        # Of a camera that was not learnt from the figures stay: its picture is no sign of what is usual.
+        # Figures of cameras that were not used do not change, because their images are not representative.
         before = outs.setdefault(name, 0)
         place = places.setdefault(name, nan)
         brightness.setdefault(name, nan)
@@ -314,18 +315,18 @@ def past_after_update(
 
 
 def usual_errors(before: Mapping[str, float], now: Mapping[str, float]) -> dict[str, float]:
-    """The errors by view that are usual: they fall at once and rise slowly.
+    """Returns the usual errors by view: they fall at once and rise slowly.
 
-    A noisy frame's error would else be enough for the next good one, which moved.
+    Otherwise the large error of a noisy frame would let the next good frame be skipped although it moved.
     """
     return {name: min(value, ERROR_RISE * before.get(name, value)) for name, value in now.items()}
 
 
 def _capped(psnr: Mapping[str, float]) -> dict[str, float]:
-    """No more than ``CLEAN_DB`` each; NaN stays NaN."""
+    """Returns each value limited to ``CLEAN_DB``; NaN is preserved."""
     return {name: CLEAN_DB if value > CLEAN_DB else value for name, value in psnr.items()}
 
 
 def unless_most(found: dict[str, Fault], count: int) -> dict[str, Fault]:
-    """The faults found of cameras, by name; none where most of ``count`` cameras have one."""
+    """Returns the faults by camera, or no faults if most of ``count`` cameras have one."""
     return found if len(found) <= MAX_OUT * count else {}

@@ -1,8 +1,8 @@
-"""Relocates an object after a large jump: the update follows motions of less than the object's size, and none beyond.
+"""Relocates an object after a jump: the update tracks motions up to about the object's size, but no larger ones.
 
-Each camera compares its picture with the scene without its moving Gaussians: pixels that differ show the object. The
-rays through the middle of the object now, and through the middle of its rendering before, meet in two points; their
-difference is how far it went. Turns are left to the update that follows.
+Each camera compares its image with the scene without moving Gaussians; different pixels show the object. The rays
+through the object's centre now, and through the centre of its previous rendering, are intersected. The difference
+between the two points is the displacement. Rotation is left to the update that follows.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from scas4d_core.gaussians import Gaussians
 Float = NDArray[np.float64]
 
 DIFFERENT = 0.1
-"""Of a colour channel, 0…1, from which a pixel shows the moving object and not the scene behind."""
+"""Channel difference, 0…1, above which a pixel shows the moving object and not the background."""
 SMALLEST_AREA = 0.25
-"""Of the object's area in a picture that has to be seen now for the camera to have a say; at most its inverse."""
+"""Minimum share of the object's rendered area that a camera must see now; the maximum is its inverse."""
 CAMERAS = 3
-"""With a say that are needed."""
+"""Minimum number of such cameras."""
 AGREE = 0.25
-"""Of the distance found that the rays may miss each other by, root mean square: else they saw different things."""
+"""Maximum RMS distance of the rays from their intersection, relative to the displacement; otherwise they disagree."""
 
 
 def find_jump(gaussians: Gaussians, views: Sequence[TrainingView], renderer: Renderer, rig: Rig) -> Float | None:
-    """[3] metres, how far the moving Gaussians have jumped; None where the cameras do not agree on it.
+    """Returns the [3] displacement of the moving Gaussians in metres; None if the cameras do not agree.
 
     Args:
-        gaussians: Θ_{t−1}. views: of frame t. renderer: draws. rig: the cameras inside.
+        gaussians: Θ_{t−1}. views: of frame t. renderer: renders views. rig: the cameras in the internal world.
     """
     rows = gaussians.moving
     if not rows.any():
@@ -62,14 +62,14 @@ def find_jump(gaussians: Gaussians, views: Sequence[TrainingView], renderer: Ren
 
 
 def shift_moving(gaussians: Gaussians, shift: Float) -> Gaussians:
-    """The state with its moving Gaussians shifted by [3] metres."""
+    """Returns the state with its moving Gaussians shifted by [3] metres."""
     means = gaussians.means.copy()
     means[gaussians.moving] += shift.astype(np.float32)
     return gaussians.replace(means=means)
 
 
 def _ray(camera: Camera, pixels: NDArray[np.bool_]) -> tuple[Float, Float]:
-    """Centre of a camera and [3] unit direction through the middle of marked pixels; centres lie at +0.5."""
+    """Returns a camera's centre and the [3] unit direction through the centroid of the marked pixels."""
     rows, columns = np.nonzero(pixels)
     middle = np.array([columns.mean() + 0.5, rows.mean() + 0.5, 1.0])
     direction = camera.world_to_camera[:3, :3].T @ np.linalg.solve(camera.intrinsics, middle)
@@ -77,7 +77,7 @@ def _ray(camera: Camera, pixels: NDArray[np.bool_]) -> tuple[Float, Float]:
 
 
 def _meeting(rays: Sequence[tuple[Float, Float]]) -> tuple[Float, float]:
-    """[3] the point nearest to all rays, and its root mean square distance from them."""
+    """Returns the [3] point nearest to all rays, and its RMS distance from them."""
     across = [np.eye(3) - np.outer(direction, direction) for _, direction in rays]
     left = np.sum(across, axis=0)
     right = np.sum([matrix @ origin for matrix, (origin, _) in zip(across, rays, strict=True)], axis=0)

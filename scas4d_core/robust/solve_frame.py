@@ -1,7 +1,7 @@
-"""Solves one frame: the update as set, retries where it fails, a search for what jumped; else Θ_{t−1} stays.
+"""Solves one frame: a regular update, retries if it fails, and a search for objects that jumped.
 
-Whatever fails, the next attempt starts from the committed state. Where no attempt gives a state that is plausible
-(``checks``) and shows the frame (``outliers``), the state of the frame before stays, and the report says so.
+Every new attempt starts from the committed state. If no attempt gives a state that is plausible (``checks``) and fits
+the frame (``outliers``), the previous state is kept and the report gives the reason.
 """
 
 from __future__ import annotations
@@ -44,15 +44,15 @@ LADDER = (
     AttemptOptions("smaller steps", rates=0.3, cold=True),
     AttemptOptions("rigid layers only", rates=0.3, rigid=True, freeze_colours=True, cold=True),
 )
-"""The attempts that follow one whose state is not plausible."""
+"""Attempts after one whose state is not plausible."""
 
 SEARCH = AttemptOptions("sought again", cold=True, iteration_factor=5.0)
-"""From where the silhouettes say that the object is, or from where an update ended. Two of three frames of robot lost,
-the next is met at 33.5 dB with five times the iterations, at 32.1 dB with twice."""
+"""The search, from the position that silhouettes suggest or from the end of the update. If two of three frames of robot
+are lost, the next one is fitted at 33.5 dB with this factor, and at 32.1 dB with 2."""
 
 
 Solved = tuple[UpdateResult, Past]
-"""The result of a frame, and the usual figures after it."""
+"""The result of a frame, and the usual values after it."""
 Validated = tuple[UpdateResult, str | None]
 """The result of an attempt, and the fault of its state, or None."""
 
@@ -61,10 +61,10 @@ class FrameSolver:
     """Solves the frames of a scene.
 
     Args:
-        updater: of the scene. factory: of its views. renderer: draws, with the settings' background and limits.
+        updater: of the scene. factory: creates its views. renderer: has the background and limits of the settings.
 
     Attributes:
-        check_seconds: seconds that checks took beside the updates.
+        check_seconds: time of the checks outside the updates, in seconds.
     """
 
     def __init__(
@@ -77,13 +77,13 @@ class FrameSolver:
         self.check_seconds = 0.0
 
     def run(self, given: UpdateInput) -> Solved:
-        """Solve a frame; where it is held, the state and the motion are those given."""
+        """Solves a frame; if it is rejected, state and motion are those of the input."""
         result, past = self._solve(given)
         with self._time_checks():
             return self._with_alarms(given, result, past)
 
     def _with_alarms(self, given: UpdateInput, result: UpdateResult, past: Past) -> Solved:
-        """With the health of the cameras, the alarms, and when the pictures were taken."""
+        """Adds the health of the cameras, the alarms, and the capture times of the images."""
         if self._settings.reject_outliers:
             past = timing.record_timing(
                 past, given.state, result, self._renderer, given.seconds, given.step, given.seed
@@ -108,7 +108,7 @@ class FrameSolver:
         stays = given.light_moves or given.past.light_frames >= self._settings.max_rejected_frames
         if stays and (solved := self._retry_with_light_gain(given)) is not None:
             return solved
-        if given.unusable is not None:  # nothing is tried, and no patience is lost with it
+        if given.unusable is not None:  # nothing is tried, and the frame does not count as rejected
             past = replace(given.past, lagging_frames=max(1, given.past.lagging_frames))
             nothing = UpdateTrace(kept=Candidate.PREVIOUS)
             return self._rejected(
@@ -126,7 +126,7 @@ class FrameSolver:
             if fault is None:
                 break
             result, fault = self._attempt(given, options, attempts)
-        lost = replace(given.past, rejected=given.past.rejected + 1)  # patience ends
+        lost = replace(given.past, rejected=given.past.rejected + 1)  # counts towards max_rejected_frames
         if fault is not None:
             outcome = FrameOutcome.REJECTED_IMPLAUSIBLE
             return self._rejected(given, outcome, result.trace, lost, attempts, fault, exposure)
@@ -155,22 +155,22 @@ class FrameSolver:
         return self._accepted(given, result)
 
     def _scene_is_static(self, given: UpdateInput) -> str | None:
-        """Why nothing has to be updated, as the pictures alone say, or None."""
+        """Returns why no update is needed, according to the images only, or None."""
         if given.same and len(given.same) == len(given.brightness):
             return "the same pictures again"
-        if not given.may_be_static or given.past.updates > 0:  # what was updated once is no frame 0 to rest at
+        if not given.may_be_static or given.past.updates > 0:  # only a scene that was never updated can rest at frame 0
             return None
-        with self._time_checks():  # what most cameras do not agree on may still have moved
+        with self._time_checks():  # motion that most cameras do not confirm is possible
             fits = self._psnr_by_camera(given.views, given.state)
             level = outliers.level_of(given.past, fits)
-        if outliers.misfits(given.past, fits, outliers.LAST_DB):  # an update shows what is wrong with a camera
+        if outliers.misfits(given.past, fits, outliers.LAST_DB):  # an update will show the fault of the camera
             return None
         return "nothing is seen to move" if level > given.past.level - outliers.RESTS_DB else None
 
     def _retry_with_light_gain(self, given: UpdateInput) -> Solved | None:
-        """A frame in a light that stays or moves: the colours take it on; None where the cameras show no other.
+        """Solves a frame with persistent or continuing lighting by scaling the colours; None if no gain is measured.
 
-        Where the scene is shown as bright as it was, something new makes the pictures brighter: no reason to hold them.
+        If the scene is as bright as before, a new object makes the images brighter, which is no reason to reject them.
         """
         gain = measure_light_gain(self._renderer, given.state, given.views)
         same = gain is not None and not given.light_moves and 1 / EXPOSURE <= gain <= EXPOSURE
@@ -201,9 +201,10 @@ class FrameSolver:
         return result, fault
 
     def _is_first_motion(self, given: UpdateInput, template: AttemptOptions) -> bool:
-        """True for the first motion of a scene, where it may take longer than others and as long as it needs.
+        """Returns true for the first motion of a scene, if its update may take longer and has no time limit.
 
-        A scene that goes on without its carry-over knows no camera; what was held was sought for longer already.
+        A scene that resumes without its carry-over has no usual values for its cameras. After rejected frames, a longer
+        search has already been made.
         """
         first = (
             given.motion is None
@@ -237,7 +238,7 @@ class FrameSolver:
         self.check_seconds += perf_counter() - began
 
     def _options(self, given: UpdateInput, template: AttemptOptions) -> AttemptOptions:
-        """The options of an attempt at a frame, in the manner of a template."""
+        """Returns the options of an attempt at a frame, based on a template."""
         settings, past = self._settings, given.past
         iteration_factor = max(
             template.iteration_factor, settings.cold_start_iterations if given.motion is None else 1.0
@@ -265,7 +266,7 @@ class FrameSolver:
         )
 
     def _attempt_deadline(self, given: UpdateInput, template: AttemptOptions, end: float) -> float:
-        """The moment by which an attempt has to be over: after held frames half is kept for a search."""
+        """Returns the deadline of an attempt; after rejected frames, half of the time is reserved for a search."""
         now = perf_counter()
         return (now + end) / 2 if given.past.rejected and template is AS_CONFIGURED and now < end else end
 
@@ -281,13 +282,13 @@ class FrameSolver:
         return outliers.lag_reason(given.past, result.trace.met, len(result.trace.losses))
 
     def _budget_is_spent(self, given: UpdateInput, more: int = 0) -> bool:
-        """True where the budget has no time left for another attempt, with ``more`` iterations before it."""
+        """Returns true if the budget has no time for another attempt after ``more`` iterations."""
         return given.end is not None and perf_counter() + (PROBE + more) * (given.iteration_seconds or 0.0) > given.end
 
     def _search(self, given: UpdateInput, tried: UpdateResult, attempts: list[str]) -> UpdateResult | None:
-        """Longer attempts, from where the silhouettes say that the object is, and from where ``tried`` ended.
+        """Runs longer attempts from the position that silhouettes suggest, and from the end of ``tried``.
 
-        That is the validated end: from a Gaussian that is not finite none comes back. None: all were in vain.
+        The end is the validated one, because non-finite Gaussians cannot recover. Returns None if all attempts fail.
         """
         if self._budget_is_spent(given, len(given.views)):
             attempts.append("not sought: the budget is spent")
@@ -305,7 +306,7 @@ class FrameSolver:
             options = self._options(given, replace(SEARCH, name=name))
             result = self._run(given, start, None, options)
             result, fault = self._check_plausible(given, start, result)
-            # A few iterations more are no excuse for meeting it less well.
+            # The tolerance for fewer iterations must not excuse a worse fit, so both attempts' iterations count.
             both = len(tried.trace.losses) + len(result.trace.losses)
             why = fault or outliers.misfit_reason(given.past, result.trace.met, both)
             attempts.append(name if why is None else f"{name}: {why}")
@@ -314,7 +315,7 @@ class FrameSolver:
         return None
 
     def _continue_update(self, given: UpdateInput, tried: UpdateResult, attempts: list[str]) -> UpdateResult:
-        """On from where an update ended, for longer; the better of both."""
+        """Continues an update from its end with more iterations; returns the better of both results."""
         options = self._options(given, replace(SEARCH, name="on from where the update ended"))
         result = self._run(given, _with_colours_of(tried.gaussians, given.state), None, options)
         result, fault = self._check_plausible(given, given.state, result)
@@ -332,7 +333,7 @@ class FrameSolver:
         reason: str,
         exposure: float,
     ) -> Solved:
-        """A frame that is not believed: state and motion stay."""
+        """Returns the result of a rejected frame: state and motion are unchanged."""
         result = UpdateResult(
             given.state, given.motion, replace(trace, kept=Candidate.PREVIOUS), outcome=outcome, reason=reason,
             attempts=attempts, exposure=exposure, offsets=outliers.offsets(past, trace.fits), carried=given.carried,
@@ -342,7 +343,7 @@ class FrameSolver:
     def _accepted(self, given: UpdateInput, result: UpdateResult) -> Solved:
         trace, psnr = result.trace, result.trace.fits
         with self._time_checks():
-            # Short updates render a camera long before their end: one that does not fit is looked at once more.
+            # In short updates, a camera may have been rendered long before the end, so misfits are checked again.
             off = outliers.misfits(given.past, psnr, outliers.LAST_DB)
             again = [view for view in result.views or given.views if view.name in off]
             psnr |= self._psnr_by_camera([*again, *given.suspects], result.gaussians)
@@ -361,20 +362,22 @@ class FrameSolver:
             return committed_errors(self._factory.rig, self._renderer, views, state)
 
     def _psnr_by_camera(self, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
-        """DB of cameras as a state shows them; those that are left out come back so, once they fit."""
+        """Returns each camera's PSNR in dB for a state, also for excluded cameras, which are accepted again when they
+        fit.
+        """
         return {view.name: self._renderer.compare(state, view).psnr for view in views}
 
 
 def _with_colours_of(state: Gaussians, before: Gaussians) -> Gaussians:
-    """A state in the colours of one before: those that followed a motion which was not met lead astray."""
+    """Returns a state with the previous colours, because colours fitted to a wrong motion are misleading."""
     return state.replace(colours=before.colours)
 
 
 def _skipped(given: UpdateInput, trace: UpdateTrace, exposure: float, reason: str) -> Solved:
-    """Θ_{t−1} shows the frame: nothing was rendered that says how any camera fits, so the usual figures stay."""
+    """Returns the unchanged Θ_{t−1}; nothing was rendered, so the usual values do not change."""
     past = replace(
         given.past, rejected=0, lagging_frames=max(1, given.past.lagging_frames)
-    )  # it may go on from here, or from further away
+    )  # motion may continue from here, or from further away
     outcome = FrameOutcome.UNCHANGED
     result = UpdateResult(
         given.state, given.motion, trace, outcome=outcome, attempts=[reason], exposure=exposure, carried=given.carried

@@ -1,10 +1,11 @@
-"""Timing of the cameras: without genlock a camera's pictures are taken up to half a frame before or after the others'.
+"""Timing of the cameras: without genlock, images are captured up to half a frame before or after those of other
+cameras.
 
-After an update a few cameras, others in each frame, are looked at. What moves goes from Θ_{t−1} to Θ_t in a frame;
-rendered half of that way on and half of it back, it shows what a picture of another moment would show. The picture's
-residual on Θ_t is explained by both, and the share of the way that explains it is the moment at which the picture was
-taken. Looks of a camera make a mean that forgets. What all cameras share is motion that is followed late: the median
-over the cameras is taken for 0. Nothing is done about it: no state hangs on these figures.
+After an update, a few cameras are measured, different ones in each frame. Moving Gaussians move from Θ_{t−1} to Θ_t
+within a frame. Renderings extrapolated forward and backward by half of this motion predict images of other times. They
+explain the residual of the image relative to Θ_t, and the fraction of the motion that fits best is the capture time.
+Measurements of a camera are averaged with exponential forgetting. An offset that all cameras share is delayed tracking,
+so the median over cameras is defined as 0. Nothing is corrected: no state depends on these figures.
 """
 
 from __future__ import annotations
@@ -25,45 +26,49 @@ from scas4d_core.robust.outliers import Past
 from scas4d_core.update.result import UpdateResult
 
 LOOKS, ITERATIONS = 4, 25
-"""Cameras that are looked at in a frame at most, one for so many iterations of its update: two renderings each."""
+"""Maximum number of measured cameras per frame, and iterations of the update per measured camera; each needs two
+renderings.
+"""
 HALF = 0.5
-"""Of the way of a frame, that what moves is rendered on and back: a camera is off by no more."""
+"""Fraction of a frame's motion by which moving Gaussians are extrapolated; larger offsets are not expected."""
 STEEP = 0.02
-"""Of a value 0…1 in half a frame, above which a pixel's change is more than noise."""
+"""Minimum change of a pixel value (0…1) in half a frame that is above noise."""
 BRIGHT = 0.98
-"""Value of a picture from which it may be cut off."""
+"""Image value above which a pixel may be saturated."""
 FEW, MOST = 50, 1500
-"""Changing pixels: fewer are not enough, and of more about this many are used."""
+"""Minimum and approximate maximum number of changing pixels that are used."""
 CAUCHY, QUIETEST = 2.4, 1 / 255
-"""As those of ``effects.cameras.alignment``: residuals beyond have less weight, and rounding is no residual."""
+"""As in ``effects.cameras.alignment``: large residuals have less weight, and the lower bound is quantization noise."""
 SMALLEST = 1e-6
-"""Of each number's own square, added to equations that may have no solution."""
+"""Regularization of possibly singular equations, relative to the square of each unknown."""
 NEIGHBOURS = 10.0
-"""Pixels that err alike, about: variances are larger by so much than those of pixels that err one by one."""
+"""Approximate number of pixels with correlated errors, by which variances are increased."""
 USUAL = 0.1
-"""Of a frame, that looks of one camera differ by where motion is fast: what it is followed late by, and bends."""
+"""Variation of a camera's measurements for fast motion, in frames, because of tracking delay and curved motion."""
 FARTHEST = 0.75
-"""Of a frame, from which a look says no more than that: motion that turns back has no measurable shift."""
+"""Maximum offset of a measurement, in frames: motion that reverses has no measurable shift."""
 KEEPS = 0.95
-"""Weight of the looks before, at each look: about the last forty count."""
+"""Weight of previous measurements at each new one; about the last forty count."""
 ENOUGH = 2.5
-"""Looks of about the same weight, from which a camera's mean is known."""
+"""Minimum number of equally weighted measurements for a known mean."""
 CAMERAS = 4
-"""That are known, of which a median is taken: with fewer it cannot be decided which is off."""
+"""Minimum number of known cameras for a median; with fewer, the one that is off cannot be identified."""
 APART = 0.02
-"""Of a frame, that the means of cameras differ by on captures whose cameras are in step, as far as can be measured on
-these: added to each error."""
+"""Difference between the means of synchronized cameras on captures, in frames, as far as measurable; added to each
+error."""
 MAX_ERROR = 0.1
-"""Error, of a frame, from which a camera's mean is too little known to be reported."""
+"""Maximum error of a reported mean, in frames."""
 OFF, SURE = 0.15, 4.0
-"""Frames, and times its error, by which a camera is clearly out of step; clean: 0.05. docs/calibration.md has more."""
+"""Minimum offset in frames, and in multiples of its error, of a camera that is out of step; clean: 0.05. See
+docs/calibration.md.
+"""
 
 Array = NDArray[np.float32]
 Row = tuple[float, ...]
 
 
 class PictureTiming(NamedTuple):
-    """Moment of one picture: ``offset`` of a frame's way after the state (+) or before it (−); its ``variance``."""
+    """Capture time of one image: ``offset`` after (+) or before (−) the state, in frames, and its ``variance``."""
 
     offset: float
     variance: float
@@ -71,11 +76,12 @@ class PictureTiming(NamedTuple):
 
 @dataclass(frozen=True)
 class CameraTimingSums:
-    """The looks at one camera, as sums that forget.
+    """The measurements of one camera as sums with exponential forgetting.
 
     Attributes:
-        weight, squares: of the looks, and of the squares of their weights. offset, spread: seconds after the state,
-            weighed, and their squares. frame: seconds of a frame, weighed. last: index of the frame of the last look.
+        weight, squares: sum of weights, and of squared weights. offset, spread: weighted sums of the seconds after the
+            state, and of their squares. frame: weighted sum of frame durations in seconds. last: index of the last
+            measured frame.
     """
 
     weight: float = 0.0
@@ -86,7 +92,11 @@ class CameraTimingSums:
     last: float = -1.0
 
     def with_picture(self, look: PictureTiming, way: float, frame: float) -> CameraTimingSums:
-        """With one more; ``way``: seconds from Θ_{t−1} to Θ_t, ``frame``: from the frame before."""
+        """Returns the sums with one more measurement.
+
+        Args:
+            look: the measurement. way: seconds from Θ_{t−1} to Θ_t. frame: seconds since the previous frame.
+        """
         weight = 1 / (NEIGHBOURS * look.variance + USUAL**2)
         seconds = way * min(FARTHEST, max(-FARTHEST, look.offset))
         return CameraTimingSums(
@@ -100,17 +110,17 @@ class CameraTimingSums:
 
     @property
     def count(self) -> float:
-        """Number of equally weighted looks with the same information."""
+        """Effective number of equally weighted measurements."""
         return self.weight**2 / self.squares if self.squares > 0 else 0.0
 
     @property
     def mean(self) -> float:
-        """Frames after the state."""
+        """Mean offset after the state, in frames."""
         return self.offset / self.frame
 
     @property
     def error(self) -> float:
-        """Standard error of the mean, frames."""
+        """Standard error of the mean, in frames."""
         seconds = self.frame / self.weight
         spread = max(0.0, self.spread / self.weight - (self.offset / self.weight) ** 2) / seconds**2
         return sqrt(spread / (self.count - 1) + APART**2) if self.count > 1 else inf
@@ -119,14 +129,14 @@ class CameraTimingSums:
 def record_timing(
     past: Past, before: Gaussians, result: UpdateResult, renderer: Renderer, way: float, frame: float, index: int
 ) -> Past:
-    """The past with the looks at some cameras of a frame; the same where it says nothing.
+    """Returns the past with measurements of some cameras of a frame; unchanged if the frame cannot be used.
 
-    That is a frame that was rejected, retried, skipped or lit differently, the first that moved, which no motion led,
-    and any on a GPU, where no rendering is kept. A camera that is left out says nothing either.
+    Frames that were rejected, retried, skipped or lit differently cannot be used. Nor can the first frames with motion,
+    or any frame on a GPU, which keeps no renderings. Excluded cameras are not measured.
 
     Args:
-        past: after the frame. before: Θ_{t−1}. result: Θ_t, before anything is born. renderer: draws.
-        way: seconds between the two. frame: seconds since the frame before. index: of the frame.
+        past: after the frame. before: Θ_{t−1}. result: Θ_t, before Gaussians are added. renderer: renders views.
+        way: seconds between the two states. frame: seconds since the previous frame. index: of the frame.
     """
     trace, after = result.trace, result.gaussians
     plain = result.outcome is FrameOutcome.UPDATED and len(result.attempts) == 1 and result.exposure == 1.0
@@ -135,13 +145,12 @@ def record_timing(
     looks = {name: CameraTimingSums(*row) for name, row in past.timing.items()}
     views = [one for one in result.views if one.name in trace.shown and one.name not in trace.left_out]
     views = [one for one in views if not past.is_left_out(one.name)]
-    views.sort(
-        key=lambda one: looks.get(one.name, CameraTimingSums()).last
-    )  # who has waited longest, in the rig's order
+    views.sort(key=lambda one: looks.get(one.name, CameraTimingSums()).last)  # longest not measured first, in rig order
     (ahead, back), most = half_frame_states(before, after), max(1, min(LOOKS, trace.iterations // ITERATIONS))
     for view in views[:most]:
         every, planes = trace.shown[view.name]
-        states = (ahead, back) if trace.kept is Candidate.END else (ahead, back, after)  # the end was shown
+        # otherwise the rendering of the end exists
+        states = (ahead, back) if trace.kept is Candidate.END else (ahead, back, after)
         here, there, *now = (_rendered(renderer, state, view)[:, ::every, ::every].copy() for state in states)
         shown = now[0] if now else planes[:3]
         shifts = measure_shift(
@@ -153,12 +162,12 @@ def record_timing(
 
 
 def astuple(looks: CameraTimingSums) -> Row:
-    """As ``Past.timing`` has it."""
+    """Returns the sums as a row of ``Past.timing``."""
     return looks.weight, looks.squares, looks.offset, looks.spread, looks.frame, looks.last
 
 
 def half_frame_states(before: Gaussians, after: Gaussians) -> tuple[Gaussians, Gaussians]:
-    """Θ_t half of a frame on and half of it back, along the way from Θ_{t−1}; only places and shapes change."""
+    """Returns Θ_t extrapolated by half a frame forward and backward; only means and factors change."""
     rows = np.flatnonzero(after.moving)
     ways = [(name, HALF * (getattr(after, name)[rows] - getattr(before, name)[rows])) for name in ("means", "factors")]
     states = []
@@ -180,13 +189,13 @@ def _exposed(view: TrainingView, shown: Array) -> Array:
 
 
 def measure_shift(target: Array, shown: Array, ahead: Array, back: Array) -> PictureTiming | None:
-    """The moment of a picture; None: too little of it changes.
+    """Returns the capture time of an image; None if too little of it changes.
 
-    Of its residual what goes with the change is separated from what goes with the bend of the change, which is that
-    of a picture half a frame off to either side, and from a gain and an offset of the whole.
+    The residual is regressed on the motion, on the curvature of the motion (second difference of the three renderings),
+    and on a global gain and offset.
 
     Args:
-        target: [3, H, W] the picture. shown, ahead, back: the same rendered of Θ_t, and half of a frame on and back.
+        target: [3, H, W] image. shown, ahead, back: renderings of Θ_t, and of half a frame forward and backward.
     """
     change = np.maximum(np.abs(ahead - shown), np.abs(shown - back)).max(axis=0)
     pixels = np.flatnonzero((change > STEEP) & (target.max(axis=0) < BRIGHT))
@@ -207,11 +216,11 @@ def measure_shift(target: Array, shown: Array, ahead: Array, back: Array) -> Pic
     variance = float(weights @ np.square(left) / weights.sum() * inverse[0, 0])
     return PictureTiming(
         float(numbers[0] / min(2.0, max(0.5, 1 + numbers[2]))), variance
-    )  # the change has the gain too
+    )  # the change is scaled by the gain too
 
 
 def timings(past: Past) -> dict[str, CameraTiming]:
-    """By camera, the moment at which its pictures seem to be taken; only of those of which it is known well enough."""
+    """Returns each camera's relative capture time, if it is known with sufficient accuracy."""
     looks = {name: CameraTimingSums(*row) for name, row in past.timing.items()}
     known = {name: one for name, one in looks.items() if one.count >= ENOUGH and one.error <= MAX_ERROR}
     if len(known) < CAMERAS:
@@ -221,4 +230,4 @@ def timings(past: Past) -> dict[str, CameraTiming]:
 
 
 def _timing(frames: float, error: float) -> CameraTiming:
-    return {"frames": frames, "error": error, "off": abs(frames) >= max(OFF, SURE * error)}
+    return {"frames": frames, "error": error, "out_of_step": abs(frames) >= max(OFF, SURE * error)}

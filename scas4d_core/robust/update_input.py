@@ -1,4 +1,4 @@
-"""All that the update of one frame starts from: the state, the pictures, and what earlier frames have shown."""
+"""The input of the update of one frame: the state, the images, and the values carried over from earlier frames."""
 
 from __future__ import annotations
 
@@ -15,24 +15,25 @@ from scas4d_core.update.parts import Arrays
 from scas4d_core.update.warm_start import Motion
 
 RESTING = 10
-"""Frames at the beginning that may stand as nothing is seen to move: what enters is born only in frames that do not."""
+"""Maximum number of initial frames that may count as static; objects enter only in frames that are not static."""
 
 
 @dataclass(frozen=True, eq=False)
 class UpdateInput:
-    """All that the update of one frame starts from.
+    """The input of the update of one frame.
 
     Attributes:
-        state: Θ_{t−1}. motion: that was found last, or None. seconds: since then. step: since the frame before.
-        views: of the frame, to learn from. suspects: views of cameras that are left out. seed: of the update.
-        brightness: mean of each camera's picture. past: the usual figures. carried: arrays of the effects.
-        lengths: [N, 3] metres, of the axes in frame 0.
-        exposure, left_out, unusable: by the brightness of the pictures, see ``checks.check_brightness``.
-        light_moves: whether it goes on from frame to frame, see ``checks.goes_on``.
-        may_be_static: whether the pictures have shown nothing to move yet, where they decide which Gaussians move.
-        same: cameras whose picture is that of the last frame that was believed. sharp: ``alarms.sharpness`` of each.
-        end: moment by which the last iteration has to be over. iteration_seconds: seconds of an iteration in the
-            updates before.
+        state: Θ_{t−1}. motion: latest motion, or None. seconds: since the last learnt frame. step: since the previous
+            frame.
+        views: of the frame, to learn from. suspects: views of excluded cameras. seed: of the update.
+        brightness: mean of each camera's image. past: the usual values. carried: arrays of the effects.
+        lengths: [N, 3] axis lengths in frame 0, in metres.
+        exposure, left_out, unusable: from the image brightness, see ``checks.check_brightness``.
+        light_moves: whether the lighting change continues from frame to frame, see ``checks.light_continues``.
+        may_be_static: whether the images have shown no motion yet, in scenes that learn labels from motion.
+        same: cameras whose image equals that of the last accepted frame. sharp: ``alarms.sharpness`` of each camera.
+        left_out: cameras excluded before the update, with the reason.
+        end: time by which the last iteration must end. iteration_seconds: seconds per iteration in previous updates.
     """
 
     state: Gaussians

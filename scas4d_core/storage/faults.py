@@ -31,5 +31,5 @@ def other_format(what: str, written: int | None, read: int) -> OtherFormatError:
     known = "names no format" if written is None else f"has format {written}"
     return OtherFormatError(
         f"{what} {known}; this scas4d reads format {read}: "
-        "use the scas4d that wrote it, or begin the scene again from its pictures"
+        "use the scas4d that wrote it, or reconstruct the scene again from its pictures"
     )

@@ -188,7 +188,7 @@ class FramesReader:
         try:
             report: dict[str, Any] = json.loads(text)
         except ValueError as error:
-            raise HistoryError(f"{frame_file(index)}: its report is no JSON ({error})") from error
+            raise HistoryError(f"{frame_file(index)}: its report is not valid JSON ({error})") from error
         if index in self._frames and index not in self._scratch_reports:
             self._texts[index] = text
         return report

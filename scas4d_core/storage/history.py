@@ -138,7 +138,7 @@ class History(HistoryReader):
             text = json.dumps(dict(report or {}), allow_nan=False)
         except (TypeError, ValueError) as error:
             raise HistoryError(
-                f"frame {index}: the report is no JSON ({error}); give finite numbers, strings, lists, mappings"
+                f"frame {index}: the report is not valid JSON ({error}); give finite numbers, strings, lists, mappings"
             ) from error
         self.record_seconds = perf_counter() - began
         arrays, before = gaussians.arrays(), self._events()
@@ -150,10 +150,10 @@ class History(HistoryReader):
                     f"frame {index}: {name} differ from those of the first frame; they are fixed within one history"
                 )
         if not (arrays["ids"][count:] == UNBORN).all():
-            raise HistoryError(f"frame {index}: the born have ids; leave them {UNBORN}: the commit gives them theirs")
+            raise HistoryError(f"frame {index}: new Gaussians have ids; leave them {UNBORN}: the commit assigns them")
         for name in PER_FRAME:
             if len(arrays[name]) != rows:
-                raise HistoryError(f"frame {index}: {name} has {len(arrays[name])} rows; give {rows}, one a Gaussian")
+                raise HistoryError(f"frame {index}: {name} has {len(arrays[name])} rows; give {rows}, one per Gaussian")
         frame = {name: np.array(arrays[name]) for name in (*PER_FRAME, *WHOLES) if name in arrays}
         births: dict[int, Arrays] = {}
         ids = fixed["ids"]

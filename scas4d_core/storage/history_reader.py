@@ -171,8 +171,8 @@ class HistoryReader(FramesReader):
         unknown = wanted[rows < 0]
         if len(unknown):
             raise InputError(
-                f"ids {unknown[:5].tolist()} are no Gaussians of this scene",
-                f"take ids out of an answer, or of its {self.count} Gaussians",
+                f"ids {unknown[:5].tolist()} are not Gaussians of this scene",
+                f"take ids from an answer, or of its {self.count} Gaussians",
             )
         return rows
 

@@ -1,23 +1,25 @@
-"""The update of one frame (paper, algorithm 1): loop, schedule, rates, warm start, choice of Θ_t.
+"""The update of one frame (paper, algorithm 1): loop, schedule, learning rates, warm start and selection of Θ_t.
 
-``frame_update`` has the loop. It keeps the schedule, the stopping rule, the gate on outlying cameras, looks and the
-best state; an iteration is one call of an engine (``scas4d_core.engines``). It uses ``schedule`` (order of views,
-samples, stopping), ``rates`` (how fast each parameter learns, and when), ``warm_start`` (the motion before as a start)
-and ``best_state`` (the better of start and end). ``parts`` is how effects take part: values of the plan, and parts that
-act before and after the iterations. ``robust`` decides around it which pictures and which results are believed.
+``frame_update`` contains the loop. It handles the schedule, the stopping rule, the exclusion of outlying cameras, the
+probe errors and the best state. An iteration is one call of an engine (``scas4d_core.engines``). The loop uses
+``schedule`` (order of views, samples, stopping) and ``rates`` (learning rate and period of each parameter). It also
+uses ``warm_start`` (start from the previous motion) and ``best_state`` (the better of start and end). ``parts`` defines
+how effects take part: values of the plan, and parts that act before and after the iterations. ``robust`` decides which
+images and which results are accepted.
 
-The values that one update passes through, from ``Reconstruction.step`` to the commit:
+The objects that one update passes through, from ``Reconstruction.step`` to the commit:
 
-1. ``engines.views.TrainingView``: one camera's pictures of the frame, made by ``view_factory``.
-2. ``checkpoint.CarryOver``: all that the update before left beside Θ_{t−1}; in the end, that of this one.
-3. ``robust.outliers.Past``: the usual figures of the scene and its cameras; a part of the carry-over.
-4. ``warm_start.Motion``: the motion of the update before; a part of the carry-over.
-5. ``preparation.PreparedUpdate``: the updater for today's clusters and effects, with the carry-over.
-6. ``robust.update_input.UpdateInput``: the above, and the limits in time, for one frame.
-7. ``result.AttemptOptions``: how one attempt at the frame is made.
+1. ``engines.views.TrainingView``: one camera's image of the frame, created by ``view_factory``.
+2. ``checkpoint.CarryOver``: the state that the previous update passes on in addition to Θ_{t−1}; at the end, that of
+this update.
+3. ``robust.outliers.Past``: the usual values of the scene and its cameras; part of the carry-over.
+4. ``warm_start.Motion``: the motion of the previous update; part of the carry-over.
+5. ``preparation.PreparedUpdate``: the updater for the current clusters and effects, with the carry-over.
+6. ``robust.update_input.UpdateInput``: all of these for one frame, and its time limits.
+7. ``result.AttemptOptions``: the options of one attempt at the frame.
 8. ``result.UpdateTrace``: the record of an attempt.
-9. ``result.UpdateResult``: the state that it ends with, its motion and trace.
-10. ``frame_report.FrameReport``: the report that is committed beside the state.
+9. ``result.UpdateResult``: the final state, its motion and trace.
+10. ``frame_report.FrameReport``: the report that is committed with the state.
 
-``frame_context.FrameContext`` holds those of one frame on its way.
+``frame_context.FrameContext`` holds these objects for one frame during processing.
 """

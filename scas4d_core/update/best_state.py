@@ -1,7 +1,7 @@
-"""Comparison of the candidates for Θ_t on a few training views: the end of an update, its warm start, Θ_{t−1}.
+"""Compares the candidates for Θ_t on a few training views: the end of an update, its warm start, and Θ_{t−1}.
 
-An update may end at any moment: what it commits is never worse than not moving, or than going on as before. The probe
-views are the same in every frame; rendering them is a part of the update's time.
+An update may end at any time. The committed state is never worse than the previous state or the extrapolated motion.
+The probe views are the same in every frame, and rendering them counts as time of the update.
 """
 
 from __future__ import annotations
@@ -22,43 +22,44 @@ from scas4d_core.update.view_factory import ViewFactory
 from scas4d_core.update.warm_start import Motion, warm_start
 
 VIEWS = 4
-"""Probe views of a frame."""
+"""Number of probe views per frame."""
 SCALE = 0.5
-"""Of their pictures: a quarter of the pixels decides as well which state is better, ..."""
+"""Scale of their images: a quarter of the pixels is sufficient for comparing states."""
 FEWEST = 80
-"""... unless they would have fewer pixels on a side: with 32 a motion that merely went on was preferred for ten frames
-in a row, while all cameras lost 1.2 dB; ..."""
+"""Minimum side of the scaled images in pixels; otherwise full-size images are compared. With 32, the extrapolated
+motion was preferred for ten consecutive frames while all cameras lost 1.2 dB.
+"""
 ALIASED = 2.0
-"""... or the state before is met so many times worse in small pictures than in whole ones: then they show Gaussians
-smaller than their pixels, and no motion, and whole pictures are compared."""
+"""Ratio between the previous state's errors in small and full-size images above which full-size images are compared.
+Small images then show aliasing from Gaussians smaller than their pixels."""
 
 
 def spread_cameras(rig: Rig, names: Sequence[str], count: int = VIEWS) -> list[str]:
-    """So many of the cameras, as far apart as can be: each next one is the farthest from those taken."""
+    """Returns ``count`` of the cameras by farthest-point sampling of their centres."""
     centres = np.array([rig[name].centre for name in names])
     return [names[index] for index in farthest_first(centres, count)]
 
 
 def mean_error(errors: Mapping[str, float], names: Sequence[str]) -> float:
-    """Mean over the named views that there are; NaN where there is none."""
+    """Returns the mean over the named views that have an error; NaN if there are none."""
     values = [errors[name] for name in names if name in errors]
     return float(np.mean(values)) if values else nan
 
 
 WHOLE = " whole"
-"""Behind the names of views whose whole pictures were compared, where errors of several frames stand together."""
+"""Suffix of the names of views that were compared at full size, in errors over several frames."""
 
 COMMITTED = " committed"
-"""Behind the names of views in whose whole pictures a committed state was looked at."""
+"""Suffix of the names of views in which a committed state was evaluated at full size."""
 CONFIRMING = 2
-"""Such views: whole pictures have four times the pixels of small ones."""
+"""Number of such views; full-size images have four times the pixels."""
 SLOW = 0.5
-"""Share that Θ_{t−1} has more error than Θ_t in small pictures, where the next frame may stand: only then are whole
-ones looked at."""
+"""Relative excess error of Θ_{t−1} over Θ_t in small images up to which the next frame may be static; only then are
+full-size images evaluated."""
 
 
 def label_by_size(errors: Mapping[str, float], whole: bool) -> dict[str, float]:
-    """Errors under names that distinguish whole pictures, whose errors are smaller, from small ones.
+    """Returns errors with names that distinguish full-size images, whose errors are smaller, from small ones.
 
     >>> label_by_size({"c0": 0.1}, whole=True)
     {'c0 whole': 0.1}
@@ -67,21 +68,21 @@ def label_by_size(errors: Mapping[str, float], whole: bool) -> dict[str, float]:
 
 
 def probe_views(rig: Rig, views: Sequence[TrainingView], count: int = VIEWS) -> list[TrainingView]:
-    """Those of the views that compare states, ``spread_cameras`` over the rig."""
+    """Returns the probe views among the views: ``spread_cameras`` over the rig."""
     chosen = set(spread_cameras(rig, [view.name for view in views], count))
     return [view for view in views if view.name in chosen]
 
 
 class ProbeViews:
-    """Fixed training views for comparing states: the engine gets ``views`` as the probes of a frame.
+    """Fixed training views for comparing states; the engine loads ``views`` as the probes of a frame.
 
     Args:
-        factory: of the rig. engine: compares. views: of the frame; ``spread_cameras`` of them are taken; of none
-            nothing is compared.
+        factory: of the rig. engine: computes the errors. views: of the frame, from which ``spread_cameras`` selects;
+            without views, nothing is compared.
 
     Attributes:
-        views: the whole pictures, then the small ones, if these are compared.
-        whole: whether whole pictures are compared; known once a state was.
+        views: the full-size images, then the small ones if they are used.
+        whole: whether full-size images are compared; known after the first comparison.
     """
 
     def __init__(self, factory: ViewFactory, engine: UpdateEngine, views: Sequence[TrainingView]) -> None:
@@ -96,12 +97,12 @@ class ProbeViews:
         self._engine, self._looked = engine, self.whole
 
     def errors(self, *, moved: bool, learnt: bool) -> dict[str, float]:
-        """The image loss of a state in each view, by the camera's name.
+        """Returns the image loss of a state in each view, by camera name.
 
         Args:
-            moved, learnt: which state, see ``UpdateEngine.probe``.
+            moved, learnt: select the state, see ``UpdateEngine.probe``.
         """
-        if not self._looked and self._names:  # the first state that is asked for is that of the frame before
+        if not self._looked and self._names:  # the first evaluated state is that of the previous frame
             self._looked = True
             small, whole = (
                 self._engine.probe([views[0]], moved=moved, learnt=learnt)[0] for views in (self._compared, self._whole)
@@ -111,7 +112,7 @@ class ProbeViews:
         return self._errors(self._compared, moved, learnt)
 
     def full_size_errors(self, *, moved: bool, learnt: bool) -> dict[str, float]:
-        """As ``errors``, in whole pictures."""
+        """Returns ``errors`` on full-size images."""
         return self._errors(self._whole, moved, learnt)
 
     def _errors(self, which: Sequence[int], moved: bool, learnt: bool) -> dict[str, float]:
@@ -119,7 +120,7 @@ class ProbeViews:
 
 
 def is_slow_motion(errors: Mapping[Candidate, Mapping[str, float]], kept: Candidate) -> bool:
-    """True where Θ_{t−1} shows a frame nearly (``SLOW``) as well as what was kept; ``errors`` by probe view.
+    """Returns true if Θ_{t−1} fits a frame nearly (``SLOW``) as well as the kept state; ``errors`` by probe view.
 
     >>> is_slow_motion({Candidate.PREVIOUS: {"a": 1.4}, Candidate.END: {"a": 1.0}}, Candidate.END)
     True
@@ -129,24 +130,24 @@ def is_slow_motion(errors: Mapping[Candidate, Mapping[str, float]], kept: Candid
 
 
 def committed_errors(rig: Rig, renderer: Renderer, views: Sequence[TrainingView], state: Gaussians) -> dict[str, float]:
-    """The image loss of a committed state in a few whole pictures, by probe view, under names of their own.
+    """Returns the image loss of a committed state in a few full-size probe views, under separate names.
 
     Args:
-        rig: as it is given, not as cameras drift. renderer: compares whole pictures. views: of the frame.
+        rig: as given, without pose drift. renderer: compares full-size images. views: of the frame.
     """
     chosen = probe_views(rig, views, CONFIRMING)
     return {view.name + COMMITTED: renderer.compare(state, view).image_loss for view in chosen}
 
 
 class BestState:
-    """Picks the best start of an update and the best state at its end.
+    """Selects the best start of an update and the best state at its end.
 
     Args:
-        probes: of the frame. engine: has taken Θ_{t−1}. hierarchy: of the moving Gaussians.
-        motion: of the update before, or None. seconds: since it was measured. momentum: see ``UpdateSettings``.
+        probes: of the frame. engine: has loaded Θ_{t−1}. hierarchy: of the moving Gaussians.
+        motion: of the previous update, or None. seconds: since it was measured. momentum: see ``UpdateSettings``.
 
     Attributes:
-        errors: by candidate, then by probe view. seconds: that the motion is taken to have gone on for.
+        errors: by candidate, then by probe view. seconds: duration for which the motion is extrapolated.
     """
 
     def __init__(
@@ -165,15 +166,15 @@ class BestState:
 
     @property
     def whole(self) -> bool:
-        """True where whole pictures were compared."""
+        """True if full-size images were compared."""
         return self._probes.whole
 
     def start(self, step: float | None = None) -> Tables:
-        """The motion before as a start, or no motion where that shows the frame better; the engine has it.
+        """Sets the previous motion, or no motion if that fits the frame better, as the start in the engine.
 
         Args:
-            step: seconds since the frame before, where that was not moved: the motion may have rested meanwhile. None:
-                as long as since the motion was measured.
+            step: seconds since the previous frame, if that frame was skipped and the motion may have paused. None: the
+                same as since the motion was measured.
         """
         motion = self._motion
         self._record(Candidate.PREVIOUS, self._probes.errors(moved=False, learnt=False))
@@ -187,7 +188,7 @@ class BestState:
         return tables
 
     def _try_after_pause(self, motion: Motion, step: float) -> Tables:
-        """The motion for the time since the frame before alone, kept where it shows the frame better."""
+        """Extrapolates the motion only from the previous frame, and keeps it if it fits the frame better."""
         whole, errors = self.seconds, self.errors[Candidate.WARM]
         self.seconds = step
         tables = self._set(motion)
@@ -198,10 +199,10 @@ class BestState:
         return tables
 
     def can_skip(self, skip_below: Mapping[str, float] | None, confirm_skip: Callable[[], bool] | None = None) -> bool:
-        """True where Θ_{t−1} shows this frame as well as ``skip_below``, errors ``label_by_size``, and
-        ``confirm_skip`` agrees.
+        """Returns true if Θ_{t−1} fits this frame within ``skip_below`` and ``confirm_skip`` agrees.
 
-        None: never, and without being asked.
+        ``skip_below`` has errors as from ``label_by_size``. If it is None, the result is false; a ``confirm_skip`` of
+        None is not called.
         """
         still = self.errors.get(Candidate.PREVIOUS)
         if (
@@ -213,12 +214,12 @@ class BestState:
         return mean_is_within(label_by_size(still, self.whole), skip_below) and (confirm_skip is None or confirm_skip())
 
     def unexplained(self, reference_errors: Mapping[str, float] | None) -> float:
-        """Share of what changed since Θ_{t−1} that the motion before leaves: about 0 to 1.
+        """Returns the share of the change since Θ_{t−1} that the previous motion does not explain, about 0 to 1.
 
-        1 where nothing is compared, there was no motion before, or nothing changed.
+        The result is 1 if nothing is compared, there was no previous motion, or nothing has changed.
 
-        What stands is met no better by any motion; ``reference_errors``, errors ``label_by_size`` of updates at their
-        end, takes it out.
+        No motion reduces the error of the static scene. ``reference_errors``, errors at the end of updates as from
+        ``label_by_size``, are subtracted to remove it.
         """
         still, warm = (self.errors.get(candidate) for candidate in (Candidate.PREVIOUS, Candidate.WARM))
         if still is None or warm is None or not reference_errors:
@@ -231,22 +232,23 @@ class BestState:
         return (led - met) / (unmoved - met) if unmoved > met else 1.0
 
     def error(self) -> float:
-        """Mean error on the probe views of the state that the update has now."""
+        """Returns the mean error on the probe views of the current state of the update."""
         errors = self._probes.errors(moved=True, learnt=True)
         return mean_error(errors, list(errors))
 
     def end(self, iterations: int, left_out: Mapping[str, str]) -> Candidate:
-        """The best candidate; the engine's tables are set to it.
+        """Selects the best candidate and sets the engine's tables to it.
 
         Args:
-            iterations: of the update. left_out: cameras that have no say.
+            iterations: of the update. left_out: cameras to ignore.
         """
         if not self.errors:
             return Candidate.END
         if iterations:
             self._record(Candidate.END, self._probes.errors(moved=True, learnt=True))
         names = [name for name in self.errors[Candidate.PREVIOUS] if name not in left_out]
-        compared = [candidate for candidate in Candidate if candidate in self.errors]  # of equal ones the first
+        # the first of equal candidates wins
+        compared = [candidate for candidate in Candidate if candidate in self.errors]
         best = min(compared, key=lambda candidate: _nan_to_inf(mean_error(self.errors[candidate], names)))
         if best is not Candidate.END and iterations and not self.whole:
             best = self._best_at_full_size(best, left_out)
@@ -255,9 +257,9 @@ class BestState:
         return best
 
     def _best_at_full_size(self, best: Candidate, left_out: Mapping[str, str]) -> Candidate:
-        """The best candidate in whole pictures: slow motion may show in them alone. Of equal ones ``best`` is taken.
+        """Returns the best candidate on full-size images, which may show slow motion; ties are resolved to ``best``.
 
-        The tables are left as they ended.
+        The engine's tables are unchanged afterwards.
         """
         ended = self._engine.tables()
         errors = {Candidate.END: self._full_size_error(True, left_out)}
@@ -268,7 +270,7 @@ class BestState:
         return min(errors, key=lambda candidate: (errors[candidate], candidate is not best))
 
     def _set_candidate(self, candidate: Candidate) -> None:
-        """Sets the engine's tables to the start that a candidate is."""
+        """Sets the engine's tables to the start of a candidate."""
         self._set(self._motion if candidate is Candidate.WARM else None)
 
     def _set(self, motion: Motion | None) -> Tables:
@@ -281,7 +283,7 @@ class BestState:
             self.errors[candidate] = errors
 
     def _full_size_error(self, learnt: bool, left_out: Mapping[str, str]) -> float:
-        """Mean error in whole pictures, but for cameras that have no say; not a number counts as infinite."""
+        """Returns the mean error on full-size images without ignored cameras; NaN counts as infinite."""
         errors = self._probes.full_size_errors(moved=True, learnt=learnt)
         return _nan_to_inf(mean_error(errors, [name for name in errors if name not in left_out]))
 
@@ -291,7 +293,7 @@ class BestState:
 
 
 def mean_is_within(errors: Mapping[str, float], limits: Mapping[str, float]) -> bool:
-    """True where the mean error of the views that have a limit is within the mean of these; false where none has.
+    """Returns true if the mean error of the views with a limit is at most the mean limit; false without such views.
 
     >>> mean_is_within({"a": 1.0, "b": 3.0}, {"a": 2.0, "b": 2.0}), mean_is_within({"a": 1.0}, {"b": 2.0})
     (True, False)
@@ -301,5 +303,5 @@ def mean_is_within(errors: Mapping[str, float], limits: Mapping[str, float]) -> 
 
 
 def _nan_to_inf(value: float) -> float:
-    """Not a number comes last."""
+    """Returns infinity for NaN, so that it sorts last."""
     return value if value == value else np.inf

@@ -1,4 +1,4 @@
-"""Update of one frame: from Θ_{t−1} and the pictures of frame t to Θ_t (paper, algorithm 1).
+"""Update of one frame: from Θ_{t−1} and the images of frame t to Θ_t (paper, algorithm 1).
 
 The loop is ``FrameUpdate.run``. An iteration is one call of the engine (``engines.engine.UpdateEngine.iterate``).
 """
@@ -29,24 +29,24 @@ from scas4d_core.update.warm_start import Motion, predicted
 Array = NDArray[np.float32]
 
 SMOOTH_GLOSS_EVERY = 10
-"""Iterations between two averages of the gloss's changes over neighbours."""
+"""Iterations between two smoothing passes of the gloss changes over neighbours."""
 GLOSS_END = 0.1
-"""Share of the gloss's rates that is left at the end of an update."""
+"""Share of the gloss learning rates that remains at the end of an update."""
 
 
 class FrameUpdate:
-    """Updates the frames of one scene for one hierarchy, on one engine.
+    """Updates the frames of a scene for one hierarchy, on one engine.
 
     Args:
-        engine: computes; it is bound to the plan here. built: plan and parts of the effects that are on.
-        neighbours: of the moving Gaussians; None: no term needs them.
+        engine: computes the update; it is bound to the plan here. built: plan and parts of the active effects.
+        neighbours: of the moving Gaussians; None if no term needs them.
 
     Attributes:
-        plan: of its updates. hierarchy: of the moving Gaussians.
-        curve: whether loss terms that the report alone needs are computed; state and evidence are the same without.
+        plan: of the updates. hierarchy: of the moving Gaussians.
+        curve: whether loss terms are computed that only the report needs; they do not affect state and evidence.
 
     Raises:
-        EngineError: the engine cannot do what the plan asks for.
+        EngineError: the engine does not support the plan.
     """
 
     curve = True
@@ -68,12 +68,12 @@ class FrameUpdate:
         options: AttemptOptions = AS_CONFIGURED,
         carried: Mapping[str, Arrays] = NOTHING,
     ) -> UpdateResult:
-        """Find D_t and apply it.
+        """Finds D_t and applies it to Θ_{t−1}.
 
         Args:
             previous: Θ_{t−1}. views: of frame t. motion: of the previous update, or None.
-            seconds: between the frames. seed: of the order of views and the sampled neighbourhoods.
-            options: of this attempt. carried: arrays that the effects left, by effect.
+            seconds: between the frames. seed: for the order of views and the sampled neighbours.
+            options: of this attempt. carried: arrays that the effects carry over, by effect.
         """
         settings, engine = self.settings, self._engine
         motion = predicted(motion, self.plan.freedom)
@@ -103,7 +103,7 @@ class FrameUpdate:
                 engine.wait(iteration)
             chosen = order.take()
             step = self._step(rates, iteration, planned, planned_before or planned, len(samples))
-            engine.iterate(chosen, step)  # cascade, render, compare, backward, Adam
+            engine.iterate(chosen, step)  # deformation, rendering, loss, backward pass, Adam
             iteration, planned_before = iteration + 1, planned
             trace.iteration_ends.append(watch.total)
             watch.lap(REPORT)
@@ -128,7 +128,7 @@ class FrameUpdate:
         return UpdateResult(state, after, trace, carried=attempt.carried, views=self._exposed(views))
 
     def _exclude_outliers(self, gate: Gate, attempt: Attempt, order: ViewPlan, trace: UpdateTrace) -> None:
-        """Exclude cameras that do not fit from the rest of an attempt; called once each camera was rendered."""
+        """Excludes cameras that do not fit from the rest of an attempt; called after each camera was rendered once."""
         trace.load_log(self._engine.log(), attempt.views)
         trace.left_out.update(gate(trace.first))
         excluded = [index for index, view in enumerate(attempt.views) if view.name in trace.left_out]
@@ -137,7 +137,7 @@ class FrameUpdate:
         attempt.views = [view for view in attempt.views if view.name not in trace.left_out]
 
     def _finish(self, attempt: Attempt) -> Gaussians:
-        """The state of the candidate that was chosen, after each effect has changed it."""
+        """Returns the state of the selected candidate, modified by each effect."""
         state = attempt.previous
         if attempt.kept is not Candidate.PREVIOUS:
             state = self._engine.state(learnt=attempt.kept is Candidate.END)
@@ -147,7 +147,7 @@ class FrameUpdate:
         return state
 
     def _rates_of(self, options: AttemptOptions, motion: Motion | None, best: BestState) -> Rates:
-        """The rates of an attempt: as set, and by how near the motion before leads."""
+        """Returns the rates of an attempt, from its options and the quality of the previous motion."""
         rates = self._rates.for_attempt(options.rates, options.rigid, options.freeze_colours)
         if motion is None:
             return rates.for_cold_start(
@@ -166,14 +166,14 @@ class FrameUpdate:
         )  # fmt: skip
 
     def _step(self, rates: Rates, iteration: int, planned: int, planned_before: int, samples: int) -> StepScalars:
-        """The numbers of an iteration.
+        """Returns the scalars of an iteration.
 
         Args:
-            planned: iterations in all. planned_before: the same, as it was before the iteration before this one.
-            samples: number of samples of neighbourhoods.
+            planned: total iterations. planned_before: the same as planned for the previous iteration.
+            samples: number of neighbour samples.
         """
         rigidity = self.plan.rigidity
-        if self.plan.rigidity_fades:  # at the end of an update positions are better known than turns
+        if self.plan.rigidity_fades:  # at the end of an update, positions are more reliable than rotations
             rigidity *= 0.5 * (1 + cos(pi * min(1.0, iteration / planned_before)))
         return StepScalars(
             frozen=rates.frozen_layers(iteration, planned),
@@ -191,7 +191,7 @@ class FrameUpdate:
         )
 
     def _exposed(self, views: Sequence[TrainingView]) -> Sequence[TrainingView]:
-        """The views with the exposures that their cameras have now."""
+        """Returns the views with the current exposures of their cameras."""
         if not self.plan.camera_gains:
             return views
         exposures = self._engine.exposures()
@@ -199,10 +199,10 @@ class FrameUpdate:
 
 
 def structure_of(hierarchy: Hierarchy, neighbours: Neighbours | None, first: Gaussians) -> Structure:
-    """What an update deforms, with the axis lengths of frame 0.
+    """Returns the structure that an update deforms, with the axis lengths of frame 0.
 
     Args:
-        first: the roots, Θ_0 with all born since.
+        first: the roots, Θ_0 plus all Gaussians added since.
     """
     lengths: Array = np.sqrt(np.square(first.factors[hierarchy.rows]).sum(axis=1))
     return Structure(hierarchy, neighbours, first.means, lengths)

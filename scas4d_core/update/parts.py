@@ -1,6 +1,7 @@
-"""What effects put into the updates of a scene: values of the plan, and parts that act before and after an attempt.
+"""Contributions of effects to updates: values of the plan, and parts that act before and after an attempt.
 
-What acts inside an iteration is a value of the plan, and the engine's work. A part acts on the host, once an attempt.
+Contributions inside an iteration are values of the plan, which the engine executes. A part runs on the host once per
+attempt.
 """
 
 from __future__ import annotations
@@ -31,23 +32,23 @@ if TYPE_CHECKING:
 Array = NDArray[np.float32]
 Arrays = dict[str, NDArray[Any]]
 NOTHING: Mapping[str, Arrays] = MappingProxyType({})
-"""Arrays of no effect."""
+"""Empty arrays of effects."""
 
 P = TypeVar("P", bound="UpdatePart")
 
 
 @dataclass(eq=False)
 class Attempt:
-    """One attempt at a frame, as parts see it.
+    """One attempt at a frame, as seen by the parts.
 
     Attributes:
-        engine: that computes it. renderer: draws states of the scene.
-        previous: Θ_{t−1}. views: that it learns from. rates: of this attempt.
-        tables: the start of the deformation; a part may change it in ``begin``.
-        gains: [cameras, 3] that the engine starts with; None: it follows none.
-        carried: arrays that the effects left at the frame before, by effect; in ``end`` parts replace them by those
-            for the frame after.
-        kept: the candidate that becomes Θ_t; known at the end.
+        engine: computes the attempt. renderer: renders states of the scene.
+        previous: Θ_{t−1}. views: that the attempt learns from. rates: of this attempt.
+        tables: initial deformation; a part may change it in ``begin``.
+        gains: [cameras, 3] initial camera gains; None if gains are not estimated.
+        carried: arrays from the previous frame, by effect; in ``end``, parts replace them with those for the next
+            frame.
+        kept: the candidate that becomes Θ_t; valid at the end.
     """
 
     engine: UpdateEngine
@@ -62,23 +63,23 @@ class Attempt:
 
 
 class UpdatePart:
-    """The work of one effect before and after the iterations; each method does nothing unless a part overrides it."""
+    """The contribution of one effect before and after the iterations; by default, both methods do nothing."""
 
     def begin(self, attempt: Attempt) -> None:
-        """Called before the first iteration of an attempt."""
+        """Prepares the attempt before its first iteration."""
 
     def end(self, attempt: Attempt, state: Gaussians) -> Gaussians:
-        """Called with Θ_t once it is chosen, and leaves ``attempt.carried`` for the frame after. Returns Θ_t."""
+        """Returns Θ_t, modified if necessary, and updates ``attempt.carried`` for the next frame."""
         return state
 
 
 @dataclass(eq=False)
 class PlanBuilder:
-    """The plan and the parts of a scene's updates, while the effects that are on register with it.
+    """Builds the plan and the parts of a scene's updates while the active effects register.
 
     Attributes:
-        scene, update: the settings, the floor inside. factory: of the scene's views. hierarchy: of the moving
-            Gaussians. first: the roots, Θ_0 with all born since (``preparation``).
+        scene, update: the settings, with the floor in the internal world. factory: creates the scene's views.
+            hierarchy: of the moving Gaussians. first: the roots, Θ_0 plus all Gaussians added since (``preparation``).
         plan: filled in by the effects. parts: of the effects, in order.
     """
 

@@ -1,8 +1,8 @@
-"""Rates of an update, the same on every engine: how fast each parameter learns, and when.
+"""Learning rates of an update, identical on every engine: the rate and active period of each parameter.
 
-The coarse motion is found first. A layer of clusters begins once those above it have begun. Where the motion before
-leads near what a frame shows, it rests before those below it do: what it still shakes by, from view to view, would be a
-motion of thousands of Gaussians. Where there is further to go, all learn to the end.
+Coarse motion is found first: a layer of clusters starts after the layers above it. If the previous motion predicts the
+frame well, coarse layers are frozen before the finer ones. Their remaining fluctuation from view to view would move
+thousands of Gaussians. If the prediction is poor, all layers learn to the end.
 """
 
 from __future__ import annotations
@@ -18,44 +18,44 @@ if TYPE_CHECKING:
     from scas4d_core.settings import UpdateSettings
 
 RATE_SCALING = 0.002
-"""Of c (1/m) and s of a cluster, per iteration."""
+"""Learning rate of a cluster's c (1/m) and s, per iteration."""
 STANDARD_RADIUS_M = 4.0
-"""The scene radius for which the translation rates of the layers are given."""
+"""The scene radius to which the layers' translation rates refer, in metres."""
 
 
 LAYER_STARTS = (0.0, 0.2, 0.4)
-"""Share of the iterations after which a layer begins to learn, coarse to fine; with more layers the last is repeated.
-The coarse motion is found first: all at once, the finer layers take a part of it, each cluster another."""
+"""Share of the iterations after which a layer starts to learn, coarse to fine; the last value repeats for more layers.
+If all layers started at once, each cluster of the finer layers would absorb part of the coarse motion."""
 
 LAYER_ENDS = (0.5, 0.75, 1.0)
-"""Share of the iterations after which a layer rests, coarse to fine. 0.5 to 0.6 and 0.7 to 0.8 came out alike
+"""Share of the iterations after which a layer is frozen, coarse to fine. 0.5 to 0.6 and 0.7 to 0.8 gave similar results
 (docs/tried.md)."""
 FIRST_UPDATE_LAYER_ENDS = (0.8, 0.9, 1.0)
-"""The same of the first update, which is tried in several orders of its views: what one has not found by then, another
-finds. It gained 0.0 to 0.5 dB (docs/tried.md)."""
+"""The same for the first update, which runs in several view orders: motion that one order misses by then is found by
+another. It gained 0.0 to 0.5 dB (docs/tried.md)."""
 NEAR_FINEST = 4.0
-"""Times its rates that the finest layer learns by where the layers above it rest, ..."""
+"""Factor on the rates of the finest layer if the layers above it are frozen early."""
 NEAR_OWN = 2.0
-"""... and the Gaussians' own displacement: what is left to find is theirs. Their turns and scales learn as ever: where
-they learn faster, made-up scenes are met less well (docs/tried.md)."""
+"""The same for the Gaussians' own displacements, which account for the remaining motion. Their rotations and scales
+keep their rates: with faster ones, synthetic scenes fit less well (docs/tried.md)."""
 LEAST_TIME = 0.3
-"""Share of the iterations that a layer has at least before it rests."""
+"""Minimum share of the iterations for a layer before it is frozen."""
 NEAR = 0.6
-"""Share of what changed that the motion before may leave unexplained, where layers rest. With every second frame left
-out it left about 0.55 to 1.2, and layers that always rested cost 0.6 to 3.4 dB (docs/tried.md)."""
+"""Maximum unexplained share of the change for early freezing of layers. With every second frame left out it was about
+0.55 to 1.2, and unconditional freezing cost 0.6 to 3.4 dB (docs/tried.md)."""
 
 
 FASTER_IN_CHANGING_LIGHT = 2.0
-"""Times the rate of static Gaussians' colours, where the light changes: 0.1 to 0.2 dB on a lamp that crosses a room."""
+"""Factor on the rate of static colours while the lighting changes: 0.1 to 0.2 dB for a lamp that crosses a room."""
 
 
 def first_iteration(start: float, iterations: int) -> int:
-    """Number of the iteration, from 0, in which what begins after a share ``start`` of all takes its first step."""
+    """Returns the iteration, from 0, of the first step of a parameter that starts after a share ``start``."""
     return round(start * iterations)
 
 
 def learning_span(start: float, rest: float, iterations: int) -> range:
-    """The iterations, from 0, in which what learns from one share of all to another takes its steps: one at least.
+    """Returns the iterations, from 0, in which a parameter learns between two shares; at least one.
 
     >>> learning_span(0.25, 0.75, 8), learning_span(0.4, 0.5, 2)
     (range(2, 6), range(1, 2))
@@ -66,17 +66,18 @@ def learning_span(start: float, rest: float, iterations: int) -> range:
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's rates per iteration; a rate of 0 leaves the parameter where it starts.
+    """Adam learning rates per iteration; with a rate of 0, a parameter keeps its initial value.
 
     Attributes:
-        layers: (rotation r, translation t in metres, scaling c and s), one a layer, coarse to fine.
-        position, rotation, scale, colour: of Δp in metres, ΔR, Δs, RGB of moving. static_colour: RGB of the rest.
-        end: rates fall to this fraction in the last iteration before what they are of rests, or the update ends, along
-            half a cosine; 1 keeps them.
-        beta1, beta2: Adam's decays.
-        layer_starts: share of the iterations after which a layer begins, one a layer; what is missing begins at once.
-        layer_ends: share of the iterations after which it rests; what is missing goes on to the end.
-        start: as ``layer_starts``, of the Gaussians' own Δp, ΔR, Δs.
+        layers: (rotation r, translation t in metres, scaling c and s) per layer, coarse to fine.
+        position, rotation, scale, colour: of Δp in metres, ΔR, Δs, RGB of moving Gaussians. static_colour: RGB of
+            static Gaussians.
+        end: fraction to which a rate decays on a half-cosine until its layer is frozen or the update ends; 1: constant
+            rate.
+        beta1, beta2: Adam decays.
+        layer_starts: share of the iterations after which each layer starts; missing layers start at once.
+        layer_ends: share of the iterations after which each layer is frozen; missing layers learn to the end.
+        start: as ``layer_starts``, for the Gaussians' own Δp, ΔR, Δs.
     """
 
     layers: tuple[tuple[float, float, float], ...]
@@ -93,9 +94,10 @@ class Rates:
     start: float = 0.0
 
     def factor(self, iteration: int, iterations: int, start: float = 0.0, rest: float = 1.0) -> float:
-        """Share of the rates in an iteration counted from 0, of what learns from one share of all to another; else 0.
+        """Returns the factor on a rate in an iteration, for a parameter that learns between two shares; 0 outside of
+        them.
 
-        It learns for one iteration at least.
+        A parameter learns for at least one iteration.
 
         >>> rates = Rates((), 0, 0, 0, 0, end=0.2)
         >>> [round(rates.factor(i, 8, 0.25, 0.75), 2) for i in range(8)]
@@ -108,22 +110,22 @@ class Rates:
         return self.end + (1 - self.end) * 0.5 * (1 + cos(pi * done))
 
     def layer_start(self, layer: int) -> float:
-        """Share of the iterations after which a layer begins."""
+        """Returns the share of the iterations after which a layer starts."""
         return self.layer_starts[layer] if layer < len(self.layer_starts) else 0.0
 
     def layer_end(self, layer: int) -> float:
-        """Share of the iterations after which a layer rests; 1 where it goes on to the end."""
+        """Returns the share of the iterations after which a layer is frozen; 1 if it learns to the end."""
         return self.layer_ends[layer] if layer < len(self.layer_ends) else 1.0
 
     def frozen_layers(self, iteration: int, iterations: int) -> int:
-        """Number of layers, from the coarsest on, that do not learn any more in an iteration counted from 0."""
+        """Returns the number of layers, coarsest first, that are frozen in an iteration counted from 0."""
         ends = (
             learning_span(self.layer_start(k), self.layer_end(k), iterations).stop for k in range(len(self.layer_ends))
         )
         return next((k for k, end in enumerate(ends) if iteration < end), len(self.layer_ends))
 
     def restricted_to(self, freedom: Freedom) -> Rates:
-        """The rates with those of the deformation's parameters that are not free at 0.
+        """Returns the rates with 0 for deformation parameters that are not free.
 
         >>> rates = Rates(((0.1, 0.2, 0.3),), position=0.4, rotation=0.5, scale=0.6, colour=0.7)
         >>> rates.restricted_to(Freedom(cluster_translation=True, own_scale=True))
@@ -139,7 +141,7 @@ class Rates:
         )
 
     def colour_rates(self, plan: ColourPlan | None) -> tuple[float, float]:
-        """Rates of the colours of moving and of static Gaussians, as a plan frees them."""
+        """Returns the colour rates of moving and static Gaussians, as enabled by a plan."""
         if plan is None:
             return 0.0, 0.0
         moving, static = self.colour, self.static_colour
@@ -149,9 +151,10 @@ class Rates:
         return moving if plan.moving else 0.0, static if plan.static else 0.0
 
     def for_cold_start(self, factor: float, several_orders: bool = False) -> Rates:
-        """Without a motion to start from: layers turn and shift faster, as there is further to go.
+        """Returns the rates without a previous motion: layers rotate and translate faster, because they have farther to
+        go.
 
-        None rests but in an update that is tried in ``several_orders`` orders of its views.
+        Layers are frozen early only if the update runs in ``several_orders`` of its views.
         """
         layers = tuple((factor * r, factor * t, scaling) for r, t, scaling in self.layers)
         return replace(
@@ -161,11 +164,12 @@ class Rates:
         )
 
     def for_warm_start(self, unexplained: float) -> Rates:
-        """From the motion before, where that leaves so much of what changed unexplained.
+        """Returns the rates for a previous motion that leaves a share of the change unexplained.
 
-        Where it leads near (``NEAR``), layers rest, and what is below them learns faster; else none rests.
+        If the share is at most ``NEAR``, layers are frozen early and the levels below learn faster; otherwise none is
+        frozen.
         """
-        if not unexplained <= NEAR:  # or not a number
+        if not unexplained <= NEAR:  # also true for NaN
             return replace(self, layer_ends=())
         if len(self.layers) < 2:
             return self
@@ -174,8 +178,9 @@ class Rates:
         return replace(self, layers=layers, position=NEAR_OWN * self.position)
 
     def for_attempt(self, factor: float, rigid: bool, freeze_colours: bool) -> Rates:
-        """All rates times a factor; ``rigid``: of clusters that turn and shift only; ``freeze_colours``: colours
-        stay.
+        """Returns all rates multiplied by a factor.
+
+        ``rigid``: only cluster rotations and translations learn. ``freeze_colours``: colours do not learn.
         """
         if (factor, rigid, freeze_colours) == (1.0, False, False):
             return self
@@ -192,7 +197,7 @@ class Rates:
 
     @classmethod
     def of(cls, settings: UpdateSettings, layers: int, radius: float) -> Rates:
-        """The rates of a scene whose cameras reach ``radius`` metres (``Rig.reach``), for so many layers."""
+        """Returns the rates for a number of layers and a camera reach ``radius`` in metres (``Rig.reach``)."""
         layer_starts = tuple(LAYER_STARTS[min(k, len(LAYER_STARTS) - 1)] for k in range(layers))
         named = [settings.layer_rates[min(k, len(settings.layer_rates) - 1)] for k in range(layers)]
         return cls(
@@ -212,13 +217,14 @@ class Rates:
 
 
 def _layer_ends(layer_ends: tuple[float, ...], layer_starts: tuple[float, ...]) -> tuple[float, ...]:
-    """When each layer rests: of fewer layers the last of ``layer_ends``, of more the first is repeated; none too
-    soon.
+    """Returns the share of the iterations after which each layer is frozen, at least ``LEAST_TIME`` after its start.
+
+    With fewer layers the last values of ``layer_ends`` are used; with more layers the first one repeats.
     """
     ends = (layer_ends[max(k - len(layer_starts), -len(layer_ends))] for k in range(len(layer_starts)))
     return tuple(min(1.0, max(end, start + LEAST_TIME)) for end, start in zip(ends, layer_starts, strict=True))
 
 
 def latest_start(settings: UpdateSettings) -> float:
-    """Share of the iterations after which every layer and the Gaussians' own deltas learn."""
+    """Returns the share of the iterations after which every layer and the Gaussians' own deltas learn."""
     return max(settings.deltas_start, *LAYER_STARTS)

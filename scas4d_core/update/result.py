@@ -1,4 +1,4 @@
-"""Options, trace and result of one attempt at an update, and the stopwatch that times its stages."""
+"""Options, trace and result of one attempt at an update, and a stopwatch for its stages."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from scas4d_core.update.schedule import Stopping
 from scas4d_core.update.warm_start import Motion
 
 Gate = Callable[[Mapping[str, float]], Mapping[str, str]]
-"""Judges cameras: takes the first PSNR of each in dB, and returns the cameras to exclude with a reason."""
+"""Takes the first PSNR of each camera in dB, and returns the cameras to exclude with a reason."""
 
 
 class Stopwatch:
-    """Seconds by stage. What the timers take themselves is booked to ``REPORT``.
+    """Measures seconds by stage; the overhead of the timers counts as ``REPORT``.
 
     Args:
-        began: ``perf_counter`` at the start; None: now.
+        began: ``perf_counter`` value at the start; None for now.
 
     Attributes:
-        seconds: by stage. began, last: ``perf_counter`` at the start and at the last lap.
+        seconds: by stage. began, last: ``perf_counter`` values at the start and at the last lap.
     """
 
     def __init__(self, began: float | None = None) -> None:
@@ -42,14 +42,14 @@ class Stopwatch:
         return self.last - self.began
 
     def lap(self, stage: str) -> None:
-        """Book the time since the last lap to a stage."""
+        """Adds the time since the last lap to a stage."""
         now = perf_counter()
         self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self.last
         self.last = perf_counter()
         self.seconds[REPORT] = self.seconds.get(REPORT, 0.0) + self.last - now
 
     def move(self, stage: str, other: str, seconds: float) -> None:
-        """Book a part of a stage to another."""
+        """Moves some seconds from one stage to another."""
         self.seconds[stage] -= seconds
         self.seconds[other] = self.seconds.get(other, 0.0) + seconds
 
@@ -59,21 +59,20 @@ class AttemptOptions:
     """Options of one attempt at an update.
 
     Attributes:
-        name: as the report has it.
-        rates: factor on all of Adam's rates. rigid: clusters turn and shift, nothing else. freeze_colours: colours
-            stay.
-        cold: the motion of the update before is not used. iteration_factor: factor on the iterations.
-        several_orders: other orders of the views are tried as well, and the best end is taken. layer_rate_factor:
-            factor on the rates of
-            the layers where no motion leads.
-        reference_errors: errors of the updates before at their end, ``best_state.label_by_size``; None: not known.
-        stopping: decides how many iterations there are; None: those of the settings.
-        gate: called with each camera's first PSNR (dB) once all were rendered; returns the cameras to drop, with the
-            reason. None: all stay.
+        name: as in the report.
+        rates: factor on all Adam learning rates. rigid: only cluster rotations and translations learn. freeze_colours:
+            colours do not learn.
+        cold: do not use the previous motion. iteration_factor: factor on the iterations.
+        several_orders: whether several view orders are tried and the best result is used. layer_rate_factor: factor on
+            the layers' rates without a previous motion.
+        stopping: decides the number of iterations; None for that of the settings.
+        gate: called with each camera's first PSNR (dB) after all were rendered; returns the cameras to exclude, with
+            the reason. None: no exclusion.
         compare: whether the candidates for Θ_t are compared on the probe views (``best_state``).
-        skip_below: image loss by probe view at which Θ_{t−1} needs no iteration; None: there is always one.
-        confirm_skip: asked where that is so; true where whole pictures show it, too. None: it is not asked.
-        step: seconds since the frame before, where nothing was learnt from that one (``BestState.start``); else None.
+        skip_below: image loss by probe view up to which Θ_{t−1} needs no iteration; None: never skip.
+        confirm_skip: called before a skip; returns true if full-size images confirm it. None: no confirmation.
+        reference_errors: errors at the end of previous updates, from ``best_state.label_by_size``; None if unknown.
+        step: seconds since the previous frame, if nothing was learnt from it (``BestState.start``); otherwise None.
     """
 
     name: str = "as set"
@@ -94,16 +93,16 @@ class AttemptOptions:
 
 
 AS_CONFIGURED = AttemptOptions()
-"""The update as the settings have it."""
+"""The update as configured by the settings."""
 
 
 class CameraFit(TypedDict):
-    """The fit of one camera, when it was last rendered; a row of the report, as it is on disk.
+    """The fit of one camera when it was last rendered; a row of the report on disk.
 
     Keys:
-        psnr: dB. colour_shift: [3] mean of the picture minus mean of the render, RGB in 0…1; None where not measured.
-        health: 0…1, 1 where it fits as usual beside the other cameras, 0 where it would be left out
-        (``outliers.health``).
+        psnr: in dB. colour_shift: [3] mean of the image minus mean of the rendering, RGB in 0…1; None if not measured.
+        health: 0…1: 1 if it fits as usual relative to the other cameras, 0 at the exclusion limit
+            (``outliers.health``).
     """
 
     psnr: float
@@ -112,27 +111,28 @@ class CameraFit(TypedDict):
 
 
 def camera_fit(psnr: float, colour_shift: tuple[float, float, float] | None = None) -> CameraFit:
-    """The fit of a camera of which nothing is known yet that it could be compared with."""
+    """Returns the fit of a camera without a usual level to compare with."""
     return {"psnr": psnr, "colour_shift": colour_shift, "health": 1.0}
 
 
 @dataclass(eq=False)
 class UpdateTrace:
-    """Record of one attempt, filled while it runs.
+    """Record of one attempt, filled during the attempt.
 
     Attributes:
-        losses: each iteration's weighted sum. psnr: dB of each view as it was rendered, in order, as many an iteration
-            as the settings say. iteration_ends: seconds from the start of the update to the end of each iteration.
+        losses: weighted loss of each iteration. psnr: dB of each rendered view, in order; one or more per iteration,
+            depending on the settings. iteration_ends: seconds from the start of the update to the end of each
+            iteration.
         seconds: by stage.
-        first: dB of each camera when first rendered. cameras: how well each was met when last rendered, by name.
-        left_out: cameras that the gate left out, with the reason.
-        planned: (iteration, iterations in all) whenever the stopping rule planned otherwise.
-        errors: image loss by candidate, then by probe view; empty where nothing was compared. kept: the candidate that
+        first: dB of each camera when first rendered. cameras: fit of each camera when last rendered, by name.
+        left_out: cameras that the gate excluded, with the reason.
+        planned: (iteration, total iterations) for each change of plan by the stopping rule.
+        errors: image loss by candidate, then by probe view; empty if nothing was compared. kept: the candidate that
             became Θ_t.
-        whole: whether these errors are of whole pictures.
-        shown: by camera, the renderings of the last ``engine.KEPT_PICTURES`` iterations: evidence is taken from them
-            without another rendering. Empty where an update ended sooner than planned.
-        guards: those that acted, how often.
+        whole: whether these errors are for full-size images.
+        shown: by camera, the renderings of the last ``engine.KEPT_PICTURES`` iterations, which evidence uses without
+            rendering again. Empty if an update ended earlier than planned.
+        guards: number of actions of each guard that acted.
     """
 
     losses: list[float] = field(default_factory=list)
@@ -151,21 +151,21 @@ class UpdateTrace:
 
     @property
     def iterations(self) -> int:
-        """Iterations that are over."""
+        """Number of completed iterations."""
         return len(self.losses)
 
     @property
     def fits(self) -> dict[str, float]:
-        """DB by camera, when last rendered."""
+        """PSNR in dB by camera, when last rendered."""
         return {name: fit["psnr"] for name, fit in self.cameras.items()}
 
     @property
     def met(self) -> dict[str, float]:
-        """DB of the cameras that were learnt from to the end."""
+        """PSNR in dB of the cameras that were not excluded."""
         return {name: psnr for name, psnr in self.fits.items() if name not in self.left_out}
 
     def load_log(self, log: IterationLog, views: Sequence[TrainingView]) -> None:
-        """Take what an engine has logged so far; colour shifts are evidence for gains of cameras, too."""
+        """Copies the engine's log; colour shifts are also evidence for camera gains."""
         self.losses, self.guards = log.losses, log.guards
         self.psnr = [rendered.psnr for rendered in log.rendered]
         self.first, self.cameras = {}, {}
@@ -178,22 +178,22 @@ class UpdateTrace:
 
 @dataclass(frozen=True, eq=False)
 class UpdateResult:
-    """The end of an attempt, and of the frame that commits it.
+    """The result of an attempt, and of the frame that commits it.
 
     Attributes:
-        gaussians: Θ_t. motion: for the next warm start; None: that starts cold. trace: how it went; of a frame that is
-            held, of the last attempt before any search.
-        frozen: number of Gaussians that keep their previous state. bounded: number of axes set to the shortest or
-            longest permitted length.
-        outcome: of the frame. reason: in words, where the outcome is a degraded one.
-        attempts: each attempt at the frame, with what came of it.
-        exposure: times that the frame is brighter than usual.
-        offsets: dB by camera above (+) or below its usual place among the cameras; empty where nothing was rendered.
-        health: 0…1 by camera of ``offsets``. alarms: but for the cameras that were left out (``robust/alarms.py``).
-        timing: by camera, when its pictures seem to be taken (``robust/timing.py``).
-        carried: arrays for the next update, by effect. views: that were learnt from, with the exposures of the end.
-        parents: [B] int64 of the Gaussians born in this frame, which are the last rows: the row of the parent that each
-            parents in the hierarchy and the graph, or −1 where it starts a structure of its own. None: none is born.
+        gaussians: Θ_t. motion: for the next warm start; None for a cold start. trace: of the attempt; for a rejected
+            frame, of the last attempt before any search.
+        frozen: number of Gaussians that keep their previous state. bounded: number of axes clamped to their minimum or
+            maximum length.
+        outcome: of the frame. reason: in words, if the outcome is degraded.
+        attempts: each attempt at the frame, with its result.
+        exposure: brightness ratio of the frame to the usual brightness.
+        offsets: dB by camera above (+) or below its usual level among the cameras; empty if nothing was rendered.
+        health: 0…1 by camera of ``offsets``. alarms: except those of excluded cameras (``robust/alarms.py``).
+        timing: by camera, relative capture time (``robust/timing.py``).
+        carried: arrays for the next update, by effect. views: that were learnt from, with their final exposures.
+        parents: [B] int64 for the Gaussians added in this frame, which are the last rows. Each has the row of the
+            parent whose clusters and neighbours it joins, or −1 if it starts a new structure. None: none were added.
     """
 
     gaussians: Gaussians
@@ -214,13 +214,13 @@ class UpdateResult:
     parents: NDArray[np.int64] | None = None
 
     def with_motion_after(self, first: UpdateResult) -> UpdateResult:
-        """An update that went on from where another ended: its motion is that of both."""
+        """Returns the result with the combined motion, for an update that continued another one."""
         if self.motion is None or first.motion is None:
             return self
         return replace(self, motion=self.motion.after(first.motion))
 
     def with_errors_of(self, first: UpdateResult) -> UpdateResult:
-        """A later attempt with the errors of the frame before and of the warm start as the first one found them."""
+        """Returns a later attempt with the first attempt's errors of the previous state and warm start."""
         errors: dict[Candidate, dict[str, float]] = {**first.trace.errors}
         errors.pop(Candidate.END, None)
         if self.trace.errors:

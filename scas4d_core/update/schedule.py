@@ -1,7 +1,7 @@
-"""Schedule of an update, the same on every device: iterations, views, samples and weights.
+"""Schedule of an update, identical on every device: iterations, views, samples and weights.
 
-Layers begin, and rates fall, by the share of the iterations that is done (``rates``), so the stopping rule says before
-each iteration how many there will be in all. What it said is recorded with the commit.
+Layer starts and rate decay depend on the share of completed iterations (``rates``). The stopping rule therefore gives
+the total number of iterations before each iteration, and its decisions are recorded with the commit.
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ from numpy.typing import NDArray
 from scas4d_core.settings import UpdateSettings
 
 NEIGHBOUR_SAMPLE = 4000
-"""Gaussians whose neighbours are looked at an iteration: what the neighbour terms cost does not grow with the scene."""
+"""Number of Gaussians per iteration whose neighbours are used, so that the cost does not grow with the scene."""
 
 IMAGE_WEIGHT = 1.0
-"""Weight of the image loss, 0.8 L1 + 0.2 (1 − SSIM); those of the other terms (``Weights``) are relative to it."""
+"""Weight of the image loss, 0.8 L1 + 0.2 (1 − SSIM); other weights (``Weights``) are relative to it."""
 
 SOFT_COLOUR_WEIGHT = 0.01
-"""Weight of the mean absolute change of the colours (Dynamic3DGaussians; the paper does not give it)."""
+"""Weight of the mean absolute colour change (Dynamic3DGaussians; the paper does not give it)."""
 
 
 def view_order(count: int, iterations: int, rng: np.random.Generator) -> Sequence[int]:
-    """The view that each iteration trains: a new random order whenever all have been used."""
+    """Returns the view for each iteration: a new random permutation after all views have been used."""
     rounds = -(-iterations // count)
     order = np.concatenate([rng.permutation(count) for _ in range(rounds)])[:iterations]
     return [int(index) for index in order]
 
 
 class ViewPlan:
-    """The views that each iteration trains, by index: random rounds over all.
+    """The view indices of each iteration, in random passes over all views.
 
     Args:
-        count: number of views. each: views of an iteration.
-        most: iterations there can be at most; the order of more begins again.
+        count: number of views. each: views per iteration.
+        most: maximum number of iterations; the order repeats after them.
     """
 
     def __init__(self, count: int, each: int, most: int, rng: np.random.Generator) -> None:
@@ -47,13 +47,13 @@ class ViewPlan:
         self._left_out: set[int] = set()
 
     def leave_out(self, views: Iterable[int]) -> None:
-        """These views have no turn any more; all of them cannot be left out."""
+        """Excludes views from the following iterations; at least one view must remain."""
         self._left_out |= set(views)
         if len(self._left_out) == self._count:
             raise ValueError(f"all {self._count} views are left out; an update needs one")
 
     def take(self) -> list[int]:
-        """The views of the next iteration."""
+        """Returns the views of the next iteration."""
         return [self._next_view() for _ in range(self._each)]
 
     def _next_view(self) -> int:
@@ -65,9 +65,9 @@ class ViewPlan:
 
 
 def plan_samples(count: int, rng: np.random.Generator) -> list[NDArray[np.int64]]:
-    """Disjoint random sets of ``NEIGHBOUR_SAMPLE`` of ``count`` Gaussians; they cover all, an iteration takes the next.
+    """Returns disjoint random sets of ``NEIGHBOUR_SAMPLE`` of ``count`` Gaussians that cover all; one per iteration.
 
-    A rest of less than a quarter of that joins the set before it: alone, a few Gaussians would carry the whole weight.
+    A remainder of less than a quarter joins the previous set; otherwise a few Gaussians would have the whole weight.
     """
     order = rng.permutation(count)
     size = min(NEIGHBOUR_SAMPLE, max(count, 1))
@@ -78,49 +78,48 @@ def plan_samples(count: int, rng: np.random.Generator) -> list[NDArray[np.int64]
 
 
 def mask_weight(settings: UpdateSettings, moving: int, count: int) -> float:
-    """Weight of the mask loss for a scene of ``count`` Gaussians of which so many move."""
+    """Returns the weight of the mask loss for a scene of ``count`` Gaussians, ``moving`` of them in motion."""
     return settings.weights.mask if moving < count else settings.weights.mask_alone
 
 
 COOLING = 0.15
-"""Share of the iterations that follows the decision to stop: the rates fall to their end first, but of a layer that
-would rest by then already."""
+"""Share of the iterations between the decision to stop and the end, in which the rates decay, except in layers that are
+already frozen."""
 
 LOOK_EVERY = 10
-"""Iterations between two looks at the probe views, where an update ends once it gains nothing."""
+"""Iterations between two evaluations of the probe views by the stopping rule."""
 
 PROBE = 4
-"""Iterations after which an update's own speed is worth more than what the updates before took."""
+"""Iterations after which an update's own pace replaces the pace of previous updates."""
 
 MAX_TIMED = 4000
-"""Iterations that an update by the clock has at most."""
+"""Maximum number of iterations with a time limit."""
 
 UNTIMED = 100
-"""Iterations that are planned by the clock before any was measured."""
+"""Number of planned iterations before the pace is known."""
 
 RATE = 0.3
-"""How fast what a budget foresees follows what was."""
+"""Rate at which the budget's predictions follow new measurements."""
 FOR_BIRTHS = 0.4
-"""Of a budget, that fits of what is born may have: about an update's worth where something entered."""
+"""Share of the budget for fitting added Gaussians: about the time of an update if an object entered."""
 AFTER_S = 0.05
-"""Seconds after the last iteration that are foreseen before any frame was measured."""
+"""Predicted seconds after the last iteration before any frame was measured."""
 
 
 class Stopping:
-    """Decides how long one update goes on: so many iterations, as many as fit, or fewer once nothing is gained.
+    """Decides the length of an update: a fixed number of iterations, a time limit, or an early stop without progress.
 
     Args:
-        most: iterations there can be at most.
-        end: moment of ``clock`` by which the last iteration has to be over, seconds; at least one is made. None: there
-            are ``most`` iterations.
-        iteration_seconds: seconds of an iteration in the updates before, or None where there was none.
-        gain: every ``LOOK_EVERY`` iterations the probe views (training views, never those held out) are looked at;
-            where their error fell by less than this share since the look before, the update cools down and ends.
-            0: it does not look.
-        first: share of the iterations before which it does not end so: what begins late has to have begun.
+        most: maximum number of iterations.
+        end: ``clock`` time in seconds by which the last iteration must end; at least one iteration is run. None:
+            ``most`` iterations.
+        iteration_seconds: seconds per iteration in previous updates, or None if unknown.
+        gain: minimum relative decrease of the error on the probe views per ``LOOK_EVERY`` iterations; with less, the
+            update cools down and stops. Probe views are training views, never held-out ones. 0: no early stop.
+        first: share of the iterations before which there is no early stop, so that late parameters have started.
 
     Attributes:
-        planned_so_far: (iteration, iterations in all) whenever what is planned changed.
+        planned_so_far: (iteration, total iterations) for each change of plan.
 
     >>> stopping = Stopping(7)
     >>> stopping.planned(0), stopping.planned(3), stopping.planned_so_far
@@ -145,7 +144,9 @@ class Stopping:
         self._stop: int | None = None
 
     def planned(self, done: int) -> int:
-        """Iterations in all, as seen before iteration ``done``, counted from 0; the update ends at ``done`` or less."""
+        """Returns the total iterations, as planned before iteration ``done`` (from 0); the update ends if it is at most
+        ``done``.
+        """
         total = self._total(done)
         if self._stop is not None:
             total = min(total, self._stop)
@@ -154,18 +155,18 @@ class Stopping:
         return total
 
     def needs_error(self, done: int) -> bool:
-        """True where it needs the error on the probe views after ``done`` iterations."""
+        """Returns true if the error on the probe views is needed after ``done`` iterations."""
         return self._gain > 0 and self._stop is None and done % LOOK_EVERY == 0
 
     def record_error(self, done: int, error: float) -> None:
-        """Take the error on the probe views after ``done`` iterations, where ``needs_error`` said so."""
+        """Records the error on the probe views after ``done`` iterations; call it if ``needs_error`` is true."""
         total = self._total(done)
         if self._error is not None and done >= self._first * total and error > (1 - self._gain) * self._error:
             self._stop = done + max(1, round(COOLING * total))
         self._error = error
 
     def _total(self, done: int) -> int:
-        """Iterations in all, but for an early end."""
+        """Returns the total iterations without an early stop."""
         if self.end is None:
             return self.most
         now = self._clock()
@@ -181,16 +182,15 @@ class Stopping:
 
 
 class TimeBudget:
-    """Milliseconds that each frame of a scene may take; learns what comes before and after the iterations.
+    """The time limit per frame of a scene; predicts the time after the iterations from previous frames.
 
-    Decoding comes before the iterations and is seen by the clock; comparing and checking the end, writing the
-    checkpoint and the commit come after them and are foreseen.
+    Decoding happens before the iterations and is measured by the clock. Comparison and checks at the end, the
+    checkpoint and the commit happen after them and are predicted.
 
     Attributes:
-        milliseconds: a frame may take, None: as many as it needs. iteration_seconds: seconds of an iteration, None:
-            not known yet.
-        after: seconds from the last iteration to the end of the commit, without fits of what is born.
-        births: whether the next frame has time for such fits, taken from its iterations: the one before had some.
+        milliseconds: limit per frame; None for no limit. iteration_seconds: seconds per iteration; None if unknown.
+        after: seconds from the last iteration to the end of the commit, without fits of added Gaussians.
+        births: whether the next frame reserves time for such fits, because the previous frame had some.
     """
 
     def __init__(self, milliseconds: float | None) -> None:
@@ -200,24 +200,24 @@ class TimeBudget:
         self.births = False
 
     def end(self, began: float) -> float | None:
-        """The moment by which the last iteration has to be over, of a frame begun at ``began``; None: no limit."""
+        """Returns the time by which the last iteration must end, for a frame begun at ``began``; None for no limit."""
         kept = FOR_BIRTHS * self.births * (self.milliseconds or 0.0) / 1000
         return None if (end := self.end_of_births(began)) is None else end - kept
 
     def end_of_births(self, began: float) -> float | None:
-        """The moment by which fits of what is born have to be over; None: no limit."""
+        """Returns the time by which fits of added Gaussians must end; None for no limit."""
         return None if self.milliseconds is None else began + self.milliseconds / 1000 - self.after
 
     def record_birth_fits(self, spent: float, postponed: Sequence[str]) -> None:
-        """Take how long fits of what was born took, and which of them there was no time for."""
-        kept = self.births  # time that was kept and was too short is not kept again
+        """Records the duration of fits of added Gaussians, and those that did not fit the budget."""
+        kept = self.births  # time that was reserved but was not sufficient is not reserved again
         self.births = bool(spent or postponed) and not (kept and postponed)
 
     def record_frame(self, moments: Sequence[float], seconds: Mapping[str, float], commit: float) -> None:
-        """Take how long a frame took.
+        """Records the duration of a frame.
 
         Args:
-            moments, seconds: of its update, see ``UpdateTrace``. commit: seconds that checking and writing took.
+            moments, seconds: of its update, see ``UpdateTrace``. commit: seconds of checks and writing.
         """
         if not moments:
             return
@@ -228,5 +228,5 @@ class TimeBudget:
         else:
             self.iteration_seconds = min(
                 each, self.iteration_seconds + RATE * (each - self.iteration_seconds)
-            )  # one slow frame is forgotten with the next
+            )  # a single slow frame has no lasting effect
             self.after += RATE * (after - self.after)

@@ -1,4 +1,4 @@
-"""Makes the training views of a frame: pictures at the size of the inside rig's cameras, exposures, masks."""
+"""Creates the training views of a frame: images at the size of the internal rig's cameras, exposures and masks."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ Array = NDArray[np.float32]
 
 
 class ViewFactory:
-    """Makes the training views of each frame of a rig; keeps the cameras.
+    """Creates the training views of each frame of a rig; caches the cameras.
 
     Args:
-        rig: the cameras inside. source: the cameras as the pictures come in, where they are to be resized.
+        rig: the cameras in the internal world. source: the cameras at the size of the incoming images, if these are
+            resized.
 
     Attributes:
-        posed: the rig as it stands by now, of which the views are.
+        posed: the rig with current poses, which the views use.
     """
 
     def __init__(self, rig: Rig, source: Rig | None = None) -> None:
@@ -28,10 +29,10 @@ class ViewFactory:
         self._source = source
 
     def scaled(self, frame: Frame) -> Frame:
-        """The frame with its pictures of the rig's cameras at the size that those have.
+        """Returns the frame with its images resized to the rig's cameras.
 
         Raises:
-            ValueError: a picture or a mask is not of the size that it should come in.
+            ValueError: an image or mask does not have the expected size.
         """
         if self._source is None:
             return frame
@@ -46,13 +47,13 @@ class ViewFactory:
         return Frame(frame.index, frame.time, images, masks)
 
     def views(self, frame: Frame, exposures: dict[str, Array], use_masks: bool = True) -> list[TrainingView]:
-        """The views of a frame, in the rig's order; cameras that the frame lacks are left out.
+        """Returns the views of a frame in rig order, without cameras that have no image.
 
         Args:
-            exposures: [3, 2] gain and offset per camera; a camera that is not named has 1 and 0.
+            exposures: [3, 2] gain and offset by camera; 1 and 0 for missing cameras.
 
         Raises:
-            ValueError: a picture's size is not its camera's, or no camera of the rig is in the frame.
+            ValueError: an image does not have its camera's size, or the frame has no camera of the rig.
         """
         views = []
         for name in self.rig.names:
@@ -73,7 +74,7 @@ class ViewFactory:
         return views
 
     def coarser(self, view: TrainingView, scale: float) -> TrainingView:
-        """The view with its pictures resized by area averaging, and the camera that sees them so."""
+        """Returns the view with its image resized by area averaging, and the matching camera."""
         camera = self.posed[view.name].scaled(scale)
         target = np.moveaxis(view.target, 0, -1)
         rows, columns = view.camera.height // camera.height, view.camera.width // camera.width
@@ -85,11 +86,11 @@ class ViewFactory:
         return TrainingView(view.name, CameraArrays.of(camera), planes, view.exposure)
 
     def retouched(self, view: TrainingView, target: Array) -> TrainingView:
-        """The view with other planes [C, H, W] of the same size."""
+        """Returns the view with different planes [C, H, W] of the same size."""
         return TrainingView(view.name, view.camera, target, view.exposure)
 
     def cropped(self, view: TrainingView, left: int, top: int, right: int, bottom: int) -> TrainingView:
-        """The part of a view in a rectangle of whole pixels, ``right`` and ``bottom`` excluded."""
+        """Returns the part of a view in a rectangle of whole pixels, without ``right`` and ``bottom``."""
         lens = view.camera.lens.copy()
         lens[2:] = lens[2] - left, lens[3] - top, right - left, bottom - top
         camera = view.camera._replace(lens=lens, width=right - left, height=bottom - top)
@@ -100,10 +101,10 @@ class ViewFactory:
 def pictures_of(
     frame: Frame, name: str, size: tuple[int, int], use_masks: bool = True
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
-    """A camera's picture [H, W, 3] and mask [H, W] (None where there is none), of the size (width, height).
+    """Returns a camera's image [H, W, 3] and mask [H, W] (or None), and checks their size (width, height).
 
     Raises:
-        ValueError: they are of another size.
+        ValueError: they have a different size.
     """
     width, height = size
     image = frame.images[name]

@@ -1,7 +1,7 @@
-"""The start of an update: the motion of the frame before goes on (paper, Optimization Pipeline).
+"""The start of an update: the motion of the previous frame is extrapolated (paper, Optimization Pipeline).
 
-A cluster keeps its twist in its own axes: what turns carries its displacement and its axis of rotation along, so that
-a point on a circle goes on along the circle, and so do the clusters of finer layers inside it.
+A cluster keeps its twist in its own axes: its displacement and rotation axis turn with it. A point on a circle thus
+continues along the circle, and so do the clusters of finer layers inside it.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ Float = NDArray[np.float64]
 
 
 WARM_START = 1.0
-"""Share of the previous deformation that starts the next (paper: all of it; without, 0.6 dB are lost on `robot`)."""
+"""Share of the previous deformation at the start (paper: all of it; without it, `robot` loses 0.6 dB)."""
 
 LEAST_COSINE = 0.5
-"""Of half the mean turn of a cluster's Gaussians, below which it says nothing."""
+"""Minimum cosine of half the mean rotation of a cluster's Gaussians for a reliable mean."""
 
 LONGEST_PREDICTION = 3.0
-"""Times the interval it was found in that a motion is carried on for: after a longer gap it says little."""
+"""Maximum extrapolation of a motion, in multiples of the interval in which it was found."""
 
 
 def rotate(r: NDArray[np.floating], vectors: NDArray[np.floating]) -> Float:
-    """[K, 3] vectors turned by the quaternions (1, r)/|(1, r)|, r [K, 3] = axis · tan(angle/2)."""
+    """Rotates [K, 3] vectors by the quaternions (1, r)/|(1, r)|, with r [K, 3] = axis · tan(angle/2)."""
     cross = np.cross(r, vectors)
     turned: Float = vectors + 2 * (cross + np.cross(r, cross)) / (1 + np.square(r).sum(axis=1, keepdims=True))
     return turned
@@ -39,13 +39,13 @@ def rotate(r: NDArray[np.floating], vectors: NDArray[np.floating]) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """The motion that an update found; the next one starts from it.
+    """The motion that an update found, from which the next one starts.
 
     Attributes:
         turns: per layer [K, 3] axis · tan(angle/2). shifts: per layer [K, 3] metres, relative to the layer above; both
-            in the axes that the cluster has turned to.
-        own_shifts: [M, 3] metres, Δp less what the finest clusters have taken of it. own_turns: [M, 3] Δr. seconds: it
-            took.
+            in the rotated axes of the cluster.
+        own_shifts: [M, 3] metres, Δp minus the part that belongs to the finest clusters. own_turns: [M, 3] Δr. seconds:
+            duration of the motion.
     """
 
     turns: list[Float]
@@ -56,11 +56,11 @@ class Motion:
 
     @property
     def finite(self) -> bool:
-        """True where all of it is: else it would spoil the next start."""
+        """True if all values are finite; other motions cannot start an update."""
         return all(np.isfinite(array).all() for array in (*self.turns, *self.shifts, self.own_shifts, self.own_turns))
 
     def after(self, first: Motion) -> Motion:
-        """Both, one after the other in the same interval; small turns add up."""
+        """Returns the composition of two motions within the same interval; small rotations are added."""
         return replace(
             self,
             turns=[a + b for a, b in zip(first.turns, self.turns, strict=True)],
@@ -71,7 +71,7 @@ class Motion:
 
     @classmethod
     def of(cls, tables: Tables, hierarchy: Hierarchy, seconds: float) -> Motion:
-        """The motion of a deformation. What the Gaussians of a finest cluster add in common becomes its own shift."""
+        """Returns the motion of a deformation; the mean Δp of a finest cluster becomes its own shift."""
         turns = [values[:, :3].astype(np.float64) for values in tables.clusters]
         shifts = [values[:, 3:6].astype(np.float64) for values in tables.clusters]
         rest = tables.deltas[:, :3].astype(np.float64)
@@ -80,7 +80,7 @@ class Motion:
             common = np.add.reduceat(rest, starts[:-1]) / np.diff(starts)[:, None]
             shifts[-1] += common
             rest -= common[hierarchy.labels[-1]]
-        # Into the axes that the clusters turned to, from the finest layer up: each layer turns what is below it.
+        # Rotate into the clusters' rotated axes, from the finest layer up: each layer rotates those below it.
         for k in reversed(range(len(turns))):
             labels = hierarchy.labels[k]
             rest = rotate(turns[k][labels], rest)
@@ -95,14 +95,14 @@ class Motion:
 def motion_between(
     hierarchy: Hierarchy, before: Gaussians, after: Gaussians, known: NDArray[np.bool_], seconds: float
 ) -> Motion:
-    """The motion from one state to another as a hierarchy would have found it: for one that was made in between.
+    """Returns the motion between two states for a hierarchy that was built in between.
 
-    All of it is in the finest layer, whose clusters turn and shift as their known Gaussians did, in the mean.
+    It is entirely in the finest layer, whose clusters rotate and translate like the mean of their known Gaussians.
 
     Args:
-        before: with the first rows of ``after``. known: [M] in the order of the hierarchy; only of these Gaussians the
-            motion between is known, and all have a row in ``before``; the others go on with their cluster.
-        seconds: between.
+        before: its rows are the first rows of ``after``. known: [M] in hierarchy order, true for Gaussians whose motion
+            is known. These have a row in ``before``; the others follow their cluster.
+        seconds: between the states.
     """
     layers = [np.zeros((count, 3)) for count in hierarchy.sizes]
     turns, shifts = layers, [array.copy() for array in layers]
@@ -116,10 +116,10 @@ def motion_between(
         turned = quaternion_products(after.rotations[rows], back).astype(np.float64)
         turned *= np.where(turned[:, :1] < 0, -1.0, 1.0)
         turn = _averages(turned, labels, known, count)
-        none = turn[:, 0] < LEAST_COSINE  # no Gaussian of it is known, or they turned every way
+        none = turn[:, 0] < LEAST_COSINE  # no known Gaussian, or their rotations disagree
         turn = np.where(none[:, None], 0.0, turn[:, 1:] / np.where(none, 1.0, turn[:, 0])[:, None])
         shift = rotate(turn, _averages(now - there, labels, known, count))
-        # The cluster turns about the middle of all of its Gaussians, which need not be that of the known ones.
+        # The cluster rotates about the centroid of all its Gaussians, which may differ from that of the known ones.
         apart = _averages(now, labels, np.ones_like(known), count) - _averages(now, labels, known, count)
         empty = np.bincount(labels, weights=known, minlength=count) == 0
         apart[empty] = 0
@@ -131,7 +131,7 @@ def motion_between(
 
 
 def _averages(values: Float, labels: NDArray[np.int32], chosen: NDArray[np.bool_], count: int) -> Float:
-    """[count, C] mean of the chosen rows of each cluster; 0 where none is."""
+    """Returns the [count, C] mean of the chosen rows of each cluster; 0 if there are none."""
     own = labels[chosen]
     sums = np.stack([np.bincount(own, weights=column, minlength=count) for column in values[chosen].T], axis=1)
     means: Float = sums / np.maximum(np.bincount(own, minlength=count), 1)[:, None]
@@ -139,7 +139,7 @@ def _averages(values: Float, labels: NDArray[np.int32], chosen: NDArray[np.bool_
 
 
 def predicted(motion: Motion | None, freedom: Freedom) -> Motion | None:
-    """A motion without that which is not free in the update that it starts; None: the update starts from no motion.
+    """Returns a motion without parameters that are not free in the next update; None for no motion.
 
     >>> motion = Motion([np.ones((1, 3))], [np.ones((1, 3))], np.ones((2, 3)), np.ones((2, 3)), 0.1)
     >>> predicted(motion, Freedom(cluster_rotation=True, prediction=True)).shifts
@@ -159,11 +159,11 @@ def predicted(motion: Motion | None, freedom: Freedom) -> Motion | None:
 
 
 def warm_start(hierarchy: Hierarchy, motion: Motion | None, seconds: float, momentum: float) -> Tables:
-    """The motion before, per unit of time, as a start; scaling (c, s) and Δs start at the identity.
+    """Returns the initial deformation from the previous motion; scaling (c, s) and Δs start at the identity.
 
     Args:
-        motion: of the update before; None: no motion. seconds: since it was measured.
-        momentum: share of what the layers leave of it that Δp and ΔR start from.
+        motion: of the previous update; None for no motion. seconds: since it was measured.
+        momentum: share of the residual motion, beyond the layers', from which Δp and ΔR start.
     """
     tables = Tables.identity(hierarchy)
     if motion is None:

@@ -1,6 +1,6 @@
-"""Runs the processes of scenes on the nodes of a Ray cluster."""
+"""Execution of scenes' processes on the nodes of a Ray cluster."""
 
 import os
 
-# A question that comes after the service has left its cluster must not start another one.
+# A Ray call made after the service has left its cluster must not start a new cluster.
 os.environ.setdefault("RAY_ENABLE_AUTO_CONNECT", "0")

@@ -1,4 +1,7 @@
-"""The service's membership of a Ray cluster: it parents by the node of its machine, and again once that is lost."""
+"""Membership of the service in a Ray cluster.
+
+The service joins through the Ray node on its machine, and joins again after that node is lost.
+"""
 
 from __future__ import annotations
 
@@ -16,28 +19,28 @@ from ray.exceptions import RayError
 from server.cluster.nodes import own_node_is_lost
 
 NAMESPACE = "scas4d"
-REACH_S = 5.0
-"""The head of the cluster answers within so long."""
+CONNECT_S = 5.0
+"""Seconds within which the head of the cluster must accept a connection."""
 SILENT_S = 3.0
-"""A head that has not answered for this long is reported."""
+"""Seconds after which a head that does not respond is reported in the log."""
 JOIN_S = 60.0
-"""A try to join takes so long at most; without a node on this machine it fails after some 10 s."""
+"""Maximum seconds for an attempt to join again; without a node on this machine it fails after about 10 s."""
 LEAVE_S = 10.0
-"""A service leaves within so long; the head may be silent just then."""
-EVERY_S = 2.0
-"""Between two looks at whether the node of this machine is there, and between two tries to join again."""
+"""Maximum seconds for leaving the cluster, during which the head may not respond."""
+CHECK_S = 2.0
+"""Seconds between two checks of this machine's node, and between two attempts to join again."""
 
 log = logging.getLogger("scas4d.server")
 
 
 class Membership:
-    """Joins, and stays.
+    """Membership in a Ray cluster that is restored after a loss.
 
-    A node that goes takes all actors with it that a service has started by it, wherever they run. The head's does each
-    time that its supervisor starts it again.
+    When a node is lost, all actors that a service started through it are lost too, wherever they run. The node of the
+    head is lost each time its supervisor restarts it.
 
     Args:
-        address: of the cluster's head, or None: that which runs on this machine, or that of RAY_ADDRESS.
+        address: address of the cluster's head; None selects the cluster on this machine or the one in RAY_ADDRESS.
     """
 
     def __init__(self, address: str | None) -> None:
@@ -45,57 +48,58 @@ class Membership:
         self._silent = False
         self._said = ""
         self._thread = ThreadPoolExecutor(1, "membership")
-        """Of its own: it waits for the head of the cluster as long as that takes."""
+        """Dedicated thread, because its calls may wait indefinitely for the head of the cluster."""
 
     def join(self) -> None:
-        """Joins, unless this process has. Blocking.
+        """Joins the cluster, unless this process is already a member. Blocking.
 
         Raises:
-            RuntimeError: there is no cluster, or this machine has no node of it.
+            RuntimeError: there is no cluster, or this machine has no node in it.
         """
         if not ray.is_initialized():
             try:
                 if self._address is not None:
-                    _reach(self._address)  # Ray would end this process where nobody listens
+                    _check_head(self._address)  # Ray would end this process if nothing listens there
             except (OSError, ValueError) as error:
-                raise _no_cluster(f"at {self._address}", error) from None
+                raise _no_cluster_error(f"at {self._address}", error) from None
             try:
                 ray.init(
                     address=self._address or "auto", namespace=NAMESPACE, log_to_driver=True, configure_logging=False
                 )
             except (OSError, ValueError, RuntimeError, RayError) as error:
                 if self._address is None:
-                    raise _no_cluster("on this machine", error) from None
+                    raise _no_cluster_error("on this machine", error) from None
                 raise RuntimeError(
                     f"the Ray cluster at {self._address} cannot be joined ({error}); this machine needs a node of it "
                     "(`ray start --address`), and, where it asks for a token, RAY_AUTH_MODE=token and that token"
                 ) from None
 
-    async def keep(self, on_loss: Callable[[], Awaitable[None]], on_return: Callable[[], Awaitable[None]]) -> None:
-        """Looks after the node of this machine, for ever.
+    async def watch(self, on_loss: Callable[[], Awaitable[None]], on_return: Callable[[], Awaitable[None]]) -> None:
+        """Monitors the node of this machine until cancelled, and joins the cluster again when the node is lost.
 
         Args:
-            on_loss: called once the node, and so every actor of this service, is lost. When it has ended, nothing in
-                this process may ask Ray, or drop a handle or an answer of Ray's, until `on_return` is called.
-            on_return: called once the service is a member again; tried again where it fails.
+            on_loss: called when the node, and thus every actor of this service, is lost. After it returns, nothing in
+                this process may call Ray or release a Ray handle or result until `on_return` is called.
+            on_return: called when the service is a member again; retried if it fails.
         """
         announced = True
         while True:
-            await asyncio.sleep(EVERY_S)
+            await asyncio.sleep(CHECK_S)
             if await self._is_lost():
                 log.error("the Ray node of this machine is lost, and all processes of scenes with it; joining again")
-                await _or_end(on_loss())
-                while not await self._is_done(self._join_or_end):
-                    await asyncio.sleep(EVERY_S)
+                await _exit_on_failure(on_loss())
+                while not await self._is_done(self._rejoin_or_exit):
+                    await asyncio.sleep(CHECK_S)
                 log.info("the service has joined the cluster again")
                 announced = False
-            if not announced:  # the node may be lost again before it is
+            if not announced:  # the node may be lost again before `on_return` succeeds
                 announced = await self._is_done(on_return)
 
     def leave(self) -> None:
-        """Leaves, once a try to join has ended; actors that are left end. Blocking.
+        """Leaves the cluster after any pending attempt to join; remaining actors end. Blocking.
 
-        Where Ray does not let it leave, this process ends at once: the interpreter would wait for Ray's threads.
+        If Ray does not shut down in time, this process exits at once, because the interpreter would wait for Ray's
+        threads.
         """
         leaving = self._thread.submit(ray.shutdown)
         self._thread.shutdown(wait=False)
@@ -106,8 +110,11 @@ class Membership:
             os._exit(1)
 
     async def _is_lost(self) -> bool:
-        """Asks the head, and logs when it is silent and when it answers again."""
-        answer = self._asked(own_node_is_lost)
+        """Asks the head whether this machine's node is lost.
+
+        Logs when the head stops responding and when it responds again.
+        """
+        answer = self._call(own_node_is_lost)
         done, _ = await asyncio.wait({answer}, timeout=SILENT_S)
         if not done or answer.exception() is not None:
             if not self._silent:
@@ -116,7 +123,7 @@ class Membership:
                     "the head of the Ray cluster is silent: frames go on, and nothing is placed; if Redis does not "
                     "keep what it knew, Ray ends this process after a minute"
                 )
-            await asyncio.wait({answer})  # one question at a time
+            await asyncio.wait({answer})  # at most one pending request
         if answer.exception() is not None:
             return False
         if self._silent:
@@ -124,25 +131,25 @@ class Membership:
             log.info("the head of the Ray cluster answers again")
         return bool(answer.result())
 
-    async def _join_or_end(self) -> None:
-        """Joins again. Where Ray stands still, as it once did, this process ends: its supervisor starts another."""
-        joining = self._asked(self._join_again)
+    async def _rejoin_or_exit(self) -> None:
+        """Joins the cluster again; if Ray hangs, exits this process so that its supervisor restarts it."""
+        joining = self._call(self._rejoin)
         if not (await asyncio.wait({joining}, timeout=JOIN_S))[0]:
             log.critical("Ray did not let the service join again within %g s; the service ends, start it again", JOIN_S)
-            os._exit(1)  # what was acknowledged is on disk; an end in order would wait for Ray
+            os._exit(1)  # acknowledged frames are on disk; a clean shutdown would wait for Ray
         joining.result()
 
-    def _join_again(self) -> None:
+    def _rejoin(self) -> None:
         ray.shutdown()
         self.join()
 
-    def _asked(self, function: Callable[[], Any]) -> asyncio.Future[Any]:
+    def _call(self, function: Callable[[], Any]) -> asyncio.Future[Any]:
         return asyncio.get_running_loop().run_in_executor(self._thread, function)
 
     async def _is_done(self, call: Callable[[], Awaitable[None]]) -> bool:
         try:
             await call()
-        except Exception as error:  # whatever Ray raises: the service must not stand still
+        except Exception as error:  # whatever Ray raises: the service must not hang
             if str(error) != self._said:
                 self._said = str(error)
                 log.warning("not a member of the cluster yet: %s", error)
@@ -151,8 +158,8 @@ class Membership:
         return True
 
 
-async def _or_end(losing: Awaitable[None]) -> None:
-    """A service that cannot give up what it has lost would stand still: its supervisor starts another."""
+async def _exit_on_failure(losing: Awaitable[None]) -> None:
+    """Awaits the handling of a loss; on failure, exits so that the supervisor restarts the service."""
     try:
         await losing
     except Exception:
@@ -160,15 +167,20 @@ async def _or_end(losing: Awaitable[None]) -> None:
         os._exit(1)
 
 
-def _no_cluster(where: str, error: Exception) -> RuntimeError:
+def _no_cluster_error(where: str, error: Exception) -> RuntimeError:
     return RuntimeError(
         f"there is no Ray cluster {where} ({error}); start one with `ray start --head`, or name its address: "
         "--placement ray=HOST:6379"
     )
 
 
-def _reach(address: str) -> None:
-    """Connects to the cluster's head and goes; an OSError where nobody answers."""
+def _check_head(address: str) -> None:
+    """Connects to the cluster's head and disconnects.
+
+    Raises:
+        OSError: nothing accepts a connection at the address.
+        ValueError: the port is not a number.
+    """
     host, _, port = address.removeprefix("ray://").rpartition(":")
-    with socket.create_connection((host, int(port)), timeout=REACH_S):
+    with socket.create_connection((host, int(port)), timeout=CONNECT_S):
         pass

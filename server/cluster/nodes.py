@@ -1,4 +1,4 @@
-"""Nodes of the cluster as Ray lists them, and what this service has on each."""
+"""Nodes of the cluster as Ray lists them, with the resources that this service reserves on each."""
 
 from __future__ import annotations
 
@@ -10,88 +10,108 @@ from typing import Any
 
 import ray
 
-from client.wire import Cluster, Node, Waiting
-from server.cluster.needs import Needs
+from client.wire import Cluster, Node, WaitingProcess
+from server.cluster.resource_needs import ResourceNeeds
 
-RAYS_OWN = "ray.io/"
-"""Prefix of labels that Ray gives a node."""
-LISTENS_S = 3.0
-"""A node that is there takes a connection within so long."""
+RAY_LABEL_PREFIX = "ray.io/"
+"""Prefix of the labels that Ray itself assigns to a node."""
+CONNECT_S = 3.0
+"""Seconds within which a live node accepts a connection."""
 
 
 @dataclass(frozen=True)
-class Place:
-    """Of a process: the id of its node, None while it waits for one; since when, `time.monotonic`."""
+class PlacedProcess:
+    """Resource needs and node of a process.
 
-    needs: Needs
+    Attributes:
+        needs: resources reserved for the process.
+        node: id of its node; None while the process waits for one.
+        since: time of `time.monotonic` at which this entry was created, in seconds.
+    """
+
+    needs: ResourceNeeds
     node: str | None = None
     since: float = field(default_factory=time.monotonic)
 
 
 def all_nodes() -> list[dict[str, Any]]:
-    """All nodes that there have been, as Ray describes them. Blocking."""
+    """Returns all current and former nodes in Ray's format. Blocking."""
     nodes: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
     return nodes
 
 
 def living_nodes() -> list[dict[str, Any]]:
-    """Those that are alive. Blocking."""
+    """Returns the nodes that are alive. Blocking."""
     return [node for node in all_nodes() if node["Alive"]]
 
 
 def is_lost(id: str) -> bool:
-    """True where a node is dead, nobody listens at its address, or the head of the cluster does not say. Blocking.
+    """Returns whether a node is lost. Blocking.
 
-    The head takes some seconds to find a node dead, and an actor of it is missed at once. Where this machine's own node
-    is dead, all actors of this service are lost with it.
+    A node is lost if it is dead, nothing listens at its address, or the head of the cluster does not respond. The
+    address is checked because the head needs some seconds to notice a dead node, whereas the loss of an actor is
+    noticed at once. If this machine's own node is dead, every node counts as lost, because all actors of this service
+    are lost.
     """
     try:
         living = living_nodes()
-        own = [node for node in living if node["NodeID"] == id] if _own_is_in(living) else []
-        return not any(_listens(node["NodeManagerAddress"], node["NodeManagerPort"]) for node in own)
-    except Exception:  # whatever Ray raises without its head
+        own = [node for node in living if node["NodeID"] == id] if _includes_own_node(living) else []
+        return not any(_accepts_connections(node["NodeManagerAddress"], node["NodeManagerPort"]) for node in own)
+    except Exception:  # any exception that Ray raises without its head
         return True
 
 
 def own_node_is_lost() -> bool:
-    """True where the head of the cluster says that the node of this machine is dead. Blocking.
+    """Returns whether the head of the cluster reports this machine's node as dead. Blocking.
 
     Raises:
-        Exception: whatever Ray raises without its head.
+        Exception: any exception that Ray raises if its head does not respond.
     """
-    return not _own_is_in(living_nodes())
+    return not _includes_own_node(living_nodes())
 
 
 def own_node() -> str:
-    """The id of the node of this machine by which this process is a member."""
+    """Returns the id of the local node through which this process joined the cluster."""
     return str(ray.get_runtime_context().get_node_id())
 
 
 def own_machine() -> str:
-    """The address of this machine in the cluster. It may have several nodes; services of one may be members by each."""
+    """Returns the address of this machine in the cluster.
+
+    A machine may have several nodes, and its services may join through different ones.
+    """
     return str(ray.util.get_node_ip_address())  # type: ignore[no-untyped-call]
 
 
-def _own_is_in(nodes: Iterable[Mapping[str, Any]]) -> bool:
+def _includes_own_node(nodes: Iterable[Mapping[str, Any]]) -> bool:
     own = own_node()
     return any(node["NodeID"] == own for node in nodes)
 
 
-def _listens(host: str, port: int) -> bool:
+def _accepts_connections(host: str, port: int) -> bool:
     try:
-        with socket.create_connection((host, port), timeout=LISTENS_S):
+        with socket.create_connection((host, port), timeout=CONNECT_S):
             return True
     except OSError:
         return False
 
 
-def cluster_of(
-    nodes: Iterable[Mapping[str, Any]], places: Collection[Place], *, lost: Collection[str] = (), answers: bool = True
+def describe_cluster(
+    nodes: Iterable[Mapping[str, Any]],
+    places: Collection[PlacedProcess],
+    *,
+    lost: Collection[str] = (),
+    head_responds: bool = True,
 ) -> Cluster:
-    """Nodes that are alive, were lost lately, or had a process, with what they have; and what waits.
+    """Returns a description of the cluster: its nodes with their resources, and the processes waiting for a node.
+
+    Includes nodes that are alive, were lost recently, or have a process of this service.
 
     Args:
-        nodes: as Ray describes them. places: of processes. lost: ids. answers: the head of the cluster does.
+        nodes: nodes in Ray's format.
+        places: the service's processes with their nodes.
+        lost: ids of recently lost nodes.
+        head_responds: whether the head of the cluster responds.
     """
     statuses = []
     for node in nodes:
@@ -103,21 +123,21 @@ def cluster_of(
             Node(
                 id=node["NodeID"],
                 host=node["NodeManagerHostname"],
-                labels={name: value for name, value in node["Labels"].items() if not name.startswith(RAYS_OWN)},
+                labels={name: value for name, value in node["Labels"].items() if not name.startswith(RAY_LABEL_PREFIX)},
                 alive=node["Alive"],
                 cpus=has.get("CPU", 0.0),
-                cpus_taken=round(sum(needs.cpus for needs in own), 3),
+                cpus_reserved=round(sum(needs.cpus for needs in own), 3),
                 gpus=has.get("GPU", 0.0),
                 memory_mb=round(has.get("memory", 0.0) / 1e6, 1),
-                memory_taken_mb=round(sum(needs.memory for needs in own) / 1e6, 1),
+                memory_reserved_mb=round(sum(needs.memory for needs in own) / 1e6, 1),
                 scenes=sorted({needs.scene for needs in own if needs.role == "worker"}),
             )
         )
     now = time.monotonic()
     waiting = [
-        Waiting(scene=needs.scene, role=needs.role, needs=needs.words(), seconds=round(now - place.since, 1))
+        WaitingProcess(scene=needs.scene, role=needs.role, needs=needs.describe(), seconds=round(now - place.since, 1))
         for place in places
         if place.node is None
         for needs in (place.needs,)
     ]
-    return Cluster(placement="ray", nodes=statuses, waiting=waiting, answers=answers)
+    return Cluster(placement="ray", nodes=statuses, waiting=waiting, head_responds=head_responds)

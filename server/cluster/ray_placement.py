@@ -1,4 +1,7 @@
-"""Runs the processes of scenes as actors on a Ray cluster. Ray chooses the node, and reports when one is lost."""
+"""Placement of scenes' processes as actors on a Ray cluster.
+
+Ray chooses the node of each process and reports the loss of a node.
+"""
 
 from __future__ import annotations
 
@@ -16,28 +19,28 @@ import ray
 from ray.exceptions import RayActorError, RayError
 
 from client.wire import Cluster
-from server.cluster.calls import Calls
-from server.cluster.folder import check_folder
-from server.cluster.host import Host, NodeGone, ProcessPriority, Started
-from server.cluster.marks import mark
+from server.cluster.folder_marker import write_marker
 from server.cluster.membership import Membership
-from server.cluster.needs import Needs, needs_of
-from server.cluster.nodes import Place, all_nodes, cluster_of, is_lost
-from server.cluster.services import announced, others
-from server.cluster.watch import NodeWatch
+from server.cluster.node_watch import NodeWatch
+from server.cluster.nodes import PlacedProcess, all_nodes, describe_cluster, is_lost
+from server.cluster.process_host import ProcessHost, ProcessPriority, StartResult, UnexpectedExit
+from server.cluster.ray_calls import RayCalls
+from server.cluster.resource_needs import ResourceNeeds, resource_needs
+from server.cluster.service_registry import peer_addresses, register_service
+from server.cluster.shared_folder import check_folder
 from server.messages import WaitsForNode
 from server.processes import worker
-from server.processes.placement import STOP_SECONDS, AnyProcess, Entry, Placement, ProcessExit
+from server.processes.placement import STOP_SECONDS, Entry, Placement, ProcessExit, ProcessHandle
 from server.settings import ServerSettings
 
 WAIT_S = 3.0
-"""A worker that is not placed after so long says what it waits for."""
+"""Seconds after which a worker that is not placed yet reports the resources that it waits for."""
 LOST_S = 10.0
-"""The head says within so long whether a node is lost."""
+"""Maximum seconds to wait for the head to report whether a node is lost."""
 LOSE_S, CLOSE_S = 20.0, 3.0
-"""The service waits so long for what it has asked of Ray before it leaves: a lost cluster, and when it ends."""
+"""Maximum seconds to wait for pending Ray calls before leaving: after the loss of the cluster, and at shutdown."""
 STOPPED_S = 5.0
-"""An actor has so much longer than its process to say that this has ended."""
+"""Additional seconds, beyond those of its process, within which an actor must report that the process ended."""
 
 T = TypeVar("T")
 
@@ -45,25 +48,26 @@ log = logging.getLogger("scas4d.server")
 
 
 class RayPlacement(Placement):
-    """Starts processes of scenes on a cluster, and those of the service on its own machine.
+    """Placement that starts scenes' processes on a Ray cluster and the service's own processes on its machine.
 
     Args:
-        prepare: see `Placement`. address: of the cluster's head, or None: that which runs on this machine, or that of
-            RAY_ADDRESS. server: settings of the service; every node has to see its data folder at the same path.
+        prepare: see `Placement`.
+        address: address of the cluster's head; None selects the cluster on this machine or the one in RAY_ADDRESS.
+        server: settings of the service; its data folder must be visible on every node at the same path.
 
     Attributes:
-        places: of processes that were started and have not ended, by name of their actor.
+        placed: processes that have been requested and have not ended, keyed by the name of their actor.
     """
 
     fenced = True
-    has_siblings = True
+    has_peers = True
     has_labels = True
 
     def __init__(self, prepare: Callable[[], None] | None, address: str | None, server: ServerSettings) -> None:
         super().__init__(prepare)
-        self.places: dict[str, Place] = {}
-        self._calls = Calls()
-        self._watch = NodeWatch(partial(self.asked, all_nodes))
+        self.placed: dict[str, PlacedProcess] = {}
+        self._calls = RayCalls()
+        self._watch = NodeWatch(partial(self.call_ray, all_nodes))
         self._server = server
         self._membership = Membership(address)
         self._processes: WeakSet[RayProcess] = WeakSet()
@@ -72,116 +76,124 @@ class RayPlacement(Placement):
         self._listens: tuple[str, int] | None = None
         self._announced: Any = None
         self._kept: list[Any] = []
-        """What has handles and answers of Ray's. Ray ends this process, or stands still, where one is dropped while the
-        service leaves."""
+        """Objects that hold Ray handles or results, kept alive while the service leaves the cluster.
+
+        If one were released during that time, Ray would hang or end this process.
+        """
         self._keeping: asyncio.Task[None] | None = None
-        self._siblings: Mapping[str, str] | None = None
+        self._peers: Mapping[str, str] | None = None
 
     async def open(self) -> None:
-        """Joins the cluster, and checks that all nodes see the data folder.
+        """Joins the cluster and checks that all nodes see the data folder.
 
         Raises:
             RuntimeError: there is no cluster, or a node does not see the folder.
         """
         data = self._server.data.resolve()
-        before = ray.is_initialized()  # `serve` opens it in a loop of its own, to say what is wrong
+        before = ray.is_initialized()  # `serve` first opens it in a separate event loop to report errors
         await asyncio.to_thread(self._membership.join)
         if not before:
             await asyncio.to_thread(check_folder, data)
-            await asyncio.to_thread(mark, data, self._token)
-            self._watch.saw(await asyncio.to_thread(all_nodes))  # not `look`: the answer would be lost with the loop
+            await asyncio.to_thread(write_marker, data, self._token)
+            self._watch.record(await asyncio.to_thread(all_nodes))  # `poll` would tie the answer to this event loop
             log.info("scenes run on a Ray cluster of %d nodes", sum(node["Alive"] for node in self._watch.nodes))
         self._keeping = asyncio.get_running_loop().create_task(
-            self._membership.keep(on_loss=self._lose_all, on_return=self._return)
+            self._membership.watch(on_loss=self._lose_all, on_return=self._on_return)
         )
 
     async def _lose_all(self) -> None:
         processes = tuple(self._processes)
         for process in processes:
             try:
-                process.lose()
-            except Exception:  # a fault of one scene's keeps none of the others, nor the service, from going on
+                process.mark_lost()
+            except Exception:  # an error in one scene must not stop the other scenes or the service
                 log.exception("a process that is lost with its cluster")
-        await self._let_go(processes, LOSE_S)
+        await self._detach(processes, LOSE_S)
 
-    async def _let_go(self, processes: Sequence[RayProcess], seconds: float) -> None:
-        """Asks Ray nothing more, and keeps all handles and answers of Ray's."""
-        self._calls.hold()
-        self._kept += [self._announced, *processes, *self._calls.begun]
+    async def _detach(self, processes: Sequence[RayProcess], seconds: float) -> None:
+        """Stops all calls to Ray and keeps all Ray handles and results alive."""
+        self._calls.suspend()
+        self._kept += [self._announced, *processes, *self._calls.running]
         for process in processes:
-            await process.let_go()
-        if not await self._calls.over(seconds):
+            await process.detach()
+        if not await self._calls.wait(seconds):
             log.warning("Ray has not answered within %g s; the service leaves the cluster nevertheless", seconds)
-        gc.collect()  # by itself it may come while the service leaves, and drop what only cycles hold
+        gc.collect()  # a collection while the service leaves would release Ray objects in reference cycles
 
-    async def _return(self) -> None:
+    async def _on_return(self) -> None:
         self._kept.clear()
-        self._calls.go_on()
+        self._calls.resume()
         await self._announce()
 
     async def cluster(self) -> Cluster:
         """See `Placement`."""
         watch = self._watch
-        await watch.look()
-        return cluster_of(watch.nodes, self.places.values(), lost=watch.lost, answers=watch.answers)
+        await watch.poll()
+        return describe_cluster(watch.nodes, self.placed.values(), lost=watch.lost, head_responds=watch.head_responds)
 
     async def announce(self, host: str, port: int) -> None:
-        """See `Placement`: an actor has the address, and goes with this service."""
+        """Announces the service through an actor that holds its address and ends with it; see `Placement`."""
         self._listens = host, port
         await self._announce()
 
     async def _announce(self) -> None:
         if self._listens is not None:
-            self._announced = await self.asked(announced, self._token, *self._listens)
+            self._announced = await self.call_ray(register_service, self._token, *self._listens)
 
     async def peers(self) -> Sequence[str]:
-        """See `Placement`; what was known before where the head does not answer."""
-        self._siblings = await self.asked(others, self._token, self._siblings)
-        return list(self._siblings.values())
+        """Returns the addresses of the other services, or the last known ones if the head does not respond.
 
-    def asked(self, function: Callable[..., T], *arguments: Any) -> asyncio.Future[T]:
-        """Calls what asks Ray, in a thread, while the service is a member of the cluster."""
-        return self._calls.asked(function, *arguments)
+        See `Placement`.
+        """
+        self._peers = await self.call_ray(peer_addresses, self._token, self._peers)
+        return list(self._peers.values())
+
+    def call_ray(self, function: Callable[..., T], *arguments: Any) -> asyncio.Future[T]:
+        """Calls a function that uses Ray in a thread, while the service is a member of the cluster."""
+        return self._calls.call(function, *arguments)
 
     async def close(self) -> None:
-        """Leaves the cluster; actors that are left end."""
+        """Leaves the cluster; remaining actors end."""
         if self._keeping is not None:
             self._keeping.cancel()
-        await self._let_go(tuple(self._processes), CLOSE_S)
+        await self._detach(tuple(self._processes), CLOSE_S)
         self._calls.close()
         await asyncio.to_thread(self._membership.leave)
 
     def start(
         self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[ProcessExit], None]
-    ) -> AnyProcess:
-        """Starts a process on the node that has room; see `Placement`."""
-        needs = needs_of(entry, spec, self._server)
+    ) -> ProcessHandle:
+        """Starts a process on a node with sufficient resources; see `Placement`."""
+        needs = resource_needs(entry, spec, self._server)
         if needs is None:
             return super().start(entry, spec, on_message, on_end)
         self._started += 1
         epoch = spec.folder.epoch if entry is worker.main else self._started
         name = f"{needs.scene}.{needs.role}.{epoch}.{self._token}"
-        self.places[name] = Place(needs)
+        self.placed[name] = PlacedProcess(needs)
         process = RayProcess(self, name, needs, (entry, spec), on_message, on_end)
         self._processes.add(process)
         return process
 
-    def host(self, name: str, needs: Needs) -> Any:
-        """An actor for a process. Blocking: the head registers its name."""
-        made: Any = ray.remote(Host)
-        return made.options(name=name, **needs.options()).remote(
-            self.prepare, self._server.data.resolve(), self._token, ProcessPriority.here()
+    def create_actor(self, name: str, needs: ResourceNeeds) -> Any:
+        """Returns a new actor for a process. Blocking, since the head registers the actor's name."""
+        made: Any = ray.remote(ProcessHost)
+        return made.options(name=name, **needs.actor_options()).remote(
+            self.prepare, self._server.data.resolve(), self._token, ProcessPriority.current()
         )
 
 
 class RayProcess:
-    """A process of a scene on some node; its messages go by its actor. On the event loop, which never waits for Ray."""
+    """Process of a scene on a node of the cluster, which exchanges messages through its actor.
+
+    For use on the event loop, which never waits for Ray.
+    """
 
     def __init__(
         self,
         placement: RayPlacement,
         name: str,
-        needs: Needs,
+        needs: ResourceNeeds,
         runs: tuple[Entry, Any],
         on_message: Callable[[Any], None],
         on_end: Callable[[ProcessExit], None],
@@ -194,48 +206,48 @@ class RayProcess:
         self._node: str | None = None
         self._pid: int | None = None
         self._early: list[Any] | None = []
-        """Messages before there is an actor."""
+        """Messages sent before the actor exists; None after that."""
         self._sent = 0
         self._over = False
         self._lost = False
         self._actor: Any = None
-        self._making: asyncio.Future[Any] = placement.asked(placement.host, name, needs)
+        self._making: asyncio.Future[Any] = placement.call_ray(placement.create_actor, name, needs)
         self._answers: set[Any] = set()
-        """Answers that are waited for, or were when the cluster was lost."""
+        """Results that are awaited now, or were awaited when the cluster was lost."""
         self._tasks: set[asyncio.Task[Any]] = set()
-        self._task = self._beside(self._run(*runs))
+        self._task = self._start_task(self._run(*runs))
 
     @property
     def pid(self) -> int | None:
-        """See `AnyProcess`."""
+        """See `ProcessHandle`."""
         return self._pid
 
     def send(self, message: Any) -> None:
-        """See `AnyProcess`."""
+        """See `ProcessHandle`."""
         if self._over:
             return
         if self._early is not None:
             self._early.append(message)
             return
-        self._beside(self._post(self._actor.post.remote(self._sent, message)))
+        self._start_task(self._post(self._actor.post.remote(self._sent, message)))
         self._sent += 1
 
     async def stop(self, seconds: float = STOP_SECONDS) -> None:
-        """See `AnyProcess`."""
+        """See `ProcessHandle`."""
         started, over, self._over = self._pid is not None, self._over, True
         self._task.cancel()
-        self._placement.places.pop(self._name, None)
+        self._placement.placed.pop(self._name, None)
         if started and not over:
-            await asyncio.wait({self._beside(self._ask_to_stop(seconds))})
-        await asyncio.wait({self._beside(self._kill())}, timeout=STOPPED_S)  # it goes on where the head is silent
+            await asyncio.wait({self._start_task(self._ask_to_stop(seconds))})
+        await asyncio.wait({self._start_task(self._kill())}, timeout=STOPPED_S)  # may continue after the timeout
 
-    def lose(self) -> None:
-        """Gives it up with the cluster on which it ran."""
+    def mark_lost(self) -> None:
+        """Gives up the process because the cluster on which it ran is lost."""
         self._lost = True
         self._give_up("the Ray node of the service's machine is lost", lost=True)
 
-    async def let_go(self) -> None:
-        """Asks the actor nothing more, and makes none; its answers are kept."""
+    async def detach(self) -> None:
+        """Stops all calls to the actor, including its creation, and keeps its results alive."""
         self._lost = self._over = True
         asked = {self._making, *self._tasks}
         for each in asked:
@@ -247,29 +259,29 @@ class RayProcess:
         try:
             await self._begin(entry, spec)
             while not self._over:
-                for message in await self._answer(self._actor.take.remote()):
-                    if isinstance(message, NodeGone):
-                        self._end(ProcessExit(message.exit_code, starved=message.starved))
+                for message in await self._result(self._actor.receive.remote()):
+                    if isinstance(message, UnexpectedExit):
+                        self._end(ProcessExit(message.exit_code, out_of_memory=message.out_of_memory))
                     elif not self._over:
-                        self._tell(message)
+                        self._notify(message)
         except RayActorError as error:
             log.warning("actor %s is lost: %s", self._name, error)
             if self._node is not None and await self._is_lost(self._node):
                 self._give_up(f"the node of its {role} is lost", lost=True)
             else:
                 self._give_up(f"the actor of its {role} ended: {_first_line(error)}")
-        except (RayError, _NotStarted) as error:
+        except (RayError, _StartFailedError) as error:
             log.warning("actor %s did not start: %s", self._name, error)
             self._give_up(f"its {role} could not be started: {_first_line(error)}")
-        except Exception as error:  # whatever it is, the scene must not stand still
+        except Exception as error:  # whatever the error is, the scene must not hang
             log.exception("actor %s", self._name)
             self._give_up(f"its {role} was given up: {type(error).__name__}: {error}")
 
     async def _begin(self, entry: Entry, spec: Any) -> None:
-        """Starts the process, and says what it waits for as long as no node has room."""
+        """Starts the process; a worker reports the resources that it waits for if no node has room within `WAIT_S`."""
         self._actor = await asyncio.shield(self._making)
-        starting = self._beside(self._answer(self._actor.start.remote(entry, spec)))
-        starting.add_done_callback(lambda done: done.cancelled() or done.exception())  # who stops it does not ask
+        starting = self._start_task(self._result(self._actor.start.remote(entry, spec)))
+        starting.add_done_callback(lambda done: done.cancelled() or done.exception())  # avoids a warning after `stop`
         early, self._early = self._early or [], None
         for message in early:
             self.send(message)
@@ -277,32 +289,32 @@ class RayProcess:
         while not (await asyncio.wait([starting], timeout=WAIT_S))[0]:
             if self._needs.role == "worker" and not said:
                 said = True
-                self._tell(WaitsForNode(f"its worker is not placed on a node yet; it needs {self._needs.words()}"))
-        started: Started = starting.result()
+                self._notify(WaitsForNode(f"its worker is not placed on a node yet; it needs {self._needs.describe()}"))
+        started: StartResult = starting.result()
         if started.fault is not None:
-            raise _NotStarted(started.fault)
+            raise _StartFailedError(started.fault)
         self._pid, self._node = started.pid, started.node
-        if self._over:  # it was given up meanwhile
+        if self._over:  # it was given up in the meantime
             return
-        self._placement.places[self._name] = Place(self._needs, started.node)
+        self._placement.placed[self._name] = PlacedProcess(self._needs, started.node)
 
     async def _is_lost(self, node: str) -> bool:
         try:
-            return await asyncio.wait_for(self._placement.asked(is_lost, node), LOST_S)
-        except TimeoutError:  # the head does not say
+            return await asyncio.wait_for(self._placement.call_ray(is_lost, node), LOST_S)
+        except TimeoutError:  # the head does not respond
             return True
 
-    def _tell(self, message: Any) -> None:
+    def _notify(self, message: Any) -> None:
         try:
             self._on_message(message)
-        except Exception:  # a fault of the service's own: the next message is none of it
+        except Exception:  # an error in the service must not affect the next message
             log.exception("a message of actor %s", self._name)
 
     async def _ask_to_stop(self, seconds: float) -> None:
         with contextlib.suppress(RayError, TimeoutError):
-            await asyncio.wait_for(self._answer(self._actor.stop.remote(seconds)), seconds + STOPPED_S)
+            await asyncio.wait_for(self._result(self._actor.stop.remote(seconds)), seconds + STOPPED_S)
 
-    async def _answer(self, asked: Any) -> Any:
+    async def _result(self, asked: Any) -> Any:
         self._answers.add(asked)
         try:
             return await asked
@@ -312,29 +324,29 @@ class RayProcess:
 
     async def _post(self, sending: Any) -> None:
         try:
-            await self._answer(sending)
+            await self._result(sending)
         except RayActorError:
-            pass  # `_run` learns of it, too, and says what became of it
-        except RayError as error:  # it did not get the message, so it must not go on
+            pass  # `_run` receives the same error and handles it
+        except RayError as error:  # the process missed a message, so it must not continue
             self._give_up(f"a message did not reach its {self._needs.role}: {_first_line(error)}")
 
     def _give_up(self, why: str, *, lost: bool = False) -> None:
-        self._end(ProcessExit(None, why, lost=lost, starved=False))
+        self._end(ProcessExit(None, why, lost=lost, out_of_memory=False))
 
     def _end(self, why: ProcessExit) -> None:
         if not self._over:
             self._over = True
-            self._placement.places.pop(self._name, None)
-            self._beside(self._kill())
+            self._placement.placed.pop(self._name, None)
+            self._start_task(self._kill())
             self._on_end(why)
 
     async def _kill(self) -> None:
         if self._lost:
             return
         with contextlib.suppress(RayError, ValueError, OSError, RuntimeError):
-            await self._placement.asked(ray.kill, await asyncio.shield(self._making))
+            await self._placement.call_ray(ray.kill, await asyncio.shield(self._making))
 
-    def _beside(self, coroutine: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
+    def _start_task(self, coroutine: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
         task = asyncio.get_running_loop().create_task(coroutine)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
@@ -342,9 +354,9 @@ class RayProcess:
 
 
 def _first_line(error: BaseException) -> str:
-    """Ray's messages go on with what people need who look after the cluster; the log has all of it."""
+    """Returns the first line of an error message; the rest of Ray's messages, for cluster operators, is in the log."""
     return str(error).strip().partition("\n")[0]
 
 
-class _NotStarted(RuntimeError):
-    """The node could not start the process."""
+class _StartFailedError(RuntimeError):
+    """Error raised if the node could not start the process."""

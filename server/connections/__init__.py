@@ -1,1 +1,1 @@
-"""Limits of connections, before the application sees a request: sizes, deadlines, number per address."""
+"""Connection limits that apply before the application sees a request: sizes, deadlines, connections per address."""

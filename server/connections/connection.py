@@ -1,8 +1,8 @@
-"""HTTP connections of uvicorn: headers and bodies bounded in size and time before the application is asked.
+"""HTTP connections of uvicorn with limits on headers and bodies before the application is called.
 
-uvicorn and httptools take whatever comes: a header of any length (joined anew with each piece, in quadratic time), as
-many trailers and pipelined requests as fit through the wire, for as long as the peer likes. All of that happens before
-a token is looked at. `server.connections.guard` watches the time; the sizes are watched here, where the bytes come in.
+uvicorn and httptools accept any input: headers of any length (which are concatenated in quadratic time), and any number
+of trailers and pipelined requests, without a time limit. All of that happens before a token is checked. This module
+limits sizes as bytes arrive; `server.connections.guard` enforces deadlines.
 """
 
 from __future__ import annotations
@@ -15,28 +15,34 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from server.connections import guard as guard_module
 from server.connections.guard import ConnectionGuard
-from server.connections.record import PROGRESS_BYTES, Phase
+from server.connections.open_connection import PROGRESS_BYTES, Phase
 from server.connections.refusals import Refusal, problem, response
 from server.http.authentication import HEADERS
 
 END_OF_HEAD = b"\r\n\r\n"
 CHUNKED_BYTES = 64 << 10
-"""A chunked body is parsed in pieces of at most so many bytes: its overhead is looked at after each."""
-OVERHEAD_BYTES = 64 << 10
-"""Chunk headers, extensions and trailers that may come without as much content."""
-LARGE_PIECE = 16 << 10
+"""Maximum bytes of a chunked body that are parsed at once; the overhead is checked after each block."""
+CHUNK_OVERHEAD_BYTES = 64 << 10
+"""Bytes of chunk headers, extensions and trailers that may exceed the bytes of content."""
+LARGE_READ = 16 << 10
+"""Size in bytes from which a piece of a body is passed on without a copy."""
 PIPELINED = 16
-"""Requests that wait for the answer before theirs; the connection ends behind them, and the client sends the rest
-again. Each costs some kilobytes, and thousands fit into what is read at once."""
+"""Maximum number of pipelined requests.
+
+After these, the connection is closed, and the client must resend the rest. Each request costs some kilobytes, and a
+single read can contain thousands.
+"""
 DROPPED_BYTES = 1 << 20
-"""Read and dropped from a connection that was refused, so that its peer gets to read the answer."""
+"""Maximum bytes that are read and discarded after a refusal, so that the peer can read the response."""
 
 
-class Connection(HttpToolsProtocol):
-    """uvicorn's HTTP connection, guarded, and without its two copies of a body: a frame is some 30 MB, and each copy
-    costs as much as reading it.
+class GuardedConnection(HttpToolsProtocol):
+    """HTTP connection of uvicorn with limits, and without uvicorn's two copies of each body.
 
-    `guard` is that of the service, set by `server.connections.config`.
+    A frame has about 30 MB, and each copy would cost as much as reading it.
+
+    Attributes:
+        guard: the guard of the service, set by `server.connections.config`.
     """
 
     guard: ClassVar[ConnectionGuard]
@@ -44,19 +50,19 @@ class Connection(HttpToolsProtocol):
     def __init__(self, *given: Any, **named: Any) -> None:
         super().__init__(*given, **named)
         self._fault: Refusal | None = None
-        """Found while parsing: an exception there would be answered as any other bad request."""
+        """Fault found while parsing; uvicorn would answer an exception like any other bad request."""
         self._head_bytes = 0
         self._left: int | None = None
-        """Bytes of the body that are missing; None where it is chunked."""
+        """Bytes of the body that have not arrived yet; None if it is chunked."""
         self._delivered = 0
-        self._credit = OVERHEAD_BYTES
+        self._credit = CHUNK_OVERHEAD_BYTES
         self._dropping = False
         self._dropped = 0
         self._closes = False
-        """The connection ends with the body that is coming."""
+        """True if the connection is to be closed after the current body."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Takes a place among the open connections, or is refused."""
+        """Registers the connection with the guard, and refuses it if a limit is reached."""
         super().connection_made(transport)
         address = self.client[0] if self.client else ""
         self._record, refusal = self.guard.admit(self, transport, self.loop, address)
@@ -64,17 +70,17 @@ class Connection(HttpToolsProtocol):
             self.refuse(refusal)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Gives the place back."""
-        self.guard.leave(self._record)
+        """Removes the connection from the guard."""
+        self.guard.remove(self._record)
         super().connection_lost(exc)
 
     @property
-    def waits_for_us(self) -> bool:
-        """True if nothing can come because the service does not read now, or has yet to ask for the body."""
+    def waiting_for_service(self) -> bool:
+        """True if no bytes can arrive because the service is not reading or has not requested the body yet."""
         return self.flow.read_paused or (self._record.phase is Phase.BODY and self.cycle.waiting_for_100_continue)
 
     def data_received(self, data: bytes) -> None:
-        """Parses what comes, piece by piece: never more of a header than it may still have."""
+        """Parses received data in pieces, so that a header never exceeds its size limit."""
         record = self._record
         record.received += len(data)
         if self.timeout_keep_alive_task is not None:
@@ -96,7 +102,7 @@ class Connection(HttpToolsProtocol):
             at += self._parse(data if whole else memoryview(data)[at:end])
 
     def _parse(self, piece: bytes | memoryview) -> int:
-        """Parses a piece; returns the bytes of it that were taken."""
+        """Parses a piece and returns the number of bytes consumed."""
         record, size = self._record, len(piece)
         self._delivered, in_head = 0, record.phase is Phase.HEAD
         taken = size
@@ -113,9 +119,9 @@ class Connection(HttpToolsProtocol):
             if self._head_bytes >= self.guard.limits.header_bytes:
                 self._fault = self._too_large()
         elif self._fault is None and not in_head and self._left is None:
-            # Delivered bytes pay for overhead, but do not add up: a large body must not buy an endless trailer,
-            # which is joined in quadratic time as a header is.
-            self._credit = min(OVERHEAD_BYTES, self._credit + self._delivered) - (size - self._delivered)
+            # Content offsets overhead, but its credit is capped. Otherwise, a large body would permit an endless
+            # trailer, which is concatenated in quadratic time, as headers are.
+            self._credit = min(CHUNK_OVERHEAD_BYTES, self._credit + self._delivered) - (size - self._delivered)
             if self._credit < 0:
                 self._fault = Refusal.BODY_OVERHEAD
         if self._fault is not None:
@@ -125,19 +131,22 @@ class Connection(HttpToolsProtocol):
 
     def _begin_head(self) -> None:
         self._head_bytes = 0
-        self.guard.enter(self._record, Phase.HEAD, self.loop.time())
+        self.guard.set_phase(self._record, Phase.HEAD, self.loop.time())
 
     def _too_large(self) -> Refusal:
         return Refusal.URL_SIZE if 2 * len(self.url or b"") > self.guard.limits.header_bytes else Refusal.HEAD_SIZE
 
     def on_message_begin(self) -> None:
-        """Begins with a request, maybe in the piece in which the one before ended."""
+        """Starts a request, possibly in the same piece in which the previous request ended."""
         super().on_message_begin()
         if self._record.phase is not Phase.HEAD:
             self._begin_head()
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """Takes a line of the header. Trailers are dropped: they are not used, and must not pass for headers."""
+        """Stores a line of the header.
+
+        Trailers are discarded, because they are unused and must not be taken for headers.
+        """
         if self._record.phase is not Phase.HEAD:
             return
         if len(self.headers) >= guard_module.HEADER_LINES:
@@ -146,38 +155,38 @@ class Connection(HttpToolsProtocol):
         super().on_header(name, value)
 
     def on_headers_complete(self) -> None:
-        """Hands the request on, unless it is refused."""
+        """Passes the request to the application, unless it is refused."""
         if self._fault is None and len(self.pipeline) >= PIPELINED:
             self._fault = Refusal.PIPELINED
-        if self._fault is None and self._summed() > self.guard.limits.header_bytes:
+        if self._fault is None and self._add_content_length() > self.guard.limits.header_bytes:
             self._fault = self._too_large()
         if self._fault is not None:
             return
         before = self.cycle
         super().on_headers_complete()
-        if self.cycle is before:  # the handshake of a WebSocket
+        if self.cycle is before:  # this is the handshake of a WebSocket
             return
         self._left, chunked = 0, False
         for name, value in self.headers:
             if name == b"content-length":
-                self._left = int(value)  # httptools refuses what is no number, and a second one
+                self._left = int(value)  # httptools rejects invalid and repeated values
             elif name == b"transfer-encoding":
                 chunked = True
         phase = Phase.ANSWER
         if chunked or self._left:
             phase = Phase.BODY
-            self._credit = OVERHEAD_BYTES
+            self._credit = CHUNK_OVERHEAD_BYTES
             if chunked:
                 self._left = None
-            # The task that answers begins after this call.
-            self.cycle.transport = _Lingering(self)
-        self.guard.enter(self._record, phase, self.loop.time())
+            # The task that runs the application starts after this call, and then sees this transport.
+            self.cycle.transport = _DelayedClose(self)
+        self.guard.set_phase(self._record, phase, self.loop.time())
 
-    def _summed(self) -> int:
+    def _add_content_length(self) -> int:
         return len(self.url) + sum(len(name) + len(value) for name, value in self.headers)
 
     def on_body(self, body: bytes) -> None:
-        """Takes a piece of a body."""
+        """Appends a piece of the body."""
         if self._fault is not None:
             return
         self._delivered += len(body)
@@ -189,27 +198,27 @@ class Connection(HttpToolsProtocol):
             self._left -= len(body)
         cycle = self.cycle
         if not cycle.body:
-            # Nothing waits: `+=` to bytes that are empty is the piece itself, and so is `bytes` of it. Small pieces
-            # are joined: they go into a bytearray, which grows without being copied each time.
-            cycle.body = b"" if len(body) >= LARGE_PIECE else bytearray()  # type: ignore[assignment]
+            # The buffer is empty. Adding a piece to empty bytes returns the piece itself, without a copy, as does
+            # `bytes` of it. Small pieces are collected in a bytearray, which grows without being copied each time.
+            cycle.body = b"" if len(body) >= LARGE_READ else bytearray()  # type: ignore[assignment]
         elif isinstance(cast("bytes | bytearray", cycle.body), bytes):
             cycle.body = bytearray(cycle.body)
         super().on_body(body)
 
     def on_message_complete(self) -> None:
-        """Ends a request; its answer may be under way, or out."""
+        """Ends a request, whose response may be in progress or already sent."""
         if self._fault is not None:
             return
         super().on_message_complete()
         if self._record.phase is Phase.BODY:
-            self.guard.enter(self._record, Phase.ANSWER, self.loop.time())
+            self.guard.set_phase(self._record, Phase.ANSWER, self.loop.time())
         elif self._record.phase is Phase.LINGER:
-            self.guard.enter(self._record, Phase.IDLE, self.loop.time())
+            self.guard.set_phase(self._record, Phase.IDLE, self.loop.time())
             if self._closes:
                 self.transport.close()
 
     def on_response_complete(self) -> None:
-        """Waits for the next request, or for the end of a body that is not needed any more."""
+        """Waits for the next request, or for the end of a body that is no longer needed."""
         super().on_response_complete()
         record = self._record
         record.served = True
@@ -217,26 +226,27 @@ class Connection(HttpToolsProtocol):
             return
         if record.phase is Phase.BODY:
             self._unset_keepalive_if_required()
-            self.guard.enter(record, Phase.LINGER, self.loop.time())
+            self.guard.set_phase(record, Phase.LINGER, self.loop.time())
         elif record.phase is Phase.ANSWER:
-            self.guard.enter(record, Phase.IDLE, self.loop.time())
+            self.guard.set_phase(record, Phase.IDLE, self.loop.time())
 
-    def close_behind_body(self) -> None:
-        """Closes the connection once the body that is coming has ended, or has gone on for too long: closed before,
-        with bytes unread, it would be reset and the answer lost.
+    def close_after_body(self) -> None:
+        """Closes the connection after the current body has ended or has taken too long.
+
+        Closing it earlier, with unread bytes, would reset the connection, and the response would be lost.
         """
         if self._record.phase in (Phase.BODY, Phase.LINGER) and not self._dropping:
             self._closes = True
-            self.guard.enter(self._record, Phase.LINGER, self.loop.time())
+            self.guard.set_phase(self._record, Phase.LINGER, self.loop.time())
             self.flow.resume_reading()
         else:
             self.transport.close()
 
     def refuse(self, refusal: Refusal) -> None:
-        """Counts the refusal, answers with it where nothing else is being answered, and ends the connection."""
+        """Counts the refusal, sends it unless another response is in progress, and closes the connection."""
         if self._dropping or self.transport.is_closing():
             return
-        self.guard.refused(refusal)
+        self.guard.count_refusal(refusal)
         self._dropping = True
         record, cycle, now = self._record, self.cycle, self.loop.time()
         answering = cycle is not None and not cycle.response_complete
@@ -248,13 +258,13 @@ class Connection(HttpToolsProtocol):
             cycle.disconnected = True
             cycle.waiting_for_100_continue = False
             cycle.message_event.set()
-        elif answering:  # requests before it are answered, and the last of them ends the connection
+        elif answering:  # earlier requests are answered first; the last of them closes the connection
             cycle.keep_alive = False
-            self.guard.enter(record, Phase.ANSWER, now)
+            self.guard.set_phase(record, Phase.ANSWER, now)
             return
         else:
             answered = False
-        self.guard.enter(record, Phase.REFUSED, now)
+        self.guard.set_phase(record, Phase.REFUSED, now)
         self._unset_keepalive_if_required()
         if not answered:
             self.transport.write(response(problem(refusal, self.guard.limits.of_refusal(refusal)), HEADERS))
@@ -272,38 +282,40 @@ class Connection(HttpToolsProtocol):
             self.flow.pause_reading()
 
     def _upgrade(self) -> None:
-        """Goes on as a WebSocket. Another protocol is not spoken here: the request is answered as it is, and whatever
-        follows belongs to that protocol and must not be taken for requests.
+        """Switches the connection to a WebSocket.
+
+        If another protocol is requested, the request is answered without an upgrade. The data that follows it
+        belongs to that protocol and is discarded, so that it is not taken for further requests.
         """
         if not self._should_upgrade():
             self.cycle.keep_alive = False
             self._dropping = True
         elif self.cycle is not None and not self.cycle.response_complete:
-            self._fault = Refusal.MALFORMED  # the answer before would be written into the WebSocket
+            self._fault = Refusal.MALFORMED  # the pending response would be written into the WebSocket
         else:
-            self._dropping = True  # what came with the handshake; the WebSocket reads what comes after it
+            self._dropping = True  # applies to data received with the handshake; the WebSocket reads later data
             self.handle_websocket_upgrade()
 
     def pause_writing(self) -> None:
-        """Notes that the peer does not read as fast as it is written."""
+        """Notes that the peer reads more slowly than the service writes."""
         super().pause_writing()
         self._record.write_paused = True
 
     def resume_writing(self) -> None:
-        """Notes that the peer has read."""
+        """Notes that the peer has caught up."""
         super().resume_writing()
         self._record.write_paused = False
 
 
-class _Lingering(asyncio.Transport):
-    """The transport of a response whose request is still coming: closing it waits for the end of the body."""
+class _DelayedClose(asyncio.Transport):
+    """Transport of a response whose request body is still arriving; closing it waits for the end of the body."""
 
-    def __init__(self, connection: Connection) -> None:
+    def __init__(self, connection: GuardedConnection) -> None:
         super().__init__()
         self._connection = connection
         self.write = connection.transport.write  # type: ignore[method-assign]
         self.is_closing = connection.transport.is_closing  # type: ignore[method-assign]
 
     def close(self) -> None:
-        """Closes the connection behind the body."""
-        self._connection.close_behind_body()
+        """Closes the connection after the body."""
+        self._connection.close_after_body()

@@ -1,6 +1,6 @@
-"""Ends connections that break the limits: deadlines, caps, and answers that the peer does not read.
+"""Guard that closes connections which exceed the limits: deadlines, connection counts, and unread responses.
 
-A connection costs no timer of its own: one sweep, about once a second, looks at all of them while there are any.
+Connections need no timers of their own, because a sweep checks all of them about once per second.
 """
 
 from __future__ import annotations
@@ -12,41 +12,49 @@ from collections import Counter
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
-from server.connections.process import unread_bytes
-from server.connections.record import KINDS, PROGRESS_BYTES, Handler, OpenConnection, Peer, Phase
+from server.connections.open_connection import KINDS, PROGRESS_BYTES, Handler, OpenConnection, Peer, Phase
+from server.connections.process_limits import unread_bytes
 from server.connections.refusals import Refusal
 from server.counters import CONNECTIONS_REFUSED
 from server.settings import ServerSettings
 
 HEADER_LINES = 100
-"""Lines of a header; more get 431. Proxies add some ten to a browser's twenty; WebSockets take 128 at most."""
+"""Maximum number of header lines; more are answered with 431.
+
+Browsers send about twenty, proxies add about ten, and WebSockets accept at most 128.
+"""
 
 SWEEP_S = 1.0
+"""Maximum seconds between two sweeps."""
 LINGER_S = 5.0
+"""Seconds within which `PROGRESS_BYTES` of a body must arrive while it is discarded."""
 LINGER_LONGEST_S = 60.0
+"""Maximum seconds for which a body is discarded."""
 LINGER_BYTES = 64 << 20
-"""A body that goes on after its answer is read and dropped while `PROGRESS_BYTES` come in `LINGER_S`, so long in all,
-so far: closed at once, the connection would be reset, and the sender would lose the answer."""
+"""Maximum bytes of a body that are read and discarded after the response.
+
+If the connection were closed at once, it would be reset, and the sender would lose the response.
+"""
 REFUSED_S = 2.0
-"""A connection that was refused is read and dropped for so long."""
+"""Seconds for which data from a refused connection is read and discarded."""
 REFUSED_AT_ONCE = 64
-"""Refused connections that wait for their peers to read why; the oldest go first."""
+"""Maximum number of refused connections that wait for their peer to read the response; the oldest are aborted."""
 CLOSING_SOCKET_S = 5.0
-"""A WebSocket that is closed and whose peer reads nothing."""
+"""Seconds after which a closing WebSocket is aborted if its peer does not read."""
 QUIET_S = 2.0
-"""An upload that brought nothing for so long gives way where a cap is reached."""
+"""Seconds without data after which an upload may be closed to make room for a new connection."""
 SUMMARY_S = 10.0
-"""Between two lines of the log about refused connections: a line each would be another flood."""
+"""Minimum seconds between log lines about refused connections; one line per refusal would flood the log."""
 
 log = logging.getLogger("scas4d.server")
 
-for refusal in Refusal:  # those that never happened count too: as 0
+for refusal in Refusal:  # export reasons that have not occurred yet as 0
     CONNECTIONS_REFUSED.labels(refusal.value)
 
 
 @dataclass(frozen=True)
 class ConnectionLimits:
-    """The limits of connections: seconds, bytes, counts."""
+    """Limits of connections, in seconds, bytes and counts."""
 
     header_seconds: float
     header_bytes: int
@@ -59,7 +67,7 @@ class ConnectionLimits:
 
     @classmethod
     def of(cls, settings: ServerSettings) -> ConnectionLimits:
-        """Takes the limits from the settings of a service."""
+        """Returns the limits from the settings of a service."""
         return cls(
             header_seconds=settings.header_seconds,
             header_bytes=settings.header_kb << 10,
@@ -72,7 +80,7 @@ class ConnectionLimits:
         )
 
     def of_refusal(self, refusal: Refusal) -> float:
-        """Returns the limit that a refusal names, in the unit of its setting."""
+        """Returns the limit that belongs to a refusal, in the unit of its setting; 0 if there is none."""
         return {
             Refusal.HEAD_SIZE: self.header_bytes / 1024,
             Refusal.URL_SIZE: self.header_bytes / 1024,
@@ -85,7 +93,7 @@ class ConnectionLimits:
         }.get(refusal, 0)
 
     def is_proxy(self, address: str) -> bool:
-        """Returns True if the address is one of the trusted proxies."""
+        """Returns whether the address belongs to a trusted proxy."""
         try:
             parsed = ipaddress.ip_address(address)
         except ValueError:
@@ -94,7 +102,10 @@ class ConnectionLimits:
 
 
 def peer_key(address: str) -> str:
-    """Returns the key of a peer's connections: of an IPv6 address its /64, which belongs to one customer."""
+    """Returns the key under which a peer's connections are counted.
+
+    For an IPv6 address, this is its /64 network, which typically belongs to one customer.
+    """
     try:
         parsed = ipaddress.ip_address(address)
     except ValueError:
@@ -107,7 +118,7 @@ def peer_key(address: str) -> str:
 
 
 class ConnectionGuard:
-    """The open connections of one service, its limits, and the sweep that enforces them."""
+    """Registry of the open connections of a service, with the sweep that enforces their limits."""
 
     def __init__(self, limits: ConnectionLimits) -> None:
         self.limits = limits
@@ -116,7 +127,7 @@ class ConnectionGuard:
         self._counted = self._bodies = 0
         self._refused: dict[OpenConnection, None] = {}
         self._pending: Counter[str] = Counter()
-        self._told = float("-inf")
+        self._logged = float("-inf")
         self._timer: asyncio.TimerHandle | None = None
         self._swept = 0.0
         shortest = min(limits.header_seconds, limits.body_seconds, limits.keep_alive_seconds, limits.unread_seconds)
@@ -125,36 +136,36 @@ class ConnectionGuard:
     def admit(
         self, handler: Handler, transport: asyncio.Transport, loop: asyncio.AbstractEventLoop, address: str
     ) -> tuple[OpenConnection, Refusal | None]:
-        """Takes a new connection: returns its record, and the refusal if it has to be refused.
+        """Registers a new connection; returns its record, and the refusal if it must be refused.
 
-        Where a cap is reached it takes the place of the oldest connection that has not sent a whole header, is idle, or
-        has stopped sending its body: an idle peer must not keep out one that has a request. Where all places are
-        taken, any peer's may give way: a peer with many addresses has few connections from each.
+        If a limit is reached, the new connection replaces another that has not sent a complete header, is idle, or has
+        stopped sending its body. An idle peer must not block a peer that has a request. If the total limit is reached,
+        connections of any peer may be replaced, because a peer with many addresses has few connections per address.
         """
         now = loop.time()
         proxy = self.limits.is_proxy(address)
-        key = address if proxy else peer_key(address)  # a proxy's neighbours are no proxies
+        key = address if proxy else peer_key(address)  # neighbors of a proxy are not proxies
         peer = self._peers.get(key)
         if peer is None:
             peer = self._peers[key] = Peer(key, proxy)
         refusal = None
-        if not proxy and peer.count >= self.limits.per_peer and not self._displace([peer], now):
+        if not proxy and peer.count >= self.limits.per_peer and not self._evict([peer], now):
             refusal = Refusal.PEER_CONNECTIONS
-        elif self._counted >= self.limits.connections and not self._displace(self._peers.values(), now):
+        elif self._counted >= self.limits.connections and not self._evict(self._peers.values(), now):
             refusal = Refusal.CONNECTIONS
         record = self._records[transport] = OpenConnection(handler, transport, peer, now, now)
-        self._peers[key] = peer  # it went where its last connection gave way
+        self._peers[key] = peer  # the peer was removed if its last connection was evicted
         peer.count += 1
         self._counted += 1
-        self.enter(record, Phase.NEW, now)
+        self.set_phase(record, Phase.NEW, now)
         if self._timer is None:
             self._swept = now
             self._timer = loop.call_later(self._every, self._sweep, loop)
         return record, refusal
 
-    def enter(self, record: OpenConnection, phase: Phase, now: float) -> None:
-        """Notes that a connection is in another phase, from `now` (loop time) on."""
-        if record.gone:
+    def set_phase(self, record: OpenConnection, phase: Phase, now: float) -> None:
+        """Sets the phase of a connection, starting at `now` (loop time)."""
+        if record.closed:
             return
         record.phase, record.since, record.entered, record.body, record.dropped = phase, now, now, 0, 0
         queue = None
@@ -172,35 +183,35 @@ class ConnectionGuard:
             record.moved = False
             self._make_room_for_headers(record)
         elif phase is Phase.REFUSED:
-            self._release(record)
+            self._stop_counting(record)
             self._refused[record] = None
             if len(self._refused) > REFUSED_AT_ONCE:
                 oldest = next(iter(self._refused))
                 del self._refused[oldest]
                 oldest.transport.abort()
 
-    def hand_over(self, transport: asyncio.BaseTransport, handler: Handler, now: float) -> OpenConnection:
-        """Returns the record of a connection that is a WebSocket from now on."""
+    def upgrade(self, transport: asyncio.BaseTransport, handler: Handler, now: float) -> OpenConnection:
+        """Marks a connection as a WebSocket and returns its record."""
         record = self._records[transport]
         record.handler = handler
-        self.enter(record, Phase.SOCKET, now)
+        self.set_phase(record, Phase.SOCKET, now)
         return record
 
-    def leave(self, record: OpenConnection) -> None:
-        """Forgets a connection that is gone."""
-        record.gone = True
+    def remove(self, record: OpenConnection) -> None:
+        """Removes the record of a closed connection."""
+        record.closed = True
         self._records.pop(record.transport, None)
         self._unqueue(record)
         self._refused.pop(record, None)
-        self._release(record)
+        self._stop_counting(record)
 
-    def refused(self, refusal: Refusal) -> None:
-        """Counts a refusal; the sweep logs a summary."""
+    def count_refusal(self, refusal: Refusal) -> None:
+        """Counts a refusal, which the sweep includes in its log summary."""
         CONNECTIONS_REFUSED.labels(refusal.value).inc()
         self._pending[refusal.value] += 1
 
     def counts(self) -> dict[str, int]:
-        """Counts the open connections by kind."""
+        """Returns the number of open connections per kind."""
         totals = dict.fromkeys(KINDS.values(), 0)
         for record in self._records.values():
             totals[KINDS[record.phase]] += 1
@@ -213,10 +224,10 @@ class ConnectionGuard:
             record.queue = None
 
     def _make_room_for_headers(self, new: OpenConnection) -> None:
-        """Keeps uploads that have brought next to nothing to half of a cap, the oldest go.
+        """Closes the oldest upload without progress if uploads occupy more than half of a limit.
 
-        The other half is then of connections that give way at once: who has a request finds a place at any moment, and
-        not only when uploads that hang are old enough to be distinguished from those that have just begun.
+        The other half then consists of connections that can be replaced at once. A client with a request can therefore
+        connect at any time, and need not wait until stalled uploads can be distinguished from new ones.
         """
         peers: Iterable[Peer] = [new.peer]
         if new.peer.proxy or 2 * len(new.peer.bodies) <= self.limits.per_peer:
@@ -224,7 +235,11 @@ class ConnectionGuard:
                 return
             peers = self._peers.values()
         begun = (
-            [other for other in peer.bodies if other is not new and other.is_begun and not other.handler.waits_for_us]
+            [
+                other
+                for other in peer.bodies
+                if other is not new and other.is_begun and not other.handler.waiting_for_service
+            ]
             for peer in peers
         )
         most = max(begun, key=len, default=[])
@@ -232,13 +247,13 @@ class ConnectionGuard:
             self._end(most[0], new.since)
 
     def _end(self, record: OpenConnection, now: float) -> None:
-        """Ends a connection that gives way, without an answer."""
-        self.refused(Refusal.DISPLACED)
-        self.enter(record, Phase.REFUSED, now)
+        """Aborts a connection to make room, without a response."""
+        self.count_refusal(Refusal.DISPLACED)
+        self.set_phase(record, Phase.REFUSED, now)
         record.transport.abort()
 
-    def _release(self, record: OpenConnection) -> None:
-        """Makes room: a connection that is refused or gone does not count."""
+    def _stop_counting(self, record: OpenConnection) -> None:
+        """Stops counting a connection towards the limits, because it is refused or gone."""
         if not record.counted:
             return
         record.counted = False
@@ -248,12 +263,12 @@ class ConnectionGuard:
         if peer.count == 0:
             self._peers.pop(peer.address, None)
 
-    def _displace(self, peers: Collection[Peer], now: float) -> bool:
-        """Ends the connection of these peers that can be spared best; False where none can."""
+    def _evict(self, peers: Collection[Peer], now: float) -> bool:
+        """Closes the most dispensable connection of these peers; returns False if there is none."""
         for queues in ([peer.strangers for peer in peers], [peer.idle for peer in peers]):
             oldest = [(len(queue), next(iter(queue))) for queue in queues if queue]
             if oldest:
-                # Of many peers with as many it is the one that has waited longest: who has just come has a request.
+                # Among peers with equally many connections, the longest wait decides: a new client has a request.
                 _, record = max(oldest, key=lambda one: (one[0], -one[1].since))
                 self._end(record, now)
                 return True
@@ -261,7 +276,7 @@ class ConnectionGuard:
             record
             for peer in peers
             for record in peer.bodies
-            if record.received == 0 and now - record.last_bytes_at > QUIET_S and not record.handler.waits_for_us
+            if record.received == 0 and now - record.last_bytes_at > QUIET_S and not record.handler.waiting_for_service
         ]
         if not quiet:
             return False
@@ -274,18 +289,18 @@ class ConnectionGuard:
         for record in list(self._records.values()):
             if record.received:
                 record.received, record.quiet_since = 0, now
-            if not self._unread(record, now):
-                self._overdue(record, now, passed)
-        if self._pending and now - self._told >= SUMMARY_S:
+            if not self._check_unread(record, now):
+                self._check_deadline(record, now, passed)
+        if self._pending and now - self._logged >= SUMMARY_S:
             reasons = ", ".join(f"{count} {reason}" for reason, count in self._pending.most_common())
             log.warning("refused connections: %s (docs/operations.md, `reason`)", reasons)
             self._pending.clear()
-            self._told = now
+            self._logged = now
         go_on = bool(self._records or self._pending)
         self._timer = loop.call_later(self._every, self._sweep, loop) if go_on else None
 
-    def _overdue(self, record: OpenConnection, now: float, passed: float) -> None:
-        """Ends a connection whose phase has taken too long."""
+    def _check_deadline(self, record: OpenConnection, now: float, passed: float) -> None:
+        """Closes a connection whose phase exceeds its deadline."""
         limits, phase = self.limits, record.phase
         if phase is Phase.REFUSED:
             if now - record.since > REFUSED_S:
@@ -293,7 +308,7 @@ class ConnectionGuard:
             return
         if phase in (Phase.ANSWER, Phase.SOCKET) or record.transport.is_closing():
             return
-        if record.handler.waits_for_us:
+        if record.handler.waiting_for_service:
             record.since += passed
             return
         waited = now - record.since
@@ -315,11 +330,11 @@ class ConnectionGuard:
             case Phase.BODY if waited > limits.body_seconds:
                 record.handler.refuse(Refusal.BODY_TIME)
 
-    def _unread(self, record: OpenConnection, now: float) -> bool:
-        """Ends a connection whose peer does not read what it asked for.
+    def _check_unread(self, record: OpenConnection, now: float) -> bool:
+        """Aborts a connection whose peer does not read the response; returns whether it did.
 
-        Only where nothing is written meanwhile, so that what is unread less than before was read: the application
-        waits for room, or the connection is being closed.
+        Checks only connections to which nothing is written at the moment, because writing is paused or the connection
+        is closing. A decrease in unread bytes then means that the peer has read them.
         """
         closing = record.transport.is_closing()
         size = unread_bytes(record.transport) if closing or record.write_paused else 0
@@ -338,6 +353,6 @@ class ConnectionGuard:
             limit = min(limit, CLOSING_SOCKET_S)
         if now - record.unsent_since <= limit:
             return False
-        self.refused(Refusal.UNREAD)
+        self.count_refusal(Refusal.UNREAD)
         record.transport.abort()
         return True

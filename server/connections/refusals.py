@@ -1,4 +1,4 @@
-"""Reasons to refuse a connection, and the problem document that answers each."""
+"""Reasons for refusing a connection, with the problem document for each."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from server import problems
 from server.problems import Problem
 
 RETRY_SECONDS = 5
-"""`Retry-After` where there are too many connections: half-sent headers are timed out by then."""
+"""Value of `Retry-After` if there are too many connections; by then, incomplete headers have timed out."""
 
 
 class Refusal(StrEnum):
-    """Reasons; the value is the label `reason` of `scas4d_connections_refused_total`."""
+    """Reason for refusing a connection; the value is the label `reason` of `scas4d_connections_refused_total`."""
 
     HEAD_SIZE = "head_size"
     HEAD_LINES = "head_lines"
@@ -31,10 +31,11 @@ class Refusal(StrEnum):
 
 
 def problem(refusal: Refusal, limit: float = 0) -> Problem:
-    """Makes the problem for a refused connection or request.
+    """Returns the problem for a refused connection or request.
 
     Args:
-        refusal: the reason. limit: the limit that was passed, in the unit of its setting.
+        refusal: the reason.
+        limit: the limit that was exceeded, in the unit of its setting.
     """
     retry = {"Retry-After": str(RETRY_SECONDS)}
     match refusal:
@@ -59,7 +60,7 @@ def problem(refusal: Refusal, limit: float = 0) -> Problem:
         case Refusal.BODY_TIME:
             return Problem(
                 408,
-                f"hardly any of the body came for {limit:g} s",
+                f"hardly any of the body arrived in {limit:g} s",
                 field="body",
                 value=f"less than 16 kB in {limit:g} s",
                 remedy="send the request again, without a pause (SCAS4D_BODY_SECONDS)",
@@ -93,7 +94,7 @@ def problem(refusal: Refusal, limit: float = 0) -> Problem:
         case Refusal.MALFORMED | Refusal.PIPELINED | Refusal.UNREAD | Refusal.DISPLACED:
             return Problem(
                 400,
-                "the request is no HTTP/1.1",
+                "the request is not HTTP/1.1",
                 field="request",
                 value="bytes that cannot be parsed",
                 remedy="send a request of RFC 9112, over plain HTTP",
@@ -101,13 +102,14 @@ def problem(refusal: Refusal, limit: float = 0) -> Problem:
 
 
 def response(refused: Problem, headers: dict[str, str]) -> bytes:
-    """Writes the problem as a whole HTTP/1.1 response that ends the connection.
+    """Returns the problem as a complete HTTP/1.1 response with `Connection: close`.
 
     Args:
-        refused: the problem. headers: further ones, of every answer of the service.
+        refused: the problem.
+        headers: headers that every response of the service has.
     """
     status = HTTPStatus(refused.status_code)
-    answer = problems.answer(refused.document, {**headers, **(refused.headers or {}), "Connection": "close"})
+    answer = problems.problem_response(refused.document, {**headers, **(refused.headers or {}), "Connection": "close"})
     lines = [f"HTTP/1.1 {status.value} {status.phrase}".encode()]
     lines += [name + b": " + value for name, value in answer.raw_headers]
     return b"\r\n".join([*lines, b"", bytes(answer.body)])

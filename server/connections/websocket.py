@@ -1,4 +1,4 @@
-"""WebSockets of uvicorn with limits: size of messages, malformed handshakes, peers that do not read."""
+"""WebSockets of uvicorn with protection against large messages, malformed handshakes and peers that do not read."""
 
 from __future__ import annotations
 
@@ -11,53 +11,58 @@ from websockets.frames import Frame
 from websockets.http11 import Request
 
 from server.connections.guard import LINGER_LONGEST_S, ConnectionGuard
-from server.connections.record import Phase
+from server.connections.open_connection import Phase
 from server.connections.refusals import Refusal, problem, response
 from server.http.authentication import HEADERS
 
 EARLY_BYTES = 1 << 16
-"""Largest message of a WebSocket before its handshake is answered: no client has to send one then."""
+"""Maximum message size in bytes before the handshake is answered; no client needs to send messages that early."""
 SMALL_FRAGMENT = 4096
+"""Maximum size in bytes of fragments that are joined with the previous fragment."""
 PONG = b"\x8a"
-"""First byte of such a frame."""
+"""First byte of a pong frame."""
 LIMIT = "scas4d.message_limit"
+"""Key of the scope extension through which the application sets the maximum message size."""
 
 
-class Socket(WebSocketsSansIOProtocol):
-    """uvicorn's WebSocket; the application sets its largest message, and a larger one is refused (1009) unread.
+class GuardedWebSocket(WebSocketsSansIOProtocol):
+    """WebSocket of uvicorn whose maximum message size is set by the application.
 
-    `guard` is that of the service, set by `server.connections.config`.
+    A larger message is rejected with close code 1009 without being read.
+
+    Attributes:
+        guard: the guard of the service, set by `server.connections.config`.
     """
 
     guard: ClassVar[ConnectionGuard]
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Takes the connection over from the HTTP request that asked for the upgrade."""
+        """Takes over the connection from the HTTP request that asked for the upgrade."""
         super().connection_made(transport)
         self._pong = b""
-        """The answer to the newest ping, while the peer does not read."""
+        """Pong for the newest ping, held back while the peer does not read."""
         self._fell_behind = False
-        """True if more waited than the transport likes, at some time since the last ping was sent."""
-        self._record = self.guard.hand_over(transport, self, self.loop.time())
+        """True if writing was paused at any time since the last ping was sent."""
+        self._record = self.guard.upgrade(transport, self, self.loop.time())
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Gives the place among the open connections back."""
-        self.guard.leave(self._record)
+        """Removes the connection from the guard."""
+        self.guard.remove(self._record)
         super().connection_lost(exc)
 
     @property
-    def waits_for_us(self) -> bool:
-        """A WebSocket has no deadline but while it is being closed, and then it reads."""
+    def waiting_for_service(self) -> bool:
+        """Always False: a WebSocket has a deadline only while it is being closed, and then the service reads."""
         return False
 
     def refuse(self, refusal: Refusal) -> None:
-        """Answers a handshake that cannot be read, and ends the connection."""
-        self.guard.refused(refusal)
+        """Responds to an invalid handshake and closes the connection."""
+        self.guard.count_refusal(refusal)
         self.transport.write(response(problem(refusal), HEADERS))
         self.transport.close()
 
     def data_received(self, data: bytes) -> None:
-        """Takes what comes; a handshake that cannot be read is refused, where uvicorn would wait for ever."""
+        """Handles received data, and refuses an invalid handshake, for which uvicorn would wait forever."""
         self._record.received += len(data)
         if self._record.phase is Phase.LINGER:
             self._record.body += len(data)
@@ -69,7 +74,7 @@ class Socket(WebSocketsSansIOProtocol):
             self.refuse(Refusal.MALFORMED)
 
     def handle_connect(self, event: Request) -> None:
-        """Begins with the handshake."""
+        """Handles the handshake."""
         self.conn.max_message_size = EARLY_BYTES
         super().handle_connect(event)
         if hasattr(self, "scope"):
@@ -79,7 +84,10 @@ class Socket(WebSocketsSansIOProtocol):
         self.conn.max_message_size = size
 
     def handle_cont(self, event: Frame) -> None:
-        """Takes a fragment of a message. Small ones are joined: an object each would take forty times their bytes."""
+        """Appends a fragment of a message.
+
+        Small fragments are joined, because one object each would take up to forty times their size.
+        """
         if event.fin or len(event.data) > SMALL_FRAGMENT:
             super().handle_cont(event)
             return
@@ -90,10 +98,10 @@ class Socket(WebSocketsSansIOProtocol):
             frames.append(bytearray(event.data))
 
     def handle_parser_exception(self) -> None:
-        """Ends a connection that breaks the protocol, or whose message is too large (1009).
+        """Closes a connection that violates the protocol or whose message is too large (1009).
 
-        What it goes on sending is read and dropped for a while: uvicorn closes at once, which resets the connection,
-        and the peer loses the reason.
+        Data that the peer continues to send is read and discarded for a while. uvicorn would close at once,
+        which resets the connection, so that the peer would not receive the reason.
         """
         sent = self.conn.close_sent
         if sent is None:  # the handshake is not answered yet
@@ -102,9 +110,9 @@ class Socket(WebSocketsSansIOProtocol):
         self.queue.put_nowait({"type": "websocket.disconnect", "code": sent.code, "reason": sent.reason})
         self.transport.write(b"".join(self.conn.data_to_send()))
         self.close_sent = True
-        self.guard.enter(self._record, Phase.LINGER, self.loop.time())
-        # The application ends now; while there is such a timer, uvicorn does not close behind it. The
-        # guard does, sooner.
+        self.guard.set_phase(self._record, Phase.LINGER, self.loop.time())
+        # The application ends now. While this timer exists, uvicorn does not close the connection after the
+        # application. The guard closes it before the timer expires.
         self.close_timer = self.loop.call_later(LINGER_LONGEST_S, self.transport.close)
         if self.transport.can_write_eof():
             self.transport.write_eof()
@@ -113,8 +121,11 @@ class Socket(WebSocketsSansIOProtocol):
             self.transport.resume_reading()
 
     def handle_ping(self) -> None:
-        """Answers a ping; while the peer does not read, only the newest is remembered, as RFC 6455 (5.5.3) allows: each
-        would add an answer to what waits. What the peer sends is read all the same: its pongs show that it is there.
+        """Responds to a ping.
+
+        While the peer does not read, only the response to the newest ping is kept, as RFC 6455 (5.5.3) permits.
+        Otherwise, each ping would add a response to the write buffer. Data from the peer is still read, since its pongs
+        show that it is alive.
         """
         if not self._record.write_paused:
             super().handle_ping()
@@ -122,17 +133,17 @@ class Socket(WebSocketsSansIOProtocol):
         for frame in self.conn.data_to_send():
             if frame[:1] == PONG:
                 self._pong = frame
-            else:  # the answer to a close that came behind the pings; nothing may follow it
+            else:  # the response to a close frame after the pings; nothing may follow it
                 self._pong = b""
                 self.transport.write(frame)
 
     def pause_writing(self) -> None:
-        """Notes that the peer does not read as fast as it is written."""
+        """Notes that the peer reads more slowly than the service writes."""
         super().pause_writing()
         self._record.write_paused = self._fell_behind = True
 
     def resume_writing(self) -> None:
-        """Notes that the peer has read, and answers its newest ping."""
+        """Notes that the peer has caught up, and responds to its newest ping."""
         super().resume_writing()
         self._record.write_paused = False
         pong, self._pong = self._pong, b""
@@ -140,14 +151,15 @@ class Socket(WebSocketsSansIOProtocol):
             self.transport.write(pong)
 
     def send_keepalive_ping(self) -> None:
-        """Sends a ping to a peer that is silent."""
+        """Sends a keepalive ping to the peer."""
         self._fell_behind = self._record.write_paused
         super().send_keepalive_ping()
 
     def keepalive_timeout(self) -> None:
-        """Ends a connection that has not answered a ping, unless the ping may not have been read yet.
+        """Closes a connection that has not answered a ping, unless the peer may not have read the ping yet.
 
-        Megabytes may wait before it, in the kernel too. Where the peer does not read them, the guard ends it.
+        Megabytes may be queued before the ping, including in the kernel. If the peer does not read them, the guard
+        closes the connection.
         """
         if self._fell_behind and self.ping_timeout is not None:
             self._fell_behind = self._record.write_paused
@@ -157,7 +169,7 @@ class Socket(WebSocketsSansIOProtocol):
 
 
 def limit_messages(scope: Scope, size: int) -> None:
-    """Lets a WebSocket have messages of so many bytes, none larger; to be called before it is accepted."""
+    """Sets the maximum message size of a WebSocket to `size` bytes; call it before accepting the WebSocket."""
     extension = scope.get("extensions", {}).get(LIMIT)
-    if extension is not None:  # another server has a limit of its own
+    if extension is not None:  # other servers have their own limit
         extension["set"](size)

@@ -1,1 +1,1 @@
-"""The state of the service for operators: readiness, estimates, gauges for Prometheus, logs."""
+"""State of the service for operators: readiness, resource estimates, Prometheus gauges and logs."""

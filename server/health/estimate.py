@@ -1,4 +1,4 @@
-"""Estimates the memory and disk of a scene; the constants were measured by `scripts/bench memory`."""
+"""Estimates of the memory and disk needs of a scene; `scripts/bench memory` measured the constants."""
 
 from __future__ import annotations
 
@@ -8,40 +8,48 @@ from pathlib import Path
 from client.wire import RigModel
 from client.wire.estimate import SceneEstimate
 from scas4d_core.settings import Settings
-from server.problems import Problem, counted
+from server.problems import Problem, count_noun
 from server.settings import ServerSettings
 
 PROCESS = 280e6
-"""Interpreter, libraries and compiled kernels of a process that reconstructs or reads."""
+"""Bytes for the interpreter, libraries and compiled kernels of a worker or reader process."""
 PIXEL = 8
-"""Bytes for each pixel as it is sent: decoded with its mask, of the frame at work and the one before."""
+"""Bytes per input pixel: the decoded image and its mask, for the current and the previous frame."""
 SCALED_PIXEL = 112
-"""Bytes for each pixel after scaling: 3 or 4 channels of float32 in the target, the same and SSIM's two moments in the
-box around what moves, what stands alone; where there are no masks, targets and moments of two frames."""
+"""Bytes per scaled pixel for the images of an update.
+
+These are the target image (3 or 4 channels of float32) and the image of the static Gaussians. The box around the moving
+Gaussians has a copy of the target and SSIM's two moments. Without masks, the targets and moments of two frames are
+held.
+"""
 NOVEL_PIXEL = 38
-"""Bytes for each pixel after scaling where Gaussians may be born: what each camera says is new there (a picture, an
-error, five masks: 21), the distances to it in carving, or the parts of pictures that the born are fitted to (17)."""
+"""Additional bytes per scaled pixel if Gaussians may be added.
+
+Of these, 21 hold the new content that each camera detects (an image, an error map and five masks). The other 17 hold
+the distance maps for carving, or the image crops to which the new Gaussians are fitted.
+"""
 VOXELS = 150e6
-"""Bytes of the voxels in which a new thing is carved, and of the grid that separates objects, at their most."""
+"""Maximum bytes of the voxels for carving a new object and of the grid that separates objects."""
 GAUSSIAN = 2200
-"""Bytes for each Gaussian in the worker: state, layers, Adam, neighbours, and what a render needs."""
+"""Bytes per Gaussian in the worker: state, layers, Adam moments, neighbors and render buffers."""
 READ_GAUSSIAN = 500
-"""Bytes for each Gaussian in a reader."""
+"""Bytes per Gaussian in a reader."""
 STATE = 81
-"""Bytes on disk for each Gaussian and frame."""
+"""Bytes on disk per Gaussian and frame."""
 HISTORY = 28
-"""Bytes for each Gaussian and frame of a query: position and material rotation."""
+"""Bytes per Gaussian and frame of a query: position and material rotation."""
 LARGEST_BUDGET, MOST_PER_PIXEL = 100_000, 0.61
-"""Limits of `scas4d_core.first_frame.static_scene.budget`, for a picture without background."""
+"""Limits of `scas4d_core.first_frame.static_scene.budget` for an image without background."""
 BEARING = ("entering", "uncovered")
-"""Effects by which Gaussians are born, and which ask the cameras what is new."""
+"""Effects that add Gaussians and therefore search the images for new content."""
 SCALES = (0.75, 0.5, 0.35, 0.25, 0.125)
+"""Image scales that are suggested for a scene that does not fit, in order of preference."""
 
 CGROUP = Path("/sys/fs/cgroup/memory.max")
 
 
 def machine_mb() -> float:
-    """Returns the memory of the machine, or of the container if that is less."""
+    """Returns the memory of the machine in MB, or of the container if that is smaller."""
     total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     try:
         return min(total, int(CGROUP.read_text())) / 1e6
@@ -50,7 +58,7 @@ def machine_mb() -> float:
 
 
 def estimate(rig: RigModel, settings: Settings, server: ServerSettings, scale: float | None = None) -> SceneEstimate:
-    """Estimates a scene with this rig and these settings; `scale` takes the place of their image_scale."""
+    """Returns the estimate for a scene with this rig and these settings; `scale` overrides their image_scale."""
     scale = settings.scene.image_scale if scale is None else scale
     sizes = [camera.width * camera.height for camera in rig.cameras]
     pixels = sum(sizes)
@@ -80,11 +88,11 @@ def estimate(rig: RigModel, settings: Settings, server: ServerSettings, scale: f
     )
 
 
-def check(rig: RigModel, settings: Settings, server: ServerSettings) -> None:
-    """Refuses a scene that will not fit.
+def refuse_if_too_large(rig: RigModel, settings: Settings, server: ServerSettings) -> None:
+    """Checks that the estimated memory of a scene is within the limit.
 
     Raises:
-        Problem: 422, with the scale of the pictures that would.
+        Problem: 422 if it is not; the remedy suggests an image scale that fits, if there is one.
     """
     needed = estimate(rig, settings, server)
     if needed.memory_mb <= needed.limit_mb:
@@ -98,7 +106,7 @@ def check(rig: RigModel, settings: Settings, server: ServerSettings) -> None:
         422,
         f"the scene is estimated to take {needed.memory_mb:.0f} MB, more than {needed.limit_mb:.0f} MB",
         field="rig.cameras",
-        value=f"{counted(len(rig.cameras), 'camera')}, {needed.scaled_pixels} pixels, {needed.gaussians} Gaussians",
+        value=f"{count_noun(len(rig.cameras), 'camera')}, {needed.scaled_pixels} pixels, {needed.gaussians} Gaussians",
         remedy=remedy,
         estimate=needed.model_dump(),
     )

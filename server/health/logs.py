@@ -1,6 +1,6 @@
-"""Formats the logs of every process on stderr: one JSON object a line, or plain lines in a terminal.
+"""Log formatting for every process: one JSON object per line on stderr, or plain text in a terminal.
 
-No secret is ever in one.
+Log lines never contain secrets.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from datetime import UTC, datetime
 from typing import Any, Literal
 
 SECRETS = re.compile(r"(?i)(bearer\s+|scas4d\.(?:ticket|read)\.|(?:token|ticket)=)[^\s\"',;&]+")
-"""A secret follows these: it is hidden wherever it appears, because clients send it and any message may quote it."""
+"""Pattern of the text before a secret. Secrets are masked everywhere, since any log message may quote a request."""
 
 _PLAIN = frozenset(logging.makeLogRecord({}).__dict__) | {"message", "asctime", "taskName"}
 
 
-def hidden(text: str) -> str:
-    """Returns the text without tokens and tickets."""
+def redact(text: str) -> str:
+    """Returns the text with tokens and tickets masked."""
     return SECRETS.sub(r"\1***", text)
 
 
 class JsonFormatter(logging.Formatter):
-    """Formats records as JSON: time, level, logger, message, process, `extra`, and the traceback of an exception."""
+    """Formatter for JSON logs with time, level, logger, message, process id, `extra` fields and any traceback."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Returns one line."""
+        """Returns the record as one line of JSON."""
         entry: dict[str, Any] = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
@@ -38,37 +38,37 @@ class JsonFormatter(logging.Formatter):
         entry |= {name: value for name, value in record.__dict__.items() if name not in _PLAIN and name[0] != "_"}
         if record.exc_info:
             entry["exception"] = self.formatException(record.exc_info)
-        return hidden(json.dumps(entry, default=str))
+        return redact(json.dumps(entry, default=str))
 
 
 class TextFormatter(logging.Formatter):
-    """Formats records for people: the time of day, the level from warning on, the message."""
+    """Formatter for human readers: the time of day, the level if it is at least warning, and the message."""
 
     def __init__(self) -> None:
         super().__init__("%(asctime)s %(message)s", datefmt="%H:%M:%S")
 
     def format(self, record: logging.LogRecord) -> str:
-        """Returns a line, or several with a traceback."""
+        """Returns the record as one line, or as several lines if it has a traceback."""
         said = super().format(record)
         if record.levelno > logging.INFO:
             moment, _, message = said.partition(" ")
             said = f"{moment} {record.levelname.lower()}: {message}"
-        return hidden(said)
+        return redact(said)
 
 
-def told_to_people(record: logging.LogRecord) -> bool:
-    """Filters out requests that only read and succeed: a viewer or a waiting rig sends several a second."""
+def is_worth_showing(record: logging.LogRecord) -> bool:
+    """Returns False for successful read requests, since a viewer or a waiting rig sends several per second."""
     return record.levelno > logging.INFO or not (
         getattr(record, "method", "") in ("GET", "HEAD") and getattr(record, "status", 500) < 400
     )
 
 
 def configure(format: Literal["auto", "json", "text"] = "auto", level: str = "info") -> None:
-    """Sends all logs of this process to stderr. Called first thing in the service and in each of its processes.
+    """Configures logging of this process to stderr; call it first in the service and in each of its processes.
 
     Args:
-        format: json; text; auto: text where stderr is a terminal, else json.
-        level: debug, info, warning or error.
+        format: log format; auto selects text if stderr is a terminal, otherwise json.
+        level: lowest level that is logged: debug, info, warning or error.
     """
     text = format == "text" or (format == "auto" and sys.stderr.isatty())
     handler = logging.StreamHandler()
@@ -79,8 +79,8 @@ def configure(format: Literal["auto", "json", "text"] = "auto", level: str = "in
     for name in ("scas4d", "uvicorn"):
         logging.getLogger(name).setLevel(level.upper())
     if text:
-        handler.addFilter(told_to_people)
-        # Its start and end; the service says both itself.
+        handler.addFilter(is_worth_showing)
+        # uvicorn logs its start and end at INFO; the service logs both itself.
         logging.getLogger("uvicorn").setLevel(max(logging.WARNING, logging.getLogger("uvicorn").level))
-    # uvicorn logs a WebSocket with its whole address; `AccessLog` logs it without what follows the question mark.
+    # uvicorn logs the full URL of a WebSocket, including the query; `AccessLog` logs it without the query.
     logging.getLogger("uvicorn.error").addFilter(lambda record: '"WebSocket %s"' not in str(record.msg))

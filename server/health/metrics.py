@@ -1,4 +1,4 @@
-"""Gauges for Prometheus, read on request. `server.counters` has what is counted when it happens."""
+"""Prometheus gauges, computed on each scrape; `server.counters` has the counters and histograms."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from server.settings import ServerSettings
 
 
 class ServiceState:
-    """Gauges of a service: scenes, queues, subscribers, disk, and the cluster if it has one."""
+    """Collector of the service's gauges: scenes, queues, subscribers, disk, and the cluster if there is one."""
 
     def __init__(
         self,
@@ -32,7 +32,7 @@ class ServiceState:
         self.cluster = cluster
 
     def collect(self) -> Iterator[Metric]:
-        """Yields the gauges as they are now."""
+        """Yields the gauges with their current values."""
         by_state = GaugeMetricFamily("scas4d_scenes", "Scenes by state.", labels=["state"])
         for state in SceneState:
             by_state.add_metric([state.value], sum(status.state == state for status in self.scenes))
@@ -66,19 +66,29 @@ class ServiceState:
             help = "From the start of the service until its kernels were warmed up."
             yield GaugeMetricFamily("scas4d_ready_after_seconds", help, value=self.ready_after)
         if self.cluster is not None:
-            yield from of_cluster(self.cluster)
+            yield from cluster_gauges(self.cluster)
 
 
-def of_cluster(cluster: Cluster) -> Iterator[Metric]:
-    """Yields the gauges of nodes, as far as the head of the cluster lists them, and what this service has there."""
-    yield GaugeMetricFamily("scas4d_cluster_up", "1 while the head of the cluster answers.", value=cluster.answers)
-    nodes = cluster.nodes if cluster.answers else []
+def cluster_gauges(cluster: Cluster) -> Iterator[Metric]:
+    """Yields the gauges of the cluster's nodes and of this service's processes on them.
+
+    The gauges of nodes have no samples while the head of the cluster does not respond.
+    """
+    yield GaugeMetricFamily(
+        "scas4d_cluster_up", "1 while the head of the cluster answers.", value=cluster.head_responds
+    )
+    nodes = cluster.nodes if cluster.head_responds else []
     for name, help, field, unit in (
         ("scas4d_node_up", "1 for a node that is alive, 0 for one that was lost lately.", "alive", 1),
         ("scas4d_node_cpus", "CPUs of a node.", "cpus", 1),
-        ("scas4d_node_cpus_taken", "CPUs of a node that scenes take, by their estimates.", "cpus_taken", 1),
+        ("scas4d_node_cpus_reserved", "CPUs of a node that scenes take, by their estimates.", "cpus_reserved", 1),
         ("scas4d_node_memory_bytes", "Memory of a node.", "memory_mb", 1e6),
-        ("scas4d_node_memory_taken_bytes", "Memory that scenes take, by their estimates.", "memory_taken_mb", 1e6),
+        (
+            "scas4d_node_memory_reserved_bytes",
+            "Memory that scenes take, by their estimates.",
+            "memory_reserved_mb",
+            1e6,
+        ),
     ):
         gauge = GaugeMetricFamily(name, help, labels=["node", "host"])
         for node in nodes:

@@ -1,4 +1,4 @@
-"""Counts processes that the kernel has killed for want of memory."""
+"""Count of processes that the kernel killed because memory was exhausted."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def oom_kills() -> int:
-    """Returns how many processes of this control group the kernel has killed for want of memory."""
+    """Returns the number of processes that the out-of-memory killer has killed in this control group."""
     try:
         for line in Path("/proc/self/cgroup").read_text().splitlines():
             number, _, path = line.partition("::")
@@ -14,6 +14,6 @@ def oom_kills() -> int:
                 events = Path("/sys/fs/cgroup") / path.lstrip("/") / "memory.events"
                 counts = dict(pair.split() for pair in events.read_text().splitlines())
                 return int(counts.get("oom_kill", 0))
-    except (OSError, ValueError):  # no control groups here
+    except (OSError, ValueError):  # this system has no control groups
         pass
     return 0

@@ -1,7 +1,8 @@
-"""Readiness of the service: a process beside it has the kernels compiled that the cache lacks.
+"""Readiness of the service, which depends on the compilation of its kernels.
 
-The service is ready once those of a first frame are compiled; those of updates follow while frame 0 runs. The process
-that answers requests never loads them. Workers find the compiled kernels in the cache, and wait for those of updates.
+A separate process compiles the kernels that are not in the cache. The service is ready when the kernels for a first
+frame are compiled; the kernels for updates are compiled while frame 0 is reconstructed. The process that handles
+requests never loads the kernels. Workers load them from the cache and wait for those for updates.
 """
 
 from __future__ import annotations
@@ -18,58 +19,59 @@ from typing import Any
 from scas4d_core.errors import message_of
 from server.messages import Stop
 from server.problems import Problem
-from server.processes.placement import AnyProcess, Placement, end_with_parent
+from server.processes.placement import Placement, ProcessHandle, end_with_parent
 from server.settings import ServerSettings
 
 log = logging.getLogger("scas4d.server")
 
-SAY_S = 5.0
-"""Between two lines of the log on how many kernels are compiled."""
+LOG_S = 5.0
+"""Seconds between two log lines about the progress of the compilation."""
 
 
 @dataclass(frozen=True)
-class Compiled:
-    """So many of the kernels of a first frame are compiled."""
+class CompileProgress:
+    """Progress of the compilation: `done` of `total` kernels for a first frame are compiled."""
 
     done: int
     total: int
 
 
 @dataclass(frozen=True)
-class WarmedUp:
-    """The kernels of a first frame are compiled; or not, for the reason in `fault`."""
+class WarmUpResult:
+    """Result of compiling the kernels for a first frame; `fault` is the reason of a failure, else None."""
 
     fault: str | None = None
 
 
 def main(spec: None, connection: Connection[Any, Any]) -> None:
-    """Runs the process: it warms up, reports, has the kernels of updates compiled, and ends."""
+    """Entry point of the process: compiles the kernels for a first frame, reports, then compiles those for updates."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     end_with_parent()
     with contextlib.suppress(EOFError, OSError):
         try:
-            from scas4d_core.warm_up import warm_up, warm_up_updates  # in this process only: the service stays light
+            from scas4d_core.warm_up import warm_up, warm_up_updates  # keeps the service itself small
 
-            warm_up(lambda done, total: connection.send(Compiled(done, total)))
-            connection.send(WarmedUp())
+            warm_up(lambda done, total: connection.send(CompileProgress(done, total)))
+            connection.send(WarmUpResult())
             warm_up_updates()
         except (EOFError, OSError):
             raise
         except Exception as error:
             log.exception("the kernels could not be warmed up")
-            connection.send(WarmedUp(f"{type(error).__name__}: {message_of(error)}"))
-        connection.recv()  # until it is asked to end, or until the service is gone: by then the report is read
+            connection.send(WarmUpResult(f"{type(error).__name__}: {message_of(error)}"))
+        connection.recv()  # returns on a request to exit or when the service is gone; the report has been read by then
     os._exit(0)
 
 
 class Readiness:
-    """Warms up the kernels from the start of the service on.
+    """Readiness state of the service, which starts to warm up the kernels on construction.
 
     Attributes:
-        after: seconds from the start to being ready; None: not yet.
-        fault: why the kernels could not be warmed up. The service works without, its first frame says what is wrong.
-        compiled: how many kernels of a first frame are compiled, and of how many; None: not known, or all were.
-        stopping: the service ends.
+        after: seconds from the start until the service was ready; None if it is not ready yet.
+        fault: reason why the kernels could not be warmed up, or None. The service continues without the warm-up, and
+            its first frame reports the error.
+        compiled: progress of the compilation of the kernels for a first frame; None if it is not known.
+        stopping: whether the service is shutting down.
     """
 
     def __init__(self, settings: ServerSettings, placement: Placement) -> None:
@@ -77,12 +79,12 @@ class Readiness:
         self.after: float | None = None
         self.fault: str | None = None
         self.stopping = False
-        self.compiled: Compiled | None = None
-        self._said = self._began
-        self._process: AnyProcess | None = None
+        self.compiled: CompileProgress | None = None
+        self._logged_at = self._began
+        self._process: ProcessHandle | None = None
         if settings.warm_up:
             log.info("warming up the kernels; the first time they are compiled, which takes half a minute")
-            self._process = placement.start(main, None, self._received, self._ended)
+            self._process = placement.start(main, None, self._on_message, self._on_end)
         else:
             self.after = 0.0
 
@@ -90,7 +92,7 @@ class Readiness:
         """Returns the seconds from the start until the service was ready.
 
         Raises:
-            Problem: 503, not ready; `warming_up` says that it will be, without anybody's doing.
+            Problem: 503 if the service is not ready; `warming_up` is true if it will become ready on its own.
         """
         waited = time.monotonic() - self._began
         if self.stopping:
@@ -118,17 +120,17 @@ class Readiness:
         return self.after
 
     async def stop(self) -> None:
-        """Ends the process."""
+        """Stops the process that compiles the kernels."""
         self.stopping = True
         if self._process is not None:
             process, self._process = self._process, None
-            await process.stop(0.0)  # it compiles, or has nothing left to do
+            await process.stop(0.0)  # no grace period: the process holds no data to save
 
-    def _received(self, message: Compiled | WarmedUp) -> None:
-        if isinstance(message, Compiled):
+    def _on_message(self, message: CompileProgress | WarmUpResult) -> None:
+        if isinstance(message, CompileProgress):
             self.compiled = message
-            if (now := time.monotonic()) - self._said >= SAY_S:
-                self._said = now
+            if (now := time.monotonic()) - self._logged_at >= LOG_S:
+                self._logged_at = now
                 log.info("compiling kernels: %d of %d", message.done, message.total)
             return
         if message.fault is None:
@@ -138,7 +140,7 @@ class Readiness:
         if self._process is not None:
             self._process.send(Stop())
 
-    def _ended(self, how: str) -> None:
+    def _on_end(self, how: str) -> None:
         self._process = None
         if self.after is None and self.fault is None:
             self.fault = str(how)

@@ -1,1 +1,1 @@
-"""Middleware of all requests: authentication, permissions, origins, body limits, compression, errors."""
+"""Middleware for all requests: authentication, permissions, origin checks, body limits, compression and errors."""

@@ -1,7 +1,8 @@
-"""Authentication of requests and WebSockets: tokens, tickets, links to share, and what each of them may do.
+"""Authentication of requests and WebSockets by tokens, tickets and share links.
 
-The token of the service may do everything, the token for reading may read, and a link to share may read one scene until
-it ends. A link is signed with the token of the service and kept nowhere: another token ends all links.
+The token of the service permits everything, a read-only token permits reading, and a share link permits reading one
+scene until the link expires. A share link is signed with the token of the service and is not stored; changing the token
+revokes all links.
 """
 
 from __future__ import annotations
@@ -17,17 +18,18 @@ from server import problems
 from server.http.origin import check_origin
 from server.http.permissions import ALL, PERMISSION, Permission, check
 from server.http.sharing import Sharing
-from server.http.tickets import SUBPROTOCOL, Tickets, accepting, take_offered
+from server.http.tickets import SUBPROTOCOL, Tickets, accept_subprotocol, take_offered
 from server.problems import Problem
 from server.settings import ServerSettings, is_loopback
 
 PROBES = frozenset({"/health/live", "/health/ready", "/health/ingest"})
-"""What an orchestrator asks: it has no token, and learns how many scenes there are."""
+"""Paths that an orchestrator probes without a token; their responses reveal at most the number of scenes."""
 OPEN = PROBES | {"/", "/viewer", "/favicon.ico", "/docs", "/redoc", "/openapi.json"}
-"""Paths that hold no data and need no token: probes, the page that asks for one, and the description of the API."""
+"""Paths that expose no data and need no token: the probes, the viewer page and the description of the API."""
 OPEN_FOLDERS = ("/viewer/", "/docs/")
-"""Files of the viewer's page, and of the API's reference."""
+"""Path prefixes of the files of the viewer page and the API reference, which need no token."""
 IN_URL = frozenset({"token", "access_token", "api_key", "ticket", "authorization"})
+"""Query parameters that are rejected because their value may be a secret."""
 
 HEADERS = {
     "X-Content-Type-Options": "nosniff",
@@ -36,12 +38,14 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
-"""Headers of every answer that has no others: no site shows the service in a frame, no browser guesses another kind of
-file, no cache answers with what was true a frame ago."""
+"""Default headers of every response.
+
+They prevent framing by other sites, guessing of media types by browsers, and responses from outdated caches.
+"""
 
 
 class AuthMiddleware:
-    """Authenticates requests and WebSockets; refuses others with a problem document."""
+    """Middleware that authenticates requests and WebSockets and rejects all others with a problem document."""
 
     def __init__(self, app: ASGIApp, settings: ServerSettings, tickets: Tickets) -> None:
         self.app = app
@@ -49,20 +53,20 @@ class AuthMiddleware:
         self.origins = settings.allowed_origins
         self.tickets = tickets
         secret = settings.secret
-        self._token = None if secret is None else _hashed(secret)
+        self._token = None if secret is None else _hash(secret)
         self._sharing = None if secret is None else Sharing(secret)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Passes the request on, or answers it."""
+        """Passes the request on if it is authorized; otherwise responds with a problem document."""
         if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
             return
-        sending = _with_headers(send) if scope["type"] == "http" else _answering(scope, receive, send)
+        sending = _add_headers(send) if scope["type"] == "http" else _answer_closed_handshake(scope, receive, send)
         try:
-            self._reached(scope)
+            self._check_reachable(scope)
             check_origin(scope, self.hosts, self.origins)
-            _printable(scope)
-            self._no_token_in_url(scope)
+            _refuse_control_characters(scope)
+            self._refuse_token_in_url(scope)
             if scope["type"] == "websocket":
                 sending = self._ticket(scope, sending)
             elif not self._is_open(scope):
@@ -72,8 +76,8 @@ class AuthMiddleware:
             return
         await self.app(scope, receive, sending)
 
-    def _reached(self, scope: Scope) -> None:
-        """Without a token only this machine reaches the service, directly or through a trusted proxy on it."""
+    def _check_reachable(self, scope: Scope) -> None:
+        """Checks that a service without a token is used only from this machine, directly or through a local proxy."""
         ends = [scope[end][0] for end in ("server", "client") if scope.get(end)]
         if self._token is None and not all(map(is_loopback, ends)):
             raise Problem(
@@ -83,7 +87,7 @@ class AuthMiddleware:
                 remedy="set a token and start it anew, or listen at 127.0.0.1",
             )
 
-    def _no_token_in_url(self, scope: Scope) -> None:
+    def _refuse_token_in_url(self, scope: Scope) -> None:
         query = scope.get("query_string", b"").decode("latin-1")
         for name, _ in parse_qsl(query, keep_blank_values=True):
             if name.lower() in IN_URL:
@@ -97,17 +101,21 @@ class AuthMiddleware:
 
     def _is_open(self, scope: Scope) -> bool:
         path = scope["path"]
-        # CORS asks with OPTIONS, without the token, what it may send; Origin was checked above.
+        # A CORS preflight uses OPTIONS without a token; its Origin was checked above.
         return path in OPEN or path.startswith(OPEN_FOLDERS) or (scope["method"] == "OPTIONS" and bool(self.origins))
 
     def _bearer(self, scope: Scope) -> Permission:
-        """Returns what the bearer may do."""
+        """Returns the permission of the bearer.
+
+        Raises:
+            Problem: 401 if the token is missing, wrong or expired.
+        """
         if self._token is None or self._sharing is None:
             return ALL
         given = Headers(scope=scope).getlist("authorization")
         scheme, _, token = given[0].partition(" ") if len(given) == 1 else ("", "", "")
         if scheme.lower() == "bearer":
-            if hmac.compare_digest(_hashed(token.strip()), self._token):  # hashed first: the length reveals nothing
+            if hmac.compare_digest(_hash(token.strip()), self._token):  # the hash hides the length
                 return ALL
             if (permission := self._sharing.read(token.strip())) is not None:
                 return permission
@@ -125,7 +133,7 @@ class AuthMiddleware:
         scope[PERMISSION] = permission
 
     def _ticket(self, scope: Scope, send: Send) -> Send:
-        """Checks the ticket of a WebSocket, or its token; returns the sender that accepts it."""
+        """Checks the ticket or token of a WebSocket, and returns the sender that accepts the ticket's subprotocol."""
         shown = take_offered(scope)
         if self._token is not None and len(shown) == 1:
             permission = self.tickets.redeem(shown[0].removeprefix(SUBPROTOCOL))
@@ -140,11 +148,14 @@ class AuthMiddleware:
         else:
             permission = self._bearer(scope)
         self._permit(permission, scope)
-        return accepting(shown[0], send) if shown else send
+        return accept_subprotocol(shown[0], send) if shown else send
 
 
-def _printable(scope: Scope) -> None:
-    """Refuses control characters in a path: a route may match before a line's end, and a rule behind it not."""
+def _refuse_control_characters(scope: Scope) -> None:
+    """Rejects control characters in a path.
+
+    A route pattern may match a path that ends with a line break when a permission rule does not.
+    """
     if any(character < " " or character == "\x7f" for character in scope["path"]):
         raise Problem(
             400,
@@ -155,11 +166,11 @@ def _printable(scope: Scope) -> None:
         )
 
 
-def _hashed(token: str) -> bytes:
+def _hash(token: str) -> bytes:
     return hashlib.sha256(token.encode("utf-8", "surrogateescape")).digest()
 
 
-def _with_headers(send: Send) -> Send:
+def _add_headers(send: Send) -> Send:
     async def sending(message: Message) -> None:
         if message["type"] == "http.response.start":
             headers = MutableHeaders(scope=message)
@@ -170,8 +181,11 @@ def _with_headers(send: Send) -> Send:
     return sending
 
 
-def _answering(scope: Scope, receive: Receive, send: Send) -> Send:
-    """Answers with a document if the application closes a WebSocket before accepting it: none is at the path."""
+def _answer_closed_handshake(scope: Scope, receive: Receive, send: Send) -> Send:
+    """Returns a sender that responds with a 404 problem if the application closes a WebSocket before accepting it.
+
+    In that case, there is no WebSocket at the path.
+    """
     accepted = False
 
     async def sending(message: Message) -> None:

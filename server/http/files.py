@@ -1,4 +1,4 @@
-"""Files of the pages that the service has: each under a policy, with a tag, and none but those."""
+"""Static files of the service's pages, served with a content security policy and an entity tag."""
 
 from __future__ import annotations
 
@@ -8,17 +8,19 @@ from pathlib import Path
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 
-from server.http.unchanging import is_known
+from server.http.immutable import matches_etag
 from server.problems import Problem
 
 MEDIA_TYPES = {".html": "text/html", ".css": "text/css", ".js": "text/javascript", ".svg": "image/svg+xml"}
 
 
-def policy(**changes: str) -> dict[str, str]:
-    """Returns the headers of a page's files: nothing from other sites, no inline script or style, no frames.
+def security_headers(**changes: str) -> dict[str, str]:
+    """Returns the security headers of a page's files.
+
+    The default policy forbids content from other sites, inline scripts and styles, and framing.
 
     Args:
-        changes: of directives of the policy, with underscores in place of hyphens.
+        changes: directives of the policy to override, with underscores instead of hyphens.
     """
     directives = {"default_src": "'none'"}
     directives |= dict.fromkeys(("script_src", "style_src", "img_src", "connect_src"), "'self'")
@@ -27,23 +29,29 @@ def policy(**changes: str) -> dict[str, str]:
         "Content-Security-Policy": "; ".join(f"{name.replace('_', '-')} {value}" for name, value in directives.items()),
         "X-Content-Type-Options": "nosniff",
         "Referrer-Policy": "no-referrer",
-        "Cache-Control": "no-cache",  # asked for again each time, by its tag: an update of the service shows at once
+        "Cache-Control": "no-cache",  # revalidated by ETag, so updates appear at once
     }
 
 
-def served(request: Request, files: Mapping[str, Path], name: str, headers: Mapping[str, str], page: str) -> Response:
-    """Answers with one of the files, 304 where the asker has it already.
+def serve_file(
+    request: Request, files: Mapping[str, Path], name: str, headers: Mapping[str, str], page: str
+) -> Response:
+    """Returns a response with one of the files, or 304 if the client has it already.
 
     Args:
-        files: those that there are, by name. name: of the file. page: where they are shown, for the remedy.
+        request: the request.
+        files: paths of the available files, keyed by name.
+        name: name of the requested file.
+        headers: headers of the response.
+        page: path of the page that uses the files, quoted in the remedy.
 
     Raises:
-        Problem: 404, it is not one of them.
+        Problem: 404 if there is no such file.
     """
     file = files.get(name)
     if file is None:
         raise Problem(404, f"the page has no file {name!r}", field="name", value=name, remedy=f"open {page}")
     answer = FileResponse(file, media_type=MEDIA_TYPES[file.suffix], headers=dict(headers), stat_result=file.stat())
-    if is_known(request, tag := answer.headers["etag"]):
+    if matches_etag(request, tag := answer.headers["etag"]):
         return Response(status_code=304, headers={**headers, "ETag": tag})
     return answer

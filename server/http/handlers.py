@@ -1,4 +1,4 @@
-"""Exception handlers: every error of the application is answered as a problem document."""
+"""Exception handlers that turn every error of the application into a problem document."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from starlette.routing import compile_path
 
 from client.wire import ProblemDetails
 from server.http import validation
-from server.problems import SERVICE_FAULT, Problem, answer, document
+from server.problems import SERVICE_FAULT, Problem, openapi_document, problem_response
 
 JSON = re.compile(r"application/([\w.-]+\+)?json")
 
 log = logging.getLogger("scas4d.server")
 
 
-def install(app: FastAPI) -> None:
-    """Makes the application answer every error as a problem document."""
+def install_handlers(app: FastAPI) -> None:
+    """Installs the exception handlers in the application."""
 
     async def from_problem(request: Request, error: Exception) -> Response:
         assert isinstance(error, HTTPException)
         if isinstance(error, Problem):
-            return answer(error.document, error.headers)
+            return problem_response(error.document, error.headers)
         headers = dict(error.headers or {})
-        if error.status_code == 405:  # Starlette names the methods of the first route at this address only
-            headers["Allow"] = ", ".join(methods(request.app, request.url.path)) or headers.get("Allow", "")
-        return answer(_of_framework(request, error.status_code, str(error.detail), headers), headers)
+        if error.status_code == 405:  # Starlette lists only the methods of the first route with this path
+            headers["Allow"] = ", ".join(allowed_methods(request.app, request.url.path)) or headers.get("Allow", "")
+        return problem_response(_framework_problem(request, error.status_code, str(error.detail), headers), headers)
 
     async def from_validation(request: Request, error: Exception) -> Response:
         assert isinstance(error, RequestValidationError)
@@ -41,41 +41,43 @@ def install(app: FastAPI) -> None:
             problem = Problem(
                 415, f"the body is {given}", field="Content-Type", value=given, remedy="send application/json"
             )
-            return answer(problem.document)
+            return problem_response(problem.document)
         route = request.scope.get("route")
         body = getattr(getattr(route, "body_field", None), "field_info", None)
-        problem = validation.invalid(
+        problem = validation.validation_problem(
             first,
             model=getattr(body, "annotation", None),
             others=len(error.errors()) - 1,
             text=error.body if isinstance(error.body, str) else None,
         )
-        return answer(problem.document)
+        return problem_response(problem.document)
 
     async def from_fault(request: Request, error: Exception) -> Response:
         log.exception("%s %s failed", request.method, request.url.path, exc_info=error)
-        return answer(Problem(500, f"the service failed: {type(error).__name__}", remedy=SERVICE_FAULT).document)
+        return problem_response(
+            Problem(500, f"the service failed: {type(error).__name__}", remedy=SERVICE_FAULT).document
+        )
 
-    app.openapi = lambda: document(app)  # type: ignore[method-assign]
+    app.openapi = lambda: openapi_document(app)  # type: ignore[method-assign]
     app.add_exception_handler(HTTPException, from_problem)
     app.add_exception_handler(RequestValidationError, from_validation)
     app.add_exception_handler(Exception, from_fault)
 
 
-def methods(app: FastAPI, path: str) -> list[str]:
-    """Returns the methods that the OpenAPI document has for an address."""
+def allowed_methods(app: FastAPI, path: str) -> list[str]:
+    """Returns the HTTP methods that the OpenAPI document lists for a path."""
     return sorted(
         {
             method.upper()
-            for template, operations in document(app)["paths"].items()
+            for template, operations in openapi_document(app)["paths"].items()
             if compile_path(template)[0].match(path)
             for method in operations
         }
     )
 
 
-def _of_framework(request: Request, status: int, detail: str, headers: Mapping[str, str]) -> ProblemDetails:
-    """The document where Starlette or FastAPI refuses: no such path, no such method, a body that is no form."""
+def _framework_problem(request: Request, status: int, detail: str, headers: Mapping[str, str]) -> ProblemDetails:
+    """Returns the problem document for an error raised by Starlette or FastAPI, such as an unknown path or method."""
     field = value = None
     remedy = "see /openapi.json"
     if status == 404:

@@ -1,4 +1,4 @@
-"""Middlewares of every request: the access log, the size of the body, HEAD, compression."""
+"""Middleware for every request: access log, body size limit, HEAD requests and compression."""
 
 from __future__ import annotations
 
@@ -12,26 +12,29 @@ from server import problems
 from server.problems import Problem
 
 HEAD = "scas4d.head"
-"""In the scope of a HEAD that is answered as GET: a long body need not be read."""
+"""Key in the scope of a HEAD request that is handled as GET, so that routes need not read a long body."""
 
 access = logging.getLogger("scas4d.access")
 
-LEAST_BYTES = 1000
-"""Shorter answers gain nothing."""
+MIN_BYTES = 1000
+"""Minimum size of a response in bytes for compression; shorter responses do not benefit."""
 LEVEL = 4
-"""Of gzip: 9, Starlette's own, takes several times as long for a few percent."""
-PACKED = (*DEFAULT_EXCLUDED_CONTENT_TYPES, "application/octet-stream", "application/vnd.numpy.npz")
-"""Media types that are compressed already, or that gain little: pictures, and floats."""
+"""Compression level of gzip; Starlette's default of 9 takes several times as long and saves only a few percent."""
+COMPRESSED_TYPES = (*DEFAULT_EXCLUDED_CONTENT_TYPES, "application/octet-stream", "application/vnd.numpy.npz")
+"""Media types that are not compressed, because they are compressed already (images) or gain little (floats)."""
 
 
 class AccessLog:
-    """Logs a line a request and a line a WebSocket: method, path (no query), status, seconds, bytes; no headers."""
+    """Middleware that logs one line per request and per WebSocket.
+
+    A line has the method, path, status, duration, sizes and client address, but no query and no headers.
+    """
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Passes the request on and logs how it ended."""
+        """Handles the request and logs its outcome."""
         if scope["type"] not in ("http", "websocket") or not access.isEnabledFor(logging.INFO):
             await self.app(scope, receive, send)
             return
@@ -57,7 +60,7 @@ class AccessLog:
             await self.app(scope, receiving, sending)
         finally:
             method = scope.get("method", "WEBSOCKET")
-            # As it was sent: percent-encoded, so that no path breaks a line.
+            # Percent-encoded as it was sent, so that a path cannot contain a line break.
             path = scope.get("raw_path", scope["path"].encode()).decode("latin-1")
             known = {
                 "method": method,
@@ -72,20 +75,23 @@ class AccessLog:
 
 
 class BodyLimit:
-    """Answers 413 to a body above `limit` bytes: by its announced length at once, without one while it is read."""
+    """Middleware that responds with 413 to a body of more than `limit` bytes.
+
+    A body with a Content-Length is rejected at once, and any other body while it is being read.
+    """
 
     def __init__(self, app: ASGIApp, limit: int) -> None:
         self.app = app
         self.limit = limit
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Passes the request on with its body counted."""
+        """Passes the request on and counts the bytes of its body."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
         announced = dict(scope["headers"]).get(b"content-length", b"0")
         if not announced.isdigit() or int(announced) > self.limit:
-            await problems.answer(self._problem(announced.decode("latin-1")).document)(scope, receive, send)
+            await problems.problem_response(self._problem(announced.decode("latin-1")).document)(scope, receive, send)
             return
         read = 0
 
@@ -109,19 +115,19 @@ class BodyLimit:
         )
 
 
-def compressed(app: ASGIApp) -> GZipMiddleware:
-    """Wraps an application: JSON and the page's files go compressed to those who accept gzip."""
-    return GZipMiddleware(app, LEAST_BYTES, LEVEL, exclude_content_types=PACKED)
+def compress_responses(app: ASGIApp) -> GZipMiddleware:
+    """Returns the application wrapped in gzip compression of JSON and page files, for clients that accept it."""
+    return GZipMiddleware(app, MIN_BYTES, LEVEL, exclude_content_types=COMPRESSED_TYPES)
 
 
 class HeadAsGet:
-    """Answers HEAD as GET would be answered, without the body (RFC 9110, 9.3.2)."""
+    """Middleware that responds to HEAD as to GET, but without the body (RFC 9110, 9.3.2)."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Passes the request on as GET, and drops the body of its answer."""
+        """Passes a HEAD request on as GET and drops the body of the response."""
         if scope["type"] != "http" or scope["method"] != "HEAD":
             await self.app(scope, receive, send)
             return

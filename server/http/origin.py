@@ -1,9 +1,9 @@
-"""Checks of Host and Origin: no page of another site uses the service.
+"""Checks of the Host and Origin headers, which prevent pages of other sites from using the service.
 
-Any web page can send requests to a server on the loopback of the machine that shows it. Two headers, which no page can
-forge, show it: `Origin` (and `Sec-Fetch-Site`, where a picture or a form leaves Origin out) names the page that asks;
-`Host` is the name under which the service was found, and a name that is not ours was pointed at this machine (DNS
-rebinding), which makes the foreign page look like one of the service itself.
+Any web page can send requests to a server on the loopback interface of the machine on which it is displayed. Two
+headers, which no page can forge, reveal such requests. `Origin` names the site of the requesting page; `Sec-Fetch-Site`
+serves the same purpose for images and forms, which omit Origin. `Host` is the name under which the client found the
+service. An unknown name indicates DNS rebinding, which makes a foreign page look like a page of the service.
 """
 
 from __future__ import annotations
@@ -22,39 +22,40 @@ DEFAULT_PORTS = {"http": 80, "https": 443, "ws": 80, "wss": 443}
 
 
 def check_origin(scope: Scope, allowed_hosts: Sequence[str], allowed_origins: Sequence[str]) -> None:
-    """Checks Host and Origin of a request.
+    """Checks the Host and Origin headers of a request.
 
     Args:
-        scope: of ASGI, http or websocket.
-        allowed_hosts: names (`host` or `host:port`) besides the loopback's and the address that was connected to.
-        allowed_origins: of other sites, `scheme://host[:port]`.
+        scope: ASGI scope of type http or websocket.
+        allowed_hosts: names (`host` or `host:port`) allowed in addition to loopback names and the address of the
+            connection.
+        allowed_origins: origins of other allowed sites, `scheme://host[:port]`.
 
     Raises:
-        Problem: 400 without a Host that can be read, 421 for a Host that is not ours, 403 for a foreign page.
+        Problem: 400 for a missing or invalid Host, 421 for an unknown Host, 403 for a page of another site.
     """
     headers = Headers(scope=scope)
-    host = _the_host(headers)
-    if not _is_ours(scope, host, allowed_hosts):
+    host = _host(headers)
+    if not _is_allowed_host(scope, host, allowed_hosts):
         raise Problem(
             421,
-            "the service does not go by this name",
+            "the service is not known by this name",
             field="Host",
             value=host,
             remedy="address it as 127.0.0.1 or localhost, or add the name to SCAS4D_ALLOWED_HOSTS",
         )
     origin = headers.get("origin")
     if origin is not None:
-        if not (_same(origin, host) or origin.lower() in {name.lower() for name in allowed_origins}):
-            raise _foreign("Origin", origin)
+        if not (_is_same_origin(origin, host) or origin.lower() in {name.lower() for name in allowed_origins}):
+            raise _foreign_problem("Origin", origin)
         return
     site = headers.get("sec-fetch-site", "none")
     opened = headers.get("sec-fetch-mode") == "navigate" and scope.get("method") in ("GET", "HEAD")
     framed = headers.get("sec-fetch-dest", "document") != "document"
     if site not in ("none", "same-origin") and (not opened or framed):
-        raise _foreign("Sec-Fetch-Site", site)
+        raise _foreign_problem("Sec-Fetch-Site", site)
 
 
-def _foreign(field: str, value: str) -> Problem:
+def _foreign_problem(field: str, value: str) -> Problem:
     return Problem(
         403,
         "pages of other sites may not use the service",
@@ -64,9 +65,9 @@ def _foreign(field: str, value: str) -> Problem:
     )
 
 
-def _the_host(headers: Headers) -> str:
+def _host(headers: Headers) -> str:
     hosts = headers.getlist("host")
-    if len(hosts) != 1 or split(hosts[0]) is None:
+    if len(hosts) != 1 or split_authority(hosts[0]) is None:
         raise Problem(
             400,
             "a request has one Host header, host or host:port",
@@ -77,8 +78,11 @@ def _the_host(headers: Headers) -> str:
     return hosts[0]
 
 
-def split(authority: str) -> tuple[str, int | None] | None:
-    """Splits `host[:port]` into host (lower case, IPv6 without brackets, no final dot) and port, if it can."""
+def split_authority(authority: str) -> tuple[str, int | None] | None:
+    """Splits `host[:port]` into host and port; returns None if it is invalid.
+
+    The host is in lower case, without the brackets of IPv6 addresses and without a final dot.
+    """
     try:
         parts = urlsplit(f"//{authority}")
         host, port = parts.hostname, parts.port
@@ -89,13 +93,15 @@ def split(authority: str) -> tuple[str, int | None] | None:
     return host.rstrip("."), port
 
 
-def _is_ours(scope: Scope, authority: str, allowed: Sequence[str]) -> bool:
-    origin = split(authority)
+def _is_allowed_host(scope: Scope, authority: str, allowed: Sequence[str]) -> bool:
+    origin = split_authority(authority)
     assert origin is not None
     host, port = origin
     if is_loopback(host) or (scope.get("server") and _is_address(host) and host == scope["server"][0]):
         return True
-    return any(other is not None and other[0] == host and other[1] in (None, port) for other in map(split, allowed))
+    return any(
+        other is not None and other[0] == host and other[1] in (None, port) for other in map(split_authority, allowed)
+    )
 
 
 def _is_address(host: str) -> bool:
@@ -105,10 +111,13 @@ def _is_address(host: str) -> bool:
         return False
 
 
-def _same(origin: str, authority: str) -> bool:
-    """Returns True if the page comes from the request's host and port; a proxy with TLS changes the scheme."""
+def _is_same_origin(origin: str, authority: str) -> bool:
+    """Returns whether the page has the same host and port as the request.
+
+    The scheme is not compared, because a proxy that terminates TLS changes it.
+    """
     scheme, _, rest = origin.partition("://")
-    page, asked = split(rest), split(authority)
+    page, asked = split_authority(rest), split_authority(authority)
     default = DEFAULT_PORTS.get(scheme.lower())
     if page is None or asked is None or default is None:
         return False

@@ -1,4 +1,4 @@
-"""Permissions: what the bearer of a token may do. Those who may only read change nothing and send no frames."""
+"""Permissions of token bearers; a read-only bearer cannot change anything or send frames."""
 
 from __future__ import annotations
 
@@ -10,13 +10,19 @@ from starlette.types import Scope
 from server.problems import Problem
 
 READS = re.compile(r"/v1/(tickets|estimate|scenes/[^/]+/(render|tracks/query))")
-"""Addresses whose POST changes nothing: the question is in the body."""
+"""Paths for which POST is a read operation with the query in the body."""
 READ_SOCKETS = re.compile(r"/v1/scenes/[^/]+/stream")
-"""WebSockets that only send."""
+"""Paths of WebSockets that only send data to the client."""
 
 
 class Permission(NamedTuple):
-    """A bearer may change things, or only read; all scenes, or one; until `end`, seconds since the epoch, or always."""
+    """Permission of a bearer.
+
+    Attributes:
+        write: whether the bearer may write; otherwise it may only read.
+        scene: id of the only accessible scene; None for all scenes.
+        end: expiry in seconds since the epoch; None if the permission does not expire.
+    """
 
     write: bool = False
     scene: str | None = None
@@ -25,14 +31,15 @@ class Permission(NamedTuple):
 
 ALL = Permission(write=True)
 PERMISSION = "scas4d.permission"
-"""Where the scope of a request has it."""
+"""Key of the permission in the scope of a request."""
 
 
 def check(permission: Permission, scope: Scope) -> None:
-    """Refuses what the bearer may not do.
+    """Checks that the permission allows the request.
 
     Raises:
-        Problem: 403; 404 for another scene than the one that may be read: the bearer does not learn whether it exists.
+        Problem: 403 for a write with a read-only permission; 404 for a path outside the permitted scene. A 404 does not
+            reveal whether another scene exists.
     """
     path, reading = scope["path"], _reads(scope)
     if permission.scene is not None:

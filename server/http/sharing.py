@@ -1,7 +1,8 @@
-"""Tokens that may only read, for a time: of one scene, as links to share have them, or of all.
+"""Read-only tokens with an expiry time, for one scene (as in share links) or for all scenes.
 
-Such a token is `scas4d.read.<scene or *>.<end>.<signature>`: the end in seconds since the epoch, the signature an
-HMAC-SHA256 of what stands before it. Nothing is kept: another token of the service ends them all.
+A token has the form `scas4d.read.<scene or *>.<end>.<signature>`. The end is in seconds since the epoch, and the
+signature is an HMAC-SHA256 of the text before it. The service stores no tokens; changing its own token revokes them
+all.
 """
 
 from __future__ import annotations
@@ -15,11 +16,11 @@ from server.problems import Problem
 PREFIX = "scas4d.read."
 ALL_SCENES = "*"
 LONGEST_SECONDS = 10 * 366 * 86_400
-"""Ten years: a monitor's token."""
+"""Longest validity of a token, ten years, for the tokens of monitoring systems."""
 
 
 class Sharing:
-    """Makes and reads tokens that may only read.
+    """Issuer and verifier of read-only tokens.
 
     Args:
         secret: the token of the service.
@@ -29,14 +30,17 @@ class Sharing:
         self._signer = Signer(secret, "scas4d tokens that may only read")
 
     def issue(self, scene: str | None, end: int) -> str:
-        """Makes a token for a scene, or for all, that ends then; `end` in seconds since the epoch."""
+        """Returns a token for a scene, or for all scenes if `scene` is None.
+
+        The token expires at `end`, in seconds since the epoch.
+        """
         return self._signer.sign(f"{PREFIX}{ALL_SCENES if scene is None else scene}.{end}")
 
     def read(self, token: str) -> Permission | None:
-        """Returns what the bearer of a token may do; None where it was not made here.
+        """Returns the permission of a token's bearer, or None if the token was not signed by this service.
 
         Raises:
-            Problem: 401, it has ended.
+            Problem: 401 if the token has expired.
         """
         text = self._signer.read(token)
         if text is None:
@@ -45,9 +49,9 @@ class Sharing:
         if int(end) <= time.time():
             raise Problem(
                 401,
-                "the link, or the token for reading, has ended",
+                "the link or read-only token has expired",
                 field="Authorization",
-                remedy="ask for a new link where you got it: POST /v1/shares, or scas4d scenes share",
+                remedy="ask its sender for a new link: POST /v1/shares, or scas4d scenes share",
                 headers={"WWW-Authenticate": 'Bearer realm="scas4d", error="invalid_token"'},
             )
         return Permission(scene=None if scene == ALL_SCENES else scene, end=int(end))

@@ -1,6 +1,7 @@
-"""Signs short texts with the token of the service: what it handed out is known again, by every service of that token.
+"""Signatures of short texts with the token of the service.
 
-Nothing is kept: another token ends all that was signed.
+Every service with the same token can verify a signed text. Nothing is stored, so changing the token invalidates all
+signatures.
 """
 
 from __future__ import annotations
@@ -11,10 +12,11 @@ import hmac
 
 
 class Signer:
-    """Signs by HMAC-SHA256.
+    """Signer and verifier of texts that uses HMAC-SHA256.
 
     Args:
-        secret: the token of the service. purpose: what is signed for one is no proof for another, nor of the token.
+        secret: the token of the service.
+        purpose: purpose of the signatures; a signature for one purpose is invalid for any other.
 
     >>> signer = Signer("a-token-of-the-service", "an example")
     >>> signer.read(signer.sign("a.b"))
@@ -27,11 +29,11 @@ class Signer:
         self._key = hmac.digest(secret.encode(), purpose.encode(), hashlib.sha256)
 
     def sign(self, text: str) -> str:
-        """Appends the signature, after a dot."""
+        """Returns the text followed by a dot and its signature."""
         return f"{text}.{self._signature(text)}"
 
     def read(self, signed: str) -> str | None:
-        """Returns the text; None where it was not signed by this token for this purpose."""
+        """Returns the text without its signature, or None if the signature is invalid."""
         text, _, signature = signed.encode("utf-8", "replace").decode().rpartition(".")
         return text if hmac.compare_digest(signature.encode(), self._signature(text).encode()) else None
 

@@ -1,8 +1,9 @@
-"""Tickets: a browser cannot send a bearer token with a WebSocket; it fetches a ticket and offers it as a subprotocol.
+"""Tickets with which browsers authenticate WebSockets.
 
-A ticket lives for seconds and opens one WebSocket at each service. It is offered as `scas4d.ticket.<ticket>` in
-Sec-WebSocket-Protocol, never in a URL, where it would end up in logs and histories. It is signed with the token, so
-that every service of a cluster knows it: a browser behind a load balancer does not choose which of them it reaches.
+A browser cannot send a bearer token with a WebSocket, so it fetches a ticket and offers it as a subprotocol. A ticket
+is valid for some seconds and opens one WebSocket per service. It is offered as `scas4d.ticket.<ticket>` in
+Sec-WebSocket-Protocol and never in a URL, which would end up in logs and browser histories. Tickets are signed with the
+token, so that every service of a cluster accepts them: a load balancer decides which service a browser reaches.
 """
 
 from __future__ import annotations
@@ -16,23 +17,23 @@ from starlette.types import Message, Scope, Send
 from server.http.permissions import ALL, Permission
 from server.http.sharing import ALL_SCENES
 from server.http.signing import Signer
-from server.problems import Problem, counted
+from server.problems import Problem, count_noun
 
 SUBPROTOCOL = "scas4d.ticket."
 
 TICKET_SECONDS = 30.0
-"""Life of a ticket: a browser opens its WebSocket at once, on a slow link within seconds."""
+"""Lifetime of a ticket in seconds; even on a slow link, a browser opens its WebSocket within a few seconds."""
 MOST_TICKETS = 1024
-"""Tickets that are used in that time: some 100 bytes each, and no page needs more than a few."""
+"""Maximum number of tickets used during one lifetime. Each takes about 100 bytes, and a page needs only a few."""
 ALWAYS, WRITE, READ = "0", "w", "r"
 
 
 class Tickets:
-    """Issues tickets, and knows those that were used.
+    """Issuer of tickets, which remembers the tickets that have been used.
 
     Args:
-        secret: the token of the service; None: it has none, and nobody else knows its tickets.
-        clock: seconds since the epoch. Machines of a cluster agree on them to within seconds.
+        secret: the token of the service. If it is None, only this service accepts its tickets.
+        clock: returns seconds since the epoch; the clocks of a cluster must agree to within a few seconds.
     """
 
     def __init__(self, secret: str | None = None, clock: Callable[[], float] = time.time) -> None:
@@ -41,30 +42,30 @@ class Tickets:
         self._used: dict[str, float] = {}
 
     def issue(self, permission: Permission = ALL) -> str:
-        """Issues a new ticket; its bearer may do what the bearer of the token may that asked for it."""
+        """Returns a new ticket that carries the permission of the client that requested it."""
         may = WRITE if permission.write else READ
         scene, end = permission.scene or ALL_SCENES, str(permission.end or ALWAYS)
         until = self._clock() + TICKET_SECONDS
         return self._signer.sign(".".join((secrets.token_urlsafe(12), may, scene, end, str(round(until)))))
 
     def redeem(self, ticket: str) -> Permission | None:
-        """Uses a ticket; returns what its bearer may do, None if it was not issued, is too old or was used before.
+        """Uses a ticket and returns its permission, or None if it is unknown, expired or already used.
 
         Raises:
-            Problem: 429, as many were used lately as may be.
+            Problem: 429 if `MOST_TICKETS` were used recently.
         """
         text, now = self._signer.read(ticket), self._clock()
         if text is None:
             return None
         number, may, rest = text.split(".", 2)
-        scene, end, until = rest.rsplit(".", 2)  # a share may be asked for any word as scene
+        scene, end, until = rest.rsplit(".", 2)  # the scene of a share may be any string, even with dots
         self._used = {used: kept for used, kept in self._used.items() if kept > now}
         if float(until) <= now or number in self._used:
             return None
         if len(self._used) >= MOST_TICKETS:
             raise Problem(
                 429,
-                f"{counted(len(self._used), 'ticket')} of at most {MOST_TICKETS} were used within {TICKET_SECONDS:g} s",
+                f"{count_noun(len(self._used), 'ticket')} of at most {MOST_TICKETS} were used in {TICKET_SECONDS:g} s",
                 field="tickets",
                 value=MOST_TICKETS,
                 remedy=f"wait {TICKET_SECONDS:g} s",
@@ -75,7 +76,7 @@ class Tickets:
 
 
 def take_offered(scope: Scope) -> list[str]:
-    """Takes the tickets out of the subprotocols that a WebSocket offers, and returns those subprotocols."""
+    """Removes the tickets from the subprotocols that a WebSocket offers, and returns them."""
     offered = scope.get("subprotocols", [])
     shown = [name for name in offered if name.startswith(SUBPROTOCOL)]
     scope["subprotocols"] = [name for name in offered if name not in shown]
@@ -85,10 +86,10 @@ def take_offered(scope: Scope) -> list[str]:
     return shown
 
 
-def accepting(subprotocol: str, send: Send) -> Send:
-    """A sender that accepts the ticket's subprotocol where the application accepts none.
+def accept_subprotocol(subprotocol: str, send: Send) -> Send:
+    """Returns a sender that accepts the ticket's subprotocol if the application accepts none.
 
-    A browser gives up a WebSocket that accepts none of the subprotocols it offered.
+    A browser closes a WebSocket if the server accepts none of the offered subprotocols.
     """
 
     async def sending(message: Message) -> None:

@@ -1,6 +1,6 @@
-"""Turns validation errors of pydantic into problems: field, value, and the remedy.
+"""Conversion of pydantic's validation errors into problems with field, value and remedy.
 
-Pydantic's messages name the fault ("Input should be less than or equal to 100"); the remedies are made here.
+Pydantic's messages describe the fault ("Input should be less than or equal to 100"); this module adds the remedy.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 
 from scas4d_core.errors import InputError
-from server.problems import Problem, counted
+from server.problems import Problem, count_noun
 
 MISSING = "nothing"
-"""The value of a field that is not there."""
+"""Text quoted as the value of a missing field."""
 EXCERPT = 20
-"""Characters on either side of the place where JSON breaks."""
+"""Number of characters quoted on either side of a JSON syntax error."""
 
 BOUNDS = {"gt": "above", "ge": "of at least", "lt": "below", "le": "of at most"}
 UNION = re.compile(r"constrained-\w+|(function|literal|lax-or-strict|nullable).*|.*\[.*\]|str|int|float|[A-Z]\w+")
-"""Parts of pydantic's `loc` that name a member of a union, not a field."""
+"""Pattern of the parts of pydantic's `loc` that name a member of a union and not a field."""
 
 KINDS = {
     "int": "a whole number",
@@ -37,10 +37,10 @@ KINDS = {
     "model": "an object: {…}",
     "mapping": "an object: {…}",
 }
-"""The right type for a type error, by the first word of the error's name."""
+"""Description of the expected type, keyed by the first word of the name of a type error."""
 
 
-def invalid(
+def validation_problem(
     error: Mapping[str, Any],
     *,
     model: object = None,
@@ -49,18 +49,21 @@ def invalid(
     text: str | None = None,
     schema: str = "the schema is at /openapi.json",
 ) -> Problem:
-    """Makes the problem for one error of a validation.
+    """Returns the problem for one validation error.
 
     Args:
-        error: as in `ValidationError.errors()`.
-        model: what was validated against, without the first part of `loc` where that says "body": it knows the names
-            of fields. prefix: of the field in the answer. others: how many errors there are besides.
-        text: what was sent, where it may be broken JSON. schema: where all fields are listed.
+        error: an entry of `ValidationError.errors()`.
+        model: the model that was validated, which is used to suggest field names. It corresponds to `loc` without a
+            leading "body".
+        prefix: prefix of the field name in the problem.
+        others: number of further errors.
+        text: the text that was sent, if it may be malformed JSON.
+        schema: a reference to the list of all fields, for the remedy.
     """
     loc = tuple(part for part in error["loc"] if isinstance(part, int) or not UNION.fullmatch(part))
-    fault, ours = said_by(error)
+    fault, ours = fault_and_remedy(error)
     if error["type"] == "json_invalid":
-        return _broken_json(error, loc, prefix, text)
+        return _json_problem(error, loc, prefix, text)
     field = ".".join(str(part) for part in ((prefix,) if prefix else ()) + loc) or "message"
     value = MISSING if error["type"] in ("missing", "union_tag_not_found") else error.get("input")
     inner = loc[1:] if loc[:1] == ("body",) else loc
@@ -74,14 +77,16 @@ def invalid(
     )
 
 
-def first_of(error: ValidationError, *, model: object = None, prefix: str = "", text: str | None = None) -> Problem:
-    """Makes the problem for the first error of a failed validation."""
+def first_problem(
+    error: ValidationError, *, model: object = None, prefix: str = "", text: str | None = None
+) -> Problem:
+    """Returns the problem for the first error of a failed validation."""
     faults = error.errors()
-    return invalid(faults[0], model=model, prefix=prefix, others=len(faults) - 1, text=text)
+    return validation_problem(faults[0], model=model, prefix=prefix, others=len(faults) - 1, text=text)
 
 
 def fields_of(model: object, loc: tuple[int | str, ...] = ()) -> list[str]:
-    """Returns the names of the fields of the model at `loc` inside another; none if there is no model."""
+    """Returns the field names of the model at `loc` inside `model`, or an empty list if there is none."""
     here = list(_models(model))
     for part in loc:
         if isinstance(part, str):
@@ -91,14 +96,14 @@ def fields_of(model: object, loc: tuple[int | str, ...] = ()) -> list[str]:
 
 
 def _models(annotation: object) -> Iterator[type[BaseModel]]:
-    """Yields the models that a type is made of."""
+    """Yields the models that occur in a type annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for inner in get_args(annotation):
         yield from _models(inner)
 
 
-def _broken_json(error: Mapping[str, Any], loc: tuple[Any, ...], prefix: str, text: str | None) -> Problem:
+def _json_problem(error: Mapping[str, Any], loc: tuple[Any, ...], prefix: str, text: str | None) -> Problem:
     at = loc[-1] if loc and isinstance(loc[-1], int) else None
     sent = text if text is not None else str(error.get("input", ""))
     value = sent if at is None else sent[max(0, at - EXCERPT) : at + EXCERPT]
@@ -107,15 +112,15 @@ def _broken_json(error: Mapping[str, Any], loc: tuple[Any, ...], prefix: str, te
     field = prefix or (str(loc[0]) if loc else "message")
     return Problem(
         422,
-        f"the {field} is no JSON: {str(reason)[:1].lower()}{str(reason)[1:]}{place}",
+        f"the {field} is not valid JSON: {str(reason)[:1].lower()}{str(reason)[1:]}{place}",
         field=field,
         value=value or MISSING,
         remedy="send well-formed JSON: names and text in double quotes, no comma behind the last one, no comments",
     )
 
 
-def said_by(error: Mapping[str, Any]) -> tuple[str, str]:
-    """Returns fault and remedy of one error; no remedy if pydantic found it and not a validator of this project."""
+def fault_and_remedy(error: Mapping[str, Any]) -> tuple[str, str]:
+    """Returns fault and remedy of an error; the remedy is empty for errors that pydantic itself raised."""
     raised = error.get("ctx", {}).get("error") if error["type"] == "value_error" else None
     if isinstance(raised, InputError):
         return raised.fault, raised.remedy
@@ -142,7 +147,7 @@ def _remedy(error: Mapping[str, Any], field: str, known: list[str], schema: str)
     if kind in ("too_short", "too_long", "string_too_short", "string_too_long"):
         count = context.get("min_length", context.get("max_length"))
         what = "character" if kind.startswith("string") else "item"
-        return f"give at {'least' if 'min_length' in context else 'most'} {counted(int(count), what)}"
+        return f"give at {'least' if 'min_length' in context else 'most'} {count_noun(int(count), what)}"
     if kind == "string_pattern_mismatch":
         return f"give text that matches {context['pattern']}"
     if kind == "value_error":

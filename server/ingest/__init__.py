@@ -1,1 +1,1 @@
-"""Receives frames: checks, writes, orders and acknowledges them."""
+"""Frame ingest: receives, validates, stores, orders and acknowledges frames."""

@@ -1,4 +1,4 @@
-"""Accepts frames: admits them in order, journals them, acknowledges them. An acknowledged frame is on disk."""
+"""Acceptance of frames in order: admission, journal entry and acknowledgement. Acknowledged frames are on disk."""
 
 from __future__ import annotations
 
@@ -12,42 +12,49 @@ from client.wire import FrameHead, FrameReceipt, FrameState, SceneCreate, SceneS
 from scas4d_core.cameras import Rig
 from server import counters
 from server.hub import Publisher
-from server.problems import Problem, counted
+from server.problems import Problem, count_noun
 from server.settings import ServerSettings
 from server.storage.events import FrameAccepted, FramesSkipped, Hashes
-from server.storage.frame_table import LOST
+from server.storage.frame_table import RECORD_LOST
 from server.storage.ledger import SceneLog, frame_identity
 from server.updates.updates import Updates
 
 T = TypeVar("T")
 
-MOST_SOCKETS = 64
-"""WebSockets that send frames to one scene: one a camera where each has a sender of its own."""
-LONGEST_S = 60.0
-"""Seconds that a sender is asked to wait at most: a prediction further ahead is a guess."""
-PAUSED_S = 5.0
-"""A sender to a paused scene asks again after so long: nobody knows when a person resumes it."""
+MAX_SOCKETS = 64
+"""Maximum number of WebSockets that send frames to one scene; there may be one per camera."""
+MAX_RETRY_S = 60.0
+"""Maximum retry delay in seconds sent to clients, because longer predictions are unreliable."""
+PAUSED_RETRY_S = 5.0
+"""Retry delay in seconds for a paused scene, whose resumption cannot be predicted."""
 
 
 @dataclass(eq=False)
-class Received:
-    """Files of a frame, or of one camera, on disk. `file` is None where they were only compared with a known frame."""
+class ReceivedFiles:
+    """Received files of a frame or of one camera.
+
+    `file` names their record on disk, or is None if they were only hashed for comparison with a known frame.
+    """
 
     hashes: Hashes
     file: str | None
     size: int
     kept: bool = False
-    """An event names the record: it must not be removed."""
+    """Whether an event references the record, so that it must not be removed."""
 
 
 @dataclass(frozen=True, eq=False)
 class IngestRules:
-    """Rules by which a scene accepts frames, the service's defaults filled in.
+    """Rules for accepting frames of a scene, with the service's defaults filled in.
 
     Attributes:
-        frames_per_second: gives a frame without a time its time. queue_frames: frames acknowledged and not finished, at
-            most. when_full: refuse the next frame, or skip those that wait. minimum_cameras: that a frame needs.
-        part_seconds: a frame sent camera by camera is closed so long after its first part; None: never.
+        rig: cameras of the scene.
+        frames_per_second: frame rate that determines the time of frames sent without one.
+        queue_frames: maximum number of acknowledged frames that are not finished.
+        when_full: whether a full queue refuses the next frame or skips the waiting ones.
+        minimum_cameras: minimum number of cameras per frame.
+        open_frame_seconds: seconds after its first part at which a frame sent camera by camera is closed, or None for
+            no deadline.
     """
 
     rig: Rig
@@ -55,11 +62,11 @@ class IngestRules:
     queue_frames: int
     when_full: Literal["refuse", "skip"]
     minimum_cameras: int
-    part_seconds: float | None
+    open_frame_seconds: float | None
 
     @classmethod
     def of(cls, request: SceneCreate, settings: ServerSettings) -> IngestRules:
-        """Takes the rules from the request of a scene, and what it leaves open from the settings of the service."""
+        """Returns the rules of a scene's request, with missing values taken from the service settings."""
         rig, ingest = request.rig.rig(), request.ingest
         least = ingest.minimum_cameras
         return cls(
@@ -68,17 +75,19 @@ class IngestRules:
             queue_frames=ingest.queue_frames or settings.queue_frames,
             when_full=ingest.when_full,
             minimum_cameras=-(-len(rig) // 2) if least is None else min(least, len(rig)),
-            part_seconds=ingest.part_seconds,
+            open_frame_seconds=ingest.open_frame_seconds,
         )
 
 
 class Ingest:
-    """Admits and acknowledges the frames of one scene, one at a time; uploads arrive side by side.
+    """Admission and acknowledgement of one scene's frames, one at a time; uploads may run concurrently.
 
     Args:
-        log, rules, publisher: of the scene.
-        updates: of the scene; they begin with the frames that are accepted here.
-        can_begin: called before the first frame is accepted; raises Problem where the scene cannot begin.
+        log: journal, ledger and frame log of the scene.
+        rules: rules for accepting frames.
+        updates: updates of the scene, triggered when a frame is accepted.
+        publisher: publisher of the scene's events.
+        can_begin: called before the first frame is accepted; raises Problem if the scene cannot start.
     """
 
     def __init__(
@@ -97,19 +106,22 @@ class Ingest:
         self._publisher = publisher
         self._can_begin = can_begin
         self._sockets = 0
-        self._coming: dict[int, asyncio.Event] = {}
-        """Whole frames that are being received, and the event of their end: the next may arrive meanwhile."""
+        self._receiving: dict[int, asyncio.Event] = {}
+        """Complete frames being received, each with an event that is set at its end.
 
-    def join(self) -> None:
-        """Counts one more WebSocket that sends frames; to be followed by `leave` when it ends.
+        The next frame may already arrive before then.
+        """
+
+    def add_socket(self) -> None:
+        """Registers a WebSocket that sends frames; call `remove_socket` when it closes.
 
         Raises:
-            Problem: 429, as many send as may.
+            Problem: 429, the maximum number of WebSockets is reached.
         """
-        if self._sockets >= MOST_SOCKETS:
+        if self._sockets >= MAX_SOCKETS:
             raise Problem(
                 429,
-                f"{counted(self._sockets, 'WebSocket')} send frames to this scene already",
+                f"{count_noun(self._sockets, 'WebSocket')} send frames to this scene already",
                 field="id",
                 value=self.ledger.scene,
                 remedy="close another one, or send over HTTP",
@@ -117,64 +129,64 @@ class Ingest:
             )
         self._sockets += 1
 
-    def leave(self) -> None:
-        """Counts a WebSocket that has ended."""
+    def remove_socket(self) -> None:
+        """Unregisters a WebSocket that has closed."""
         self._sockets -= 1
 
-    # Whole frames.
+    # Complete frames.
 
-    def expects(self, head: FrameHead) -> bool:
-        """Returns whether a whole frame has to be written; False for a known one, whose content is only compared.
+    def needs_files(self, head: FrameHead) -> bool:
+        """Returns whether a complete frame must be written; a known frame is only compared.
 
         Raises:
-            Problem: the frame will be refused, whatever it holds.
+            Problem: the frame will be refused regardless of its content.
         """
         next_frame = self.ledger.next_frame
         if head.index < next_frame:
             return False
         awaited = next_frame
-        while awaited in self._coming:
+        while awaited in self._receiving:
             awaited += 1
         if head.index == next_frame:
             self.admit(head.index, self.time_of(head.index, head.time))
         elif head.index > awaited:
-            raise self.gap(head.index)
-        else:  # the frames before it are arriving: it is checked when they are here
-            self.refuse_if_it_cannot_go_on()
+            raise self.gap_problem(head.index)
+        else:  # earlier frames are still arriving; this one is checked after them
+            self.refuse_if_stopped()
         return True
 
-    def is_coming(self, index: int) -> bool:
-        """True while the whole frame is being received."""
-        return index in self._coming
+    def is_receiving(self, index: int) -> bool:
+        """Returns whether the complete frame is being received."""
+        return index in self._receiving
 
-    def coming(self, index: int) -> None:
-        """Notes that the frame is being received, until `came`."""
-        self._coming.setdefault(index, asyncio.Event())
+    def begin_receiving(self, index: int) -> None:
+        """Marks the frame as being received until `end_receiving` is called."""
+        self._receiving.setdefault(index, asyncio.Event())
 
-    def came(self, index: int) -> None:
-        """Notes that the frame is accepted or refused."""
-        if (event := self._coming.pop(index, None)) is not None:
+    def end_receiving(self, index: int) -> None:
+        """Marks the frame as accepted or refused and wakes up the waiting next frame."""
+        if (event := self._receiving.pop(index, None)) is not None:
             event.set()
 
-    async def accept(self, head: FrameHead, received: Received) -> FrameReceipt:
-        """Acknowledges a frame whose pictures are on disk, and queues it; a known frame gets its receipt again.
+    async def accept(self, head: FrameHead, received: ReceivedFiles) -> FrameReceipt:
+        """Acknowledges and queues a frame whose images are on disk; a known frame gets the same receipt again.
 
         Raises:
-            Problem: 409 for a gap, for other content under a known index and for a failed scene; 422 for a time that
-                does not rise; 429 when the queue is full; 507 when the disk is.
+            Problem: 409 for a gap, for different content under a known index and for a failed scene; 422 for a time
+                that does not increase; 429 if the queue is full; 507 if the disk is full.
         """
-        while (before := self._coming.get(head.index - 1)) is not None and head.index > self.ledger.next_frame:
+        while (before := self._receiving.get(head.index - 1)) is not None and head.index > self.ledger.next_frame:
             await before.wait()
-        return await uncancelled(self._accept(head, received))
+        return await shield_and_wait(self._accept(head, received))
 
-    async def _accept(self, head: FrameHead, received: Received) -> FrameReceipt:
+    async def _accept(self, head: FrameHead, received: ReceivedFiles) -> FrameReceipt:
         seconds = self.time_of(head.index, head.time)
         identity = frame_identity(received.hashes, seconds)
         async with self.log.lock:
             if head.index < self.ledger.next_frame:
-                return self._known(head.index, identity)
+                return self._existing_receipt(head.index, identity)
             self.admit(head.index, seconds)
-            if received.file is None:  # the frame was known when it arrived, and a scene forgets none
+            if received.file is None:  # only a known frame has no file, and a scene never forgets one
                 raise AssertionError(f"frame {head.index} was not written")
             event = FrameAccepted(index=head.index, time=seconds, identity=identity, files=(received.file,))
             receipt = await self.acknowledge(event)
@@ -185,37 +197,37 @@ class Ingest:
         return receipt
 
     async def acknowledge(self, event: FrameAccepted) -> FrameReceipt:
-        """Journals a frame, and those that are skipped for it; the log's lock is held.
+        """Journals a frame and the frames skipped for it; the caller must hold the log's lock.
 
         Raises:
-            Problem: 507.
+            Problem: 507, the disk is full.
         """
-        skipped = self._skipped_for(event.index)
+        skipped = self._skip_event(event.index)
         await self.log.append(*skipped, event)
         for index in (index for one in skipped for index in one.frames):
-            self.ended(index)
+            self.publish_ended(index)
         counters.FRAMES.labels("acknowledged").inc()
-        if self.ledger.frames[event.index].finished:  # it comes before the first frame
-            self.ended(event.index)
+        if self.ledger.frames[event.index].finished:  # it precedes the reconstruction's first frame
+            self.publish_ended(event.index)
         receipt = self.ledger.frames[event.index].receipt
         assert receipt is not None
         return receipt
 
-    def ended(self, index: int) -> None:
-        """Publishes that a frame has ended without the worker: it was skipped, is missing, or comes too early."""
-        self._publisher.finished(self.ledger.frames[index].report)
+    def publish_ended(self, index: int) -> None:
+        """Publishes a frame that finished without an update: skipped, missing or before the first frame."""
+        self._publisher.publish_frame(self.ledger.frames[index].report)
 
-    # Rules: they change nothing.
+    # Rules, which do not change any state.
 
     def time_of(self, index: int, time: float | None) -> float:
-        """Returns the seconds of a frame: as given, or by the scene's frame rate."""
+        """Returns the time of a frame in seconds: the given one, or one computed from the scene's frame rate."""
         return index / self.rules.frames_per_second if time is None else time
 
     def admit(self, index: int, seconds: float) -> None:
-        """Refuses a frame that cannot be the next."""
-        self.refuse_if_it_cannot_go_on()
+        """Raises Problem if a frame cannot be accepted as the next one."""
+        self.refuse_if_stopped()
         if index != self.ledger.next_frame:
-            raise self.gap(index)
+            raise self.gap_problem(index)
         if index in self.ledger.open:
             raise Problem(
                 409,
@@ -227,10 +239,10 @@ class Ingest:
             )
         self.check_time(index, seconds)
         if not self.has_room():
-            raise self.full(index)
+            raise self.queue_full_problem(index)
 
-    def refuse_if_it_cannot_go_on(self) -> None:
-        """Refuses any frame of a scene that cannot begin, 422, or has failed or is archived, 409."""
+    def refuse_if_stopped(self) -> None:
+        """Raises Problem for a scene that cannot start (422), has failed or is archived (409)."""
         if self.ledger.next_frame == 0:
             self._can_begin()
         self.refuse_if_failed()
@@ -240,24 +252,24 @@ class Ingest:
                 "the scene is archived",
                 field="id",
                 value=self.ledger.scene,
-                remedy='take that back: PATCH /v1/scenes/ID with {"archived": false}, or scas4d scenes restore ID',
+                remedy='unarchive it: PATCH /v1/scenes/ID with {"archived": false}, or scas4d scenes restore ID',
             )
 
     def refuse_if_failed(self) -> None:
-        """Refuses, 409, what is asked of a scene that has failed."""
+        """Raises Problem (409) if the scene has failed."""
         if self.ledger.fatal is not None:
             raise Problem(
                 409,
                 f"the scene has failed: {self.ledger.fatal}",
                 field="id",
                 value=self.ledger.scene,
-                remedy="begin its reconstruction anew: PUT …/reconstructions/"
-                f"{self.ledger.reconstruction + 1}, or delete the scene and create it anew",
+                remedy="restart its reconstruction: PUT …/reconstructions/"
+                f"{self.ledger.reconstruction + 1}, or delete and recreate the scene",
                 state=SceneState.FAILED,
             )
 
-    def gap(self, index: int) -> Problem:
-        """Makes the answer to a frame that is not the next: 409, with the expected index."""
+    def gap_problem(self, index: int) -> Problem:
+        """Returns the 409 response for a frame that is not the next, with the expected index."""
         expected = self.ledger.next_frame
         return Problem(
             409,
@@ -269,7 +281,7 @@ class Ingest:
         )
 
     def check_time(self, index: int, seconds: float) -> None:
-        """Refuses a time that is not after the last one: 422."""
+        """Raises Problem (422) if a frame's time is not after the previous one."""
         before = self.ledger.last_time()
         if not (math.isfinite(seconds) and (before is None or seconds > before)):
             raise Problem(
@@ -281,25 +293,25 @@ class Ingest:
             )
 
     def has_room(self) -> bool:
-        """True where the queue accepts one more frame, if need be by skipping others."""
+        """Returns whether the queue accepts another frame, if necessary by skipping others."""
         if self.ledger.unfinished < self.rules.queue_frames:
             return True
         return self.rules.when_full == "skip" and bool(self._skippable())
 
-    def full(self, index: int) -> Problem:
-        """Makes the answer of a full queue: 429, with the predicted time until the frame at work ends.
+    def queue_full_problem(self, index: int) -> Problem:
+        """Returns the 429 response for a full queue, with the predicted time until the current update ends.
 
-        ``Retry-After`` holds whole seconds, the document's ``retry_after_seconds`` the same unrounded.
+        ``Retry-After`` is in whole seconds; ``retry_after_seconds`` in the body has millisecond precision.
         """
         ledger = self.ledger
         if ledger.paused:
-            seconds, remedy = PAUSED_S, f"let the scene go on: POST /v1/scenes/{ledger.scene}/resume"
+            seconds, remedy = PAUSED_RETRY_S, f"let the scene go on: POST /v1/scenes/{ledger.scene}/resume"
         else:
-            seconds = min(self.updates.clock.remaining(), LONGEST_S)
-            remedy = f"send the same frame again in {counted(math.ceil(seconds), 'second')}"
+            seconds = min(self.updates.clock.remaining(), MAX_RETRY_S)
+            remedy = f"send the same frame again in {count_noun(math.ceil(seconds), 'second')}"
         return Problem(
             429,
-            f"{counted(ledger.unfinished, 'frame')} of at most {self.rules.queue_frames} wait already"
+            f"{count_noun(ledger.unfinished, 'frame')} of at most {self.rules.queue_frames} wait already"
             + (" and the scene is paused" if ledger.paused else ""),
             field="n",
             value=index,
@@ -309,23 +321,23 @@ class Ingest:
             retry_after_seconds=round(seconds, 3),
         )
 
-    def _skipped_for(self, index: int) -> list[FramesSkipped]:
-        """Returns the event that skips waiting frames to make room for a frame, where the queue is full."""
+    def _skip_event(self, index: int) -> list[FramesSkipped]:
+        """Returns the event that skips waiting frames in favour of a new one if the queue is full."""
         if self.ledger.unfinished < self.rules.queue_frames:
             return []
         return [FramesSkipped(frames=self._skippable(), by=index)]
 
     def _skippable(self) -> tuple[int, ...]:
-        """Lists the waiting frames; not the one that somebody asked to begin with."""
+        """Returns the waiting frames, except the explicitly requested first frame of a reconstruction."""
         ledger = self.ledger
         asked_for = None if ledger.begun is None or ledger.committed else ledger.begun.index
         return tuple(index for index in ledger.waiting() if index != asked_for)
 
-    def _known(self, index: int, identity: str) -> FrameReceipt:
-        """Returns the receipt of a known frame, if it has the same content.
+    def _existing_receipt(self, index: int, identity: str) -> FrameReceipt:
+        """Returns the receipt of a known frame with the same content.
 
         Raises:
-            Problem: 409, it has not.
+            Problem: 409, the content differs or the frame has no receipt.
         """
         entry = self.ledger.frames[index]
         receipt = entry.receipt
@@ -334,7 +346,7 @@ class Ingest:
         known = "known with other content or another time"
         if receipt is None:
             missing = entry.state == FrameState.MISSING
-            known = "declared missing" if missing else f"{entry.state}: {entry.error or LOST}"
+            known = "declared missing" if missing else f"{entry.state}: {entry.error or RECORD_LOST}"
         raise Problem(
             409,
             f"frame {index} is {known}",
@@ -346,6 +358,9 @@ class Ingest:
         )
 
 
-async def uncancelled(coroutine: Coroutine[Any, Any, T]) -> T:
-    """Runs to the end even where the caller is cancelled: the ledger must not stay behind the journal."""
+async def shield_and_wait(coroutine: Coroutine[Any, Any, T]) -> T:
+    """Runs a coroutine to completion even if the caller is cancelled.
+
+    Otherwise a cancellation could leave the ledger behind the journal.
+    """
     return await asyncio.shield(asyncio.ensure_future(coroutine))

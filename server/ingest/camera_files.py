@@ -1,4 +1,4 @@
-"""Receives frames that do not come as one S4DF: multipart forms, and pictures sent camera by camera."""
+"""Receivers for frames that do not arrive as one S4DF body: multipart forms and single-camera uploads."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from collections.abc import AsyncIterator, Sequence
 from fastapi import Request
 from starlette.datastructures import UploadFile
 
-from client.wire import FileKind, FrameFile, FrameHead, FrameReceipt, PartReceipt
+from client.wire import CameraReceipt, FileKind, FrameFile, FrameHead, FrameReceipt
 from scas4d_core.cameras import Camera, Rig
 from server.ingest.acknowledge import Ingest
 from server.ingest.open_frames import OpenFrames
 from server.ingest.pictures import MASK, check_files, check_size
-from server.ingest.receive import Receiving, accepted_or_removed, check_index, drain, read_framed, receiving_of
-from server.problems import Problem, counted
+from server.ingest.receive import FrameReceiver, accept_or_remove, check_index, drain, frame_receiver, read_framed
+from server.problems import Problem, count_noun
 from server.storage.disk import full_disk, no_room
 
 
 async def receive_form(ingest: Ingest, index: int, request: Request) -> FrameReceipt:
-    """Receives a whole frame as multipart/form-data, which is easy to send and slow to read."""
-    # A picture sent as a plain field (no file name) would be read as text: such fields are kept short.
+    """Receives a complete frame as multipart/form-data, which is easy to send but slow to parse."""
+    # An image sent as a plain field (without a file name) would be parsed as text, so plain fields are limited in size.
     async with request.form(max_files=2 * len(ingest.rules.rig) + 8, max_fields=8, max_part_size=4096) as form:
         given: dict[str, UploadFile] = {}
         time: float | None = None
@@ -31,51 +31,54 @@ async def receive_form(ingest: Ingest, index: int, request: Request) -> FrameRec
                 if name in given:
                     raise Problem(
                         422,
-                        f"{name!r} is here twice",
+                        f"{name!r} is given twice",
                         field=name,
                         value=value.filename,
-                        remedy="send one file a camera",
+                        remedy="send one file per camera",
                     )
                 given[name] = value
             else:
                 raise Problem(
                     422, f"{name!r} is no file", field=name, value=value, remedy="send it with a file name in its part"
                 )
-        # Names that no camera can have are refused here, as the model of a file would not take them.
+        # Checked before `FrameFile` is built, because its validation would raise for an invalid camera name.
         for name in given:
             _check_camera(ingest.rules.rig, name.removeprefix(MASK), name)
         head = _head(index, time, [_file(name, upload.size or 0) for name, upload in given.items()], part=False)
         check_files(ingest.rules.rig, head.files, whole=True)
-        keep = ingest.expects(head)
+        keep = ingest.needs_files(head)
         if keep:
-            ingest.coming(index)
+            ingest.begin_receiving(index)
         try:
-            receiving = receiving_of(ingest, head, ingest.time_of(index, time), keep=keep)
-            await _feed(receiving, [await upload.read() for upload in given.values()])
-            return await accepted_or_removed(receiving, lambda received: ingest.accept(head, received))
+            receiving = frame_receiver(ingest, head, ingest.time_of(index, time), keep=keep)
+            await _receive_files(receiving, [await upload.read() for upload in given.values()])
+            return await accept_or_remove(receiving, lambda received: ingest.accept(head, received))
         finally:
             if keep:
-                ingest.came(index)
+                ingest.end_receiving(index)
 
 
 async def receive_camera(
     frames: OpenFrames, index: int | None, camera: str | None, body: AsyncIterator[bytes], length: int | None
-) -> PartReceipt:
-    """Receives one camera's picture and mask as S4DF; `index` and `camera` as the address gives them, if it does."""
+) -> CameraReceipt:
+    """Receives one camera's image and mask as S4DF.
+
+    `index` and `camera` come from the URL and are None if the URL does not contain them.
+    """
     ingest = frames.ingest
     names: list[str] = []
 
-    def begin(head: FrameHead) -> Receiving:
+    def begin(head: FrameHead) -> FrameReceiver:
         check_index(head, index)
         check_files(ingest.rules.rig, head.files, whole=False)
-        names.append(_one_camera(head, camera))
-        frames.expects(head, names[0])
+        names.append(_check_one_camera(head, camera))
+        frames.check_head(head, names[0])
         keep = head.index >= ingest.ledger.next_frame
-        return receiving_of(ingest, head.model_copy(update={"part": True}), head.time, keep=keep)
+        return frame_receiver(ingest, head.model_copy(update={"single_camera": True}), head.time, keep=keep)
 
     try:
         head, receiving = await read_framed(body, begin, length)
-        return await accepted_or_removed(receiving, lambda received: frames.accept(head, names[0], received))
+        return await accept_or_remove(receiving, lambda received: frames.accept(head, names[0], received))
     finally:
         await drain(body)
 
@@ -88,20 +91,20 @@ async def receive_file(
     time: float | None,
     body: AsyncIterator[bytes],
     length: int | None,
-) -> PartReceipt:
-    """Receives one camera's picture or mask, the plain file."""
+) -> CameraReceipt:
+    """Receives one camera's image or mask as a plain file."""
     ingest = frames.ingest
     _check_camera(ingest.rules.rig, camera, "c")
     data = await _read(ingest.rules.rig[camera], camera, body, length)
     head = _head(index, time, [FrameFile(camera=camera, kind=kind, size=len(data))], part=True)
-    frames.expects(head, camera)
-    receiving = receiving_of(ingest, head, time, keep=index >= ingest.ledger.next_frame)
-    await _feed(receiving, [data])
-    return await accepted_or_removed(receiving, lambda received: frames.accept(head, camera, received))
+    frames.check_head(head, camera)
+    receiving = frame_receiver(ingest, head, time, keep=index >= ingest.ledger.next_frame)
+    await _receive_files(receiving, [data])
+    return await accept_or_remove(receiving, lambda received: frames.accept(head, camera, received))
 
 
 async def _read(camera: Camera, field: str, body: AsyncIterator[bytes], length: int | None) -> bytearray:
-    """Reads a file of a camera; refuses it as soon as it is larger than the camera's pictures can be."""
+    """Reads a file of a camera and refuses it once it exceeds the maximum size for that camera."""
     data = bytearray()
     try:
         check_size(camera, field, length or 0)
@@ -114,7 +117,7 @@ async def _read(camera: Camera, field: str, body: AsyncIterator[bytes], length: 
 
 
 def _check_camera(rig: Rig, camera: str, field: str) -> None:
-    """Refuses a camera that the rig does not have."""
+    """Raises Problem (422) for a camera that is not in the rig."""
     if camera not in rig.names:
         raise Problem(
             422,
@@ -129,12 +132,12 @@ def _head(index: int, time: float | None, files: Sequence[FrameFile], *, part: b
     if not files:
         raise Problem(
             422,
-            "no picture is here",
+            "there is no picture",
             field="body",
             value="nothing",
-            remedy="send one file a camera, named like the camera",
+            remedy="send one file per camera, named like the camera",
         )
-    return FrameHead(index=index, time=time, files=list(files), part=part)
+    return FrameHead(index=index, time=time, files=list(files), single_camera=part)
 
 
 def _file(field: str, size: int) -> FrameFile:
@@ -142,7 +145,7 @@ def _file(field: str, size: int) -> FrameFile:
     return FrameFile(camera=field.removeprefix(MASK), kind=kind, size=size)
 
 
-async def _feed(receiving: Receiving, files: Sequence[bytes | bytearray]) -> None:
+async def _receive_files(receiving: FrameReceiver, files: Sequence[bytes | bytearray]) -> None:
     try:
         for data in files:
             await receiving.take(memoryview(data))
@@ -153,12 +156,12 @@ async def _feed(receiving: Receiving, files: Sequence[bytes | bytearray]) -> Non
         raise
 
 
-def _one_camera(head: FrameHead, camera: str | None) -> str:
+def _check_one_camera(head: FrameHead, camera: str | None) -> str:
     names = sorted({file.camera for file in head.files})
     if len(names) != 1 or camera not in (None, names[0]):
         raise Problem(
             422,
-            f"the files are of {counted(len(names), 'camera')}: {', '.join(names)}",
+            f"the files are of {count_noun(len(names), 'camera')}: {', '.join(names)}",
             field="head.files",
             value=", ".join(names),
             remedy="send the files of one camera" + ("" if camera is None else f", {camera!r}, as the address says"),
@@ -173,6 +176,10 @@ def _seconds(value: str) -> float:
         seconds = math.nan
     if not math.isfinite(seconds):
         raise Problem(
-            422, "time is no finite number", field="time", value=value, remedy="give seconds, as 1.25, or leave it out"
+            422,
+            "time is not a finite number",
+            field="time",
+            value=value,
+            remedy="give seconds, such as 1.25, or leave it out",
         )
     return seconds

@@ -1,6 +1,7 @@
-"""Accepts frames camera by camera: open until all cameras are in, until closed on request, or until a deadline.
+"""Acceptance of frames sent camera by camera.
 
-A frame that never came is declared missing here too.
+Such a frame is open until all cameras have arrived, a client closes it, or its deadline passes. This module also
+declares frames missing that never arrived.
 """
 
 from __future__ import annotations
@@ -9,25 +10,26 @@ import asyncio
 from pathlib import Path
 from typing import Literal
 
-from client.wire import FileKind, FrameHead, FrameReceipt, FrameReportModel, FrameState, PartReceipt
+from client.wire import CameraReceipt, FileKind, FrameHead, FrameReceipt, FrameReportModel, FrameState
 from server import counters
 from server.background import Background
-from server.ingest.acknowledge import Ingest, Received, uncancelled
-from server.problems import Problem, counted
-from server.storage.events import FrameAccepted, FrameMissing, JournalEvent, OpenFrame, PartAccepted
+from server.ingest.acknowledge import Ingest, ReceivedFiles, shield_and_wait
+from server.problems import Problem, count_noun
+from server.storage.events import CameraAccepted, FrameAccepted, FrameMissing, JournalEvent, OpenFrame
 from server.storage.frame_store import FrameDamage, read_pictures
 from server.storage.journal import replay
 from server.storage.ledger import frame_identity
 
-AHEAD = 8
-"""Frames that may be open at a time: so far may one camera be ahead of another."""
+MAX_FRAMES_AHEAD = 8
+"""Maximum number of simultaneously open frames, which limits how far one camera may be ahead of another."""
 
 
 class OpenFrames:
-    """The open frames of one scene.
+    """Open frames of one scene.
 
     Args:
-        ingest, background: of the scene.
+        ingest: frame ingest of the scene.
+        background: background tasks of the scene.
     """
 
     def __init__(self, ingest: Ingest, background: Background) -> None:
@@ -41,55 +43,55 @@ class OpenFrames:
         for index in self._ledger.open:
             self._set_deadline(index)
 
-    def expects(self, head: FrameHead, camera: str) -> None:
-        """Refuses a part that will be refused, whatever it holds.
+    def check_head(self, head: FrameHead, camera: str) -> None:
+        """Refuses a single-camera upload early if it cannot be accepted regardless of its content.
 
         Raises:
-            Problem: 409 for a frame too far ahead or that is being sent whole, 422 for its time, 429 where nothing can
-                be accepted.
+            Problem: 409 for a frame that is too far ahead or being sent as a whole, 422 for its time, 429 if the queue
+                is full.
         """
         ledger, index = self._ledger, head.index
         if index < ledger.next_frame:
             return
-        if self.ingest.is_coming(index):
+        if self.ingest.is_receiving(index):
             raise Problem(409, f"frame {index} is being sent whole", field="n", value=index, remedy="wait for its end")
         self._admit(head, camera)
 
     def _admit(self, head: FrameHead, camera: str) -> None:
         ledger, index = self._ledger, head.index
-        self.ingest.refuse_if_it_cannot_go_on()
-        if index >= ledger.next_frame + AHEAD:
+        self.ingest.refuse_if_stopped()
+        if index >= ledger.next_frame + MAX_FRAMES_AHEAD:
             if not self.ingest.has_room():
-                raise self.ingest.full(index)
-            raise self.ingest.gap(index)
+                raise self.ingest.queue_full_problem(index)
+            raise self.ingest.gap_problem(index)
         frame = ledger.open.get(index)
         if head.time is not None:
             self.ingest.check_time(index, head.time)
             if frame is not None and frame.time is not None and frame.time != head.time:
                 raise Problem(
                     422,
-                    f"camera {camera!r} gives frame {index} another time than the cameras before it",
+                    f"camera {camera!r} gives frame {index} another time than the previous cameras",
                     field="time",
                     value=head.time,
                     remedy=f"give {frame.time!r}, or none: the first time given is the frame's",
                 )
 
-    async def accept(self, head: FrameHead, camera: str, received: Received) -> PartReceipt:
+    async def accept(self, head: FrameHead, camera: str, received: ReceivedFiles) -> CameraReceipt:
         """Acknowledges one camera's files of a frame.
 
         Raises:
-            Problem: as `Ingest.accept`; 409 for other content than the camera has sent before, and for a part of a
-                frame that was closed without it.
+            Problem: as for `Ingest.accept`; also 409 if the camera sent different content before, or if the frame was
+                closed without this file.
         """
-        return await uncancelled(self._accept(head, camera, received))
+        return await shield_and_wait(self._accept(head, camera, received))
 
-    async def _accept(self, head: FrameHead, camera: str, received: Received) -> PartReceipt:
+    async def _accept(self, head: FrameHead, camera: str, received: ReceivedFiles) -> CameraReceipt:
         ledger, index, kinds = self._ledger, head.index, received.hashes[camera]
-        closed = await self._parts_of(index) if index < ledger.next_frame else None
+        closed = await self._camera_events_of(index) if index < ledger.next_frame else None
         async with self._log.lock:
             known = ledger.open.get(index)
             if index < ledger.next_frame:
-                known = closed or await self._parts_of(index)
+                known = closed or await self._camera_events_of(index)
             before = {} if known is None else known.hashes.get(camera, {})
             if any(before.get(kind, value) != value for kind, value in kinds.items()):
                 raise Problem(
@@ -112,17 +114,17 @@ class OpenFrames:
                 self._admit(head, camera)
                 assert received.file is not None
                 await self._log.append(
-                    PartAccepted(index=index, time=head.time, camera=camera, file=received.file, hashes=kinds)
+                    CameraAccepted(index=index, time=head.time, camera=camera, file=received.file, hashes=kinds)
                 )
                 self._log.pictures.add(received.file, received.size)
                 received.kept = True
                 counters.INGEST_BYTES.inc(received.size)
                 self._set_deadline(index)
         await self._close_due()
-        known = await self._parts_of(index) if index < ledger.next_frame else ledger.open[index]
+        known = await self._camera_events_of(index) if index < ledger.next_frame else ledger.open[index]
         here = known.cameras if known is not None else []
         entry = ledger.frames.get(index)
-        return PartReceipt(
+        return CameraReceipt(
             scene=ledger.scene,
             index=index,
             camera=camera,
@@ -131,8 +133,8 @@ class OpenFrames:
             frame=None if entry is None else entry.receipt,
         )
 
-    async def _parts_of(self, index: int) -> OpenFrame | None:
-        """Returns the parts of a closed frame; None where its pictures are gone or it never had any."""
+    async def _camera_events_of(self, index: int) -> OpenFrame | None:
+        """Returns the single-camera uploads of a closed frame, or None if they are unknown."""
         entry = self._ledger.frames[index]
         known = entry.note.parts
         if known is None and entry.files:
@@ -144,12 +146,12 @@ class OpenFrames:
             except FrameDamage:
                 return None
             self._ledger.frames.note(index).parts = known = parts
-        if known is None and entry.receipt is not None:  # its pictures are deleted; the journal still has its parts
-            return await asyncio.to_thread(_parts_in_journal, self._log.journal.path, index)
+        if known is None and entry.receipt is not None:  # its images are deleted, but the journal still has the uploads
+            return await asyncio.to_thread(_camera_events_in_journal, self._log.journal.path, index)
         return known
 
     def _set_deadline(self, index: int) -> None:
-        seconds = self._rules.part_seconds
+        seconds = self._rules.open_frame_seconds
         if seconds is not None and index not in self._deadlines:
             self._deadlines[index] = asyncio.get_running_loop().call_later(seconds, self._is_overdue, index)
 
@@ -158,8 +160,8 @@ class OpenFrames:
         self._background.run(self.close_due())
 
     async def close_due(self) -> None:
-        """Closes frames, in order, whose cameras are all in or whose deadline is over, while there is room for them."""
-        await uncancelled(self._close_due())
+        """Closes frames in order if all cameras have arrived or the deadline has passed, while the queue has room."""
+        await shield_and_wait(self._close_due())
 
     async def _close_due(self) -> None:
         ledger = self._ledger
@@ -170,20 +172,20 @@ class OpenFrames:
                     break
                 try:
                     await self._close(frame, "complete" if complete else "deadline")
-                except Problem:  # the disk is full: the next occasion tries again
+                except Problem:  # the disk is full; the next call retries
                     break
         self.ingest.updates.begin()
 
     async def close(self, index: int) -> FrameReceipt:
-        """Closes a frame on request, with the cameras that are in. A closed frame gets its receipt again.
+        """Closes a frame on request with the cameras that have arrived; a closed frame gets the same receipt again.
 
         Raises:
-            Problem: 404, nothing of it is here; 409, one before it is not closed, or fewer cameras are in than the
-                scene's minimum; 429, 507 as `Ingest.accept`.
+            Problem: 404 if no camera has arrived; 409 if an earlier frame is not closed or fewer cameras than the
+                scene's minimum have arrived; 429 and 507 as for `Ingest.accept`.
         """
-        return await uncancelled(self._close_asked(index))
+        return await shield_and_wait(self._close_on_request(index))
 
-    async def _close_asked(self, index: int) -> FrameReceipt:
+    async def _close_on_request(self, index: int) -> FrameReceipt:
         ledger = self._ledger
         async with self._log.lock:
             if index < ledger.next_frame:
@@ -203,31 +205,31 @@ class OpenFrames:
             if frame is None:
                 raise Problem(
                     404,
-                    f"nothing of frame {index} is here",
+                    f"no picture of frame {index} has arrived",
                     field="n",
                     value=index,
                     remedy=f"send its pictures, or declare it missing; the next frame is {ledger.next_frame}",
                 )
             if index > ledger.next_frame:
-                raise self.ingest.gap(index)
+                raise self.ingest.gap_problem(index)
             least = self._rules.minimum_cameras
             if len(frame.cameras) < least:
                 raise Problem(
                     409,
-                    f"{counted(len(frame.cameras), 'camera')} of at least {least} sent a picture",
+                    f"{count_noun(len(frame.cameras), 'camera')} of the required {least} sent a picture",
                     field="n",
                     value=index,
                     remedy="send those of more cameras, or declare the frame missing",
                     received=frame.cameras,
                 )
             if not self.ingest.has_room():
-                raise self.ingest.full(index)
+                raise self.ingest.queue_full_problem(index)
             receipt = await self._close(frame, "request")
         self.ingest.updates.begin()
         return receipt
 
     async def _close(self, frame: OpenFrame, by: Literal["complete", "request", "deadline"]) -> FrameReceipt:
-        """Makes a frame of its parts; the log's lock is held."""
+        """Closes a frame with the uploads received so far; the caller must hold the log's lock."""
         seconds = self.ingest.time_of(frame.index, frame.time)
         hashes = {camera: kinds for camera, kinds in frame.hashes.items() if FileKind.IMAGE in kinds}
         identity, files = frame_identity(hashes, seconds), tuple(sorted(frame.files))
@@ -237,12 +239,12 @@ class OpenFrames:
         return receipt
 
     async def declare_missing(self, index: int, reason: str) -> FrameReportModel:
-        """Declares the next frame missing, for ever; a frame declared before gets the same answer.
+        """Permanently declares the next frame missing; a repeated declaration gets the same response.
 
         Raises:
-            Problem: 409 for a gap, for a frame that was accepted, and for a failed scene; 507 when the disk is full.
+            Problem: 409 for a gap, for an accepted frame and for a failed scene; 507 if the disk is full.
         """
-        return await uncancelled(self._declare_missing(index, reason))
+        return await shield_and_wait(self._declare_missing(index, reason))
 
     async def _declare_missing(self, index: int, reason: str) -> FrameReportModel:
         ledger = self._ledger
@@ -255,16 +257,16 @@ class OpenFrames:
                         f"frame {index} is {report.state}: it was accepted",
                         field="n",
                         value=index,
-                        remedy=f"only frames that never came can be missing; the next is {ledger.next_frame}",
+                        remedy=f"only frames that never arrived can be missing; the next frame is {ledger.next_frame}",
                         expected=ledger.next_frame,
                     )
                 return report
             self.ingest.refuse_if_failed()
             if index > ledger.next_frame:
-                raise self.ingest.gap(index)
-            if self.ingest.is_coming(index):
+                raise self.ingest.gap_problem(index)
+            if self.ingest.is_receiving(index):
                 raise Problem(
-                    409, f"frame {index} is just coming in", field="n", value=index, remedy="wait for its end"
+                    409, f"frame {index} is being received", field="n", value=index, remedy="wait for its end"
                 )
             parts = ledger.open.get(index)
             await self._log.append(FrameMissing(index=index, reason=reason or "declared missing"))
@@ -272,28 +274,31 @@ class OpenFrames:
             if parts is not None:
                 await self._log.delete_pictures(parts.files)
             report = ledger.frames[index].report
-        self.ingest.ended(index)
+        self.ingest.publish_ended(index)
         await self._close_due()
         return report
 
     def _forget(self, index: int) -> None:
-        """Removes the deadline of a frame that is not open any more."""
+        """Removes the deadline of a frame that is no longer open."""
         self._overdue.discard(index)
         if (handle := self._deadlines.pop(index, None)) is not None:
             handle.cancel()
 
     def stop(self) -> None:
-        """Cancels the deadlines."""
+        """Cancels all deadlines."""
         for handle in self._deadlines.values():
             handle.cancel()
 
 
-def _parts_in_journal(journal: Path, index: int) -> OpenFrame | None:
-    """Reads the parts of a closed frame from the journal: slow, for a camera that repeats a frame deleted long ago."""
+def _camera_events_in_journal(journal: Path, index: int) -> OpenFrame | None:
+    """Returns the single-camera uploads of a closed frame from the journal, or None if it has none.
+
+    This is slow, but only needed if a camera resends a frame whose images are already deleted.
+    """
     parts = OpenFrame(index)
 
     def look(event: JournalEvent) -> None:
-        if isinstance(event, PartAccepted) and event.index == index:
+        if isinstance(event, CameraAccepted) and event.index == index:
             parts.add(event)
 
     replay(journal, look)

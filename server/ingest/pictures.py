@@ -1,6 +1,7 @@
-"""Checks the picture files of a frame without decoding pixels: names, sizes, and the structure of the file.
+"""Validation of a frame's image files without decoding pixels: names, sizes and file structure.
 
-JPEG is walked by its segments to the end marker, PNG by its chunks with their checksums, WebP by its RIFF chunks.
+The checks walk through the segments of a JPEG up to its end marker, through the chunks of a PNG including their
+checksums, and through the RIFF chunks of a WebP.
 """
 
 from __future__ import annotations
@@ -18,38 +19,38 @@ from client.wire import FileKind, FrameFile
 from client.wire.framing import MAX_HEAD, PREFIX
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.errors import InputError
-from server.problems import Problem, counted
+from server.problems import Problem, count_noun
 
 _SCAN_END = re.compile(rb"\xff(?![\x00\xd0-\xd7\xff])(?=[\x00-\xff])", re.DOTALL)
 MASK = "mask."
 EXIF_ORIENTATION = 0x0112
 
 PIXEL_BYTES = 5
-"""Bytes a pixel that one file has at most: noise in RGBA as PNG has a little over 4."""
+"""Maximum bytes per pixel in one file; RGBA noise in a PNG needs slightly more than 4."""
 METADATA_BYTES = 1_000_000
-"""Bytes beside the pixels at most: a colour profile, a preview."""
+"""Maximum bytes of metadata in one file, such as a colour profile or a preview."""
 
 
 def field_of(file: FrameFile) -> str:
-    """Names a file as forms and answers do: `<camera>`, or `mask.<camera>`."""
+    """Returns the field name of a file in forms and responses: `<camera>` or `mask.<camera>`."""
     return MASK + file.camera if file.kind == FileKind.MASK else file.camera
 
 
 def largest_file(camera: Camera) -> int:
-    """Returns the most bytes that a picture or mask of the camera can have, encoded."""
+    """Returns the maximum size in bytes of an encoded image or mask of the camera."""
     return camera.width * camera.height * PIXEL_BYTES + METADATA_BYTES
 
 
 def largest_frame(rig: Rig) -> int:
-    """Returns the most bytes that a frame with masks can have on the wire."""
+    """Returns the maximum size in bytes of an S4DF frame with masks."""
     return PREFIX.size + MAX_HEAD + 2 * sum(largest_file(camera) for camera in rig.cameras)
 
 
 def check_size(camera: Camera, field: str, size: int) -> None:
-    """Refuses a file by its announced size, before it is received.
+    """Refuses a file by its announced size before it is received.
 
     Raises:
-        Problem: 413.
+        Problem: 413, the file is larger than any image of the camera can be.
     """
     if size > (most := largest_file(camera)):
         raise Problem(
@@ -62,10 +63,12 @@ def check_size(camera: Camera, field: str, size: int) -> None:
 
 
 def check_files(rig: Rig, files: Sequence[FrameFile], *, whole: bool) -> None:
-    """Checks that each file is of a camera of the rig, once; of a whole frame all cameras, and masks of all or none.
+    """Checks that each file belongs to a camera of the rig and appears only once.
+
+    A whole frame must contain an image from every camera, and masks for all cameras or none.
 
     Raises:
-        Problem: 422, names the file; 413, the file announces more bytes than it can have.
+        Problem: 422 with the name of the invalid file; 413 if the announced size is too large.
     """
     names = set(rig.names)
     seen: dict[FileKind, set[str]] = {FileKind.IMAGE: set(), FileKind.MASK: set()}
@@ -82,10 +85,10 @@ def check_files(rig: Rig, files: Sequence[FrameFile], *, whole: bool) -> None:
         if file.camera in seen[file.kind]:
             raise Problem(
                 422,
-                f"{field!r} is here twice",
+                f"{field!r} is given twice",
                 field=field,
                 value=file.camera,
-                remedy="send one file a camera and kind",
+                remedy="send one file per camera and kind",
             )
         check_size(rig[file.camera], field, file.size)
         seen[file.kind].add(file.camera)
@@ -97,7 +100,7 @@ def check_files(rig: Rig, files: Sequence[FrameFile], *, whole: bool) -> None:
             image = kind == FileKind.IMAGE
             raise Problem(
                 422,
-                f"no {'picture' if image else 'mask'} of {counted(len(missing), 'camera')}: {', '.join(missing)}",
+                f"no {'picture' if image else 'mask'} of {count_noun(len(missing), 'camera')}: {', '.join(missing)}",
                 field=missing[0] if image else MASK + missing[0],
                 value="nothing",
                 remedy=f"add {'one' if len(missing) == 1 else 'one each'}"
@@ -108,16 +111,16 @@ def check_files(rig: Rig, files: Sequence[FrameFile], *, whole: bool) -> None:
 
 
 def check_picture(rig: Rig, file: FrameFile, data: memoryview) -> None:
-    """Checks that a file is whole, of an accepted format, of the camera's size, and not turned.
+    """Checks that a file is complete, in an accepted format, not rotated by EXIF, and of the camera's size.
 
     Raises:
-        Problem: 422, names the file, its fault, and the remedy.
+        Problem: 422 with the file, its fault and the remedy.
     """
     camera, field = rig[file.camera], field_of(file)
     try:
         header = image_header(data)
     except StructureError as error:
-        value = error.value or counted(len(data), "byte")
+        value = error.value or count_noun(len(data), "byte")
         raise Problem(422, f"{field}: {error.fault}", field=field, value=value, remedy=error.remedy) from None
     if (header.width, header.height) != (camera.width, camera.height):
         raise Problem(
@@ -143,17 +146,19 @@ def check_picture(rig: Rig, file: FrameFile, data: memoryview) -> None:
 
 def _orientation(data: memoryview) -> int:
     try:
-        with Image.open(io.BytesIO(data), formats=["JPEG"]) as picture:  # reads the segments, decodes nothing
+        with Image.open(io.BytesIO(data), formats=["JPEG"]) as picture:  # reads only the segments, without decoding
             return int(picture.getexif().get(EXIF_ORIENTATION, 1))
-    except Exception:  # damaged metadata: the worker decodes the file, and reports it
+    except Exception:  # damaged metadata; the worker decodes the file and reports errors
         return 1
 
 
 class StructureError(InputError):
-    """A file is not a whole picture of an accepted format.
+    """Error for a file that is not a complete image in an accepted format.
 
     Attributes:
-        fault: what is wrong with it. remedy: what to send instead. value: the part at fault; None: the whole file.
+        fault: description of the fault.
+        remedy: advice on what to send instead.
+        value: the invalid property, or None for the whole file.
     """
 
     def __init__(self, fault: str, remedy: str, value: str | None = None) -> None:
@@ -163,23 +168,24 @@ class StructureError(InputError):
 
 @dataclass(frozen=True)
 class ImageHeader:
-    """Header of a file: format "jpeg", "png" or "webp", and the size in pixels."""
+    """Image header: format ("jpeg", "png" or "webp") and size in pixels."""
 
     format: str
     width: int
     height: int
     exif: bool = False
-    """A JPEG has a segment of EXIF metadata, which may say that the picture is to be turned."""
+    """Whether a JPEG has an EXIF segment, which may request a rotation."""
 
 
 def image_header(data: bytes | memoryview) -> ImageHeader:
-    """Walks a file to its end and returns its header.
+    """Checks the structure of a file up to its end and returns its header.
 
     Args:
-        data: the file, one contiguous buffer of bytes; not copied.
+        data: content of the file in one contiguous buffer, which is not copied.
 
     Raises:
-        StructureError: another format, truncated, damaged, CMYK, animated, or of a bit depth that is not accepted.
+        StructureError: the file has another format, is truncated, damaged, CMYK or animated, or has an unsupported bit
+            depth.
     """
     data = memoryview(data)
     start = bytes(data[:12])
@@ -192,7 +198,7 @@ def image_header(data: bytes | memoryview) -> ImageHeader:
     if not start:
         raise StructureError("an empty file", "send the picture as JPEG, PNG or WebP")
     raise StructureError(
-        f"begins with {start[:8].hex(' ')}, which is no JPEG, PNG or WebP", "encode the picture as one of these"
+        f"begins with {start[:8].hex(' ')}, which is not JPEG, PNG or WebP", "encode the picture as one of these"
     )
 
 
@@ -237,8 +243,8 @@ def _jpeg(data: memoryview) -> ImageHeader:
         exif |= marker == 0xE1 and bytes(data[at + 4 : at + 10]) == b"Exif\0\0"
         at += 2 + length
         if marker == 0xDA:
-            # The one scan of a sequential picture is followed by the end only, and holds no end marker itself: where
-            # the file ends with one, it is whole. Others are walked from scan to scan.
+            # A sequential JPEG with a single scan has only the end marker after it, and scan data cannot contain that
+            # marker, so a file that ends with the marker is complete. Other files are checked scan by scan.
             if at <= len(data) - 2 and data[at - length + 2] == components and bytes(data[-2:]) == b"\xff\xd9":
                 break
             at = _end_of_scan(data, at)
@@ -248,7 +254,10 @@ def _jpeg(data: memoryview) -> ImageHeader:
 
 
 def _end_of_scan(data: memoryview, at: int) -> int:
-    """Finds the end of the entropy-coded data from `at` on: the next marker that is no stuffed zero and no restart."""
+    """Returns the end of the entropy-coded data after `at`.
+
+    This is the next marker other than a restart marker; a stuffed zero byte is not a marker.
+    """
     end = _SCAN_END.search(data, at)
     if end is None:
         raise _truncated("JPEG", len(data))
@@ -280,7 +289,7 @@ def _png(data: memoryview) -> ImageHeader:
                     "a PNG of 16 bits a channel", "send 8 bits: you choose how they are scaled", "16 bits"
                 )
         if kind == b"acTL":
-            raise StructureError("an animated PNG", "send one picture a file", "animated")
+            raise StructureError("an animated PNG", "send one picture per file", "animated")
         pixels |= kind == b"IDAT"
         if kind == b"IEND":
             break
@@ -301,7 +310,7 @@ def _webp(data: memoryview) -> ImageHeader:
         if len(body) < length or at + 8 + length > size:
             raise _truncated("WebP", len(data))
         if kind in (b"ANIM", b"ANMF"):
-            raise StructureError("an animated WebP", "send one picture a file", "animated")
+            raise StructureError("an animated WebP", "send one picture per file", "animated")
         if kind == b"VP8X" and length >= 10:
             width, height = int.from_bytes(body[4:7], "little") + 1, int.from_bytes(body[7:10], "little") + 1
             header = ImageHeader("webp", width, height)

@@ -1,4 +1,4 @@
-"""Receives frames: reads S4DF, checks, hashes and writes the pictures while the next bytes arrive."""
+"""Receiver of S4DF frames; checks, hashes and writes images while the next bytes arrive."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from blake3 import blake3
 
 from client.wire import FrameFile, FrameHead, FrameReceipt, FramingError, head_length, parse_head
 from client.wire.framing import PREFIX
-from server.ingest.acknowledge import Ingest, Received, uncancelled
+from server.ingest.acknowledge import Ingest, ReceivedFiles, shield_and_wait
 from server.ingest.pictures import check_files, check_picture
 from server.problems import Problem
 from server.storage.disk import full_disk, no_room
@@ -23,25 +23,30 @@ from server.storage.frame_store import BLOCK, Upload
 T = TypeVar("T")
 
 BATCH = 4_000_000
-"""Bytes of files that are checked, hashed and written at once; a larger file is a batch of its own."""
-SPARE_BUFFERS = 8
-"""Buffers of that size that are kept for the next frames: fresh memory costs as much time as filling it."""
+"""Bytes of files that are checked, hashed and written together; a larger file forms its own batch."""
+MAX_SPARE_BUFFERS = 8
+"""Maximum number of batch buffers kept for reuse, because allocating memory takes as long as filling it."""
 
 Check = Callable[[FrameFile, memoryview], None]
-"""Raises Problem for a file that the scene does not accept."""
+"""Function that raises Problem for a file that the scene does not accept."""
 
 _spare: list[mmap.mmap] = []
 
 
-class Receiving:
-    """Receives one record, batch by batch: one is filled while a thread checks, hashes and writes the one before.
+class FrameReceiver:
+    """Receiver of one record in batches, double-buffered.
+
+    While one batch is filled, a thread checks, hashes and writes the previous one.
 
     Args:
-        folder: of the frame log. head: names the files. seconds: time of the frame, where it is known.
-        check: called with each file. keep: False: the files are only hashed, not written.
+        folder: folder of the frame log.
+        head: names and sizes of the files.
+        seconds: time of the frame, or None if it is not known yet.
+        check: called with each file.
+        keep: whether to write the files; if False, they are only checked and hashed.
 
     Attributes:
-        missing: bytes of the files that have not arrived yet.
+        missing: number of bytes that have not arrived yet.
     """
 
     def __init__(self, folder: Path, head: FrameHead, seconds: float | None, check: Check, *, keep: bool) -> None:
@@ -51,17 +56,17 @@ class Receiving:
         self._upload = Upload(folder, head, seconds) if keep else None
         self._at_work: asyncio.Future[None] | None = None
         self._batches = in_batches(head.files)
-        # Memory and file are alike modulo the size of a block: so it can be written without the page cache.
+        # Buffer and file offsets are equal modulo the block size, as writes that bypass the page cache require.
         self._at = self._begin = 0 if self._upload is None else self._upload.begin % BLOCK
         self.missing = sum(map(_bytes, self._batches))
         size = BLOCK + max(map(_bytes, self._batches))
         self._buffers = [_buffer(size) for _ in self._batches[:2]]
 
     async def take(self, data: memoryview) -> None:
-        """Takes the next bytes, not more than are missing; returns when there is room for more.
+        """Takes the next bytes, at most `missing`, and returns when there is space for more.
 
         Raises:
-            Problem, OSError: of files that arrived before.
+            Problem, OSError: an earlier file is invalid or could not be written.
         """
         while self._batches:
             end = self._begin + _bytes(self._batches[0])
@@ -72,7 +77,7 @@ class Receiving:
             data = data[len(piece) :]
             if self._at < end:
                 return
-            await self._settle()
+            await self._wait_for_thread()
             block = memoryview(self._buffers[0])[:end]
             self._start(self._write, self._batches.pop(0), block, self._begin)
             self._buffers.reverse()
@@ -90,65 +95,71 @@ class Receiving:
         if self._upload is not None:
             self._upload.write(block, begin)
 
-    async def finish(self) -> Received:
-        """Returns once all files are on disk.
+    async def finish(self) -> ReceivedFiles:
+        """Waits until all files are on disk and returns their digests.
 
         Raises:
-            Problem, OSError: they are not.
+            Problem, OSError: a file is invalid or could not be written.
         """
-        await self._settle()
+        await self._wait_for_thread()
         upload = self._upload
         if upload is not None:
             self._start(upload.finish, self._digests)
-            await self._settle()
-        self._give_back()
-        return Received(self._hashes, None, 0) if upload is None else Received(self._hashes, upload.name, upload.size)
+            await self._wait_for_thread()
+        self._return_buffers()
+        return (
+            ReceivedFiles(self._hashes, None, 0)
+            if upload is None
+            else ReceivedFiles(self._hashes, upload.name, upload.size)
+        )
 
     async def abort(self) -> None:
-        """Removes the record, even where the caller is cancelled meanwhile."""
+        """Removes the record, even if the caller is cancelled during the removal."""
         await asyncio.shield(asyncio.ensure_future(self._abort()))
 
     async def _abort(self) -> None:
         if self._at_work is not None:
-            await asyncio.wait([self._at_work])  # nothing may be closed or used again under a thread that writes
-        self._give_back()
+            await asyncio.wait([self._at_work])  # the thread may still use the file and the buffers
+        self._return_buffers()
         if self._upload is not None:
             await asyncio.to_thread(self._upload.abort)
 
     def _start(self, function: Callable[..., None], *arguments: object) -> None:
         self._at_work = asyncio.ensure_future(asyncio.to_thread(function, *arguments))
 
-    async def _settle(self) -> None:
-        """Waits for the thread, which goes on where the caller is cancelled."""
+    async def _wait_for_thread(self) -> None:
+        """Waits for the thread, which continues if the caller is cancelled."""
         if self._at_work is not None:
             try:
                 await asyncio.shield(self._at_work)
-            except FileNotFoundError:  # its folder is gone
+            except FileNotFoundError:  # the folder no longer exists
                 remedy = "GET /v1/scenes lists the scenes"
                 raise Problem(404, "the scene was deleted meanwhile", field="id", remedy=remedy) from None
             self._at_work = None
 
-    def _give_back(self) -> None:
+    def _return_buffers(self) -> None:
         _spare.extend(buffer for buffer in self._buffers if len(buffer) == _STANDARD)
-        del _spare[SPARE_BUFFERS:]
+        del _spare[MAX_SPARE_BUFFERS:]
         self._buffers = []
 
 
 async def read_framed(
-    chunks: AsyncIterator[bytes], begin: Callable[[FrameHead], Receiving], total: int | None
-) -> tuple[FrameHead, Receiving]:
-    """Reads a frame as `client.wire.framing` writes it; holds two batches of its bytes at most.
+    chunks: AsyncIterator[bytes], begin: Callable[[FrameHead], FrameReceiver], total: int | None
+) -> tuple[FrameHead, FrameReceiver]:
+    """Reads a frame in the format of `client.wire.framing` and buffers at most two batches of it.
 
     Args:
-        chunks: the bytes as they arrive. begin: called with the head; refuses it or begins to receive.
-        total: bytes announced, if any.
+        chunks: bytes as they arrive.
+        begin: called with the head; raises Problem or returns the receiver.
+        total: announced number of bytes, or None.
 
     Raises:
-        Problem: 422, no frame, or not as its head says; and all that `begin` and the checks raise.
+        Problem: 422 if the body is not a frame or contradicts its head; also everything that `begin` and the checks
+            raise.
     """
     start = bytearray()
     head: FrameHead | None = None
-    receiving: Receiving | None = None
+    receiving: FrameReceiver | None = None
     try:
         async for chunk in chunks:
             view = memoryview(chunk)
@@ -183,14 +194,14 @@ async def read_framed(
 
 
 def _fill(start: bytearray, view: memoryview, size: int) -> memoryview:
-    """Moves bytes from `view` until `start` has `size`; returns the rest of `view`."""
+    """Appends bytes from `view` to `start` until it has `size` bytes, and returns the rest of `view`."""
     missing = max(0, size - len(start))
     start += view[:missing]
     return view[missing:]
 
 
 def framing_problem(error: FramingError) -> Problem:
-    """Makes the answer to bytes that are no frame."""
+    """Returns the 422 response for a body that is not a valid frame."""
     return Problem(422, f"the frame {error.fault}", field="body", value=error.fault, remedy=error.remedy)
 
 
@@ -201,7 +212,7 @@ def _check_length(head: FrameHead, start: int, total: int | None) -> None:
 
 
 def in_batches(files: Sequence[FrameFile]) -> list[list[FrameFile]]:
-    """Groups consecutive files for a thread: handing over a small file costs more than hashing it."""
+    """Groups consecutive files into batches, because a thread hand-over costs more than hashing a small file."""
     batches: list[list[FrameFile]] = []
     for file in files:
         if not batches or _bytes(batches[-1]) + file.size > BATCH:
@@ -218,7 +229,7 @@ _STANDARD = -(-(BATCH + BLOCK) // mmap.PAGESIZE) * mmap.PAGESIZE
 
 
 def _buffer(size: int) -> mmap.mmap:
-    """Returns memory that begins at a page."""
+    """Returns page-aligned memory of at least `size` bytes."""
     if size <= _STANDARD and _spare:
         return _spare.pop()
     return mmap.mmap(-1, max(size, _STANDARD))
@@ -227,56 +238,61 @@ def _buffer(size: int) -> mmap.mmap:
 async def receive_frame(
     ingest: Ingest, index: int | None, body: AsyncIterator[bytes], length: int | None
 ) -> FrameReceipt:
-    """Receives and acknowledges a whole frame as S4DF.
+    """Receives and acknowledges a complete frame as S4DF.
 
     Args:
-        ingest: of the scene. index: as the address gives it; None where the head alone does.
-        body: its bytes. length: their number, where it is announced.
+        ingest: frame ingest of the scene.
+        index: frame index from the URL, or None if only the head contains it.
+        body: bytes of the frame.
+        length: announced number of bytes, or None.
 
     Raises:
         Problem: the frame is refused; see `Ingest.accept`.
     """
     begun: list[int] = []
 
-    def begin(head: FrameHead) -> Receiving:
+    def begin(head: FrameHead) -> FrameReceiver:
         check_index(head, index)
         check_files(ingest.rules.rig, head.files, whole=True)
-        keep = ingest.expects(head)
+        keep = ingest.needs_files(head)
         if keep:
-            ingest.coming(head.index)
+            ingest.begin_receiving(head.index)
             begun.append(head.index)
-        whole = head.model_copy(update={"part": False})  # the address says so, whatever the head does
-        return receiving_of(ingest, whole, ingest.time_of(head.index, head.time), keep=keep)
+        whole = head.model_copy(update={"single_camera": False})  # the URL decides, not the head
+        return frame_receiver(ingest, whole, ingest.time_of(head.index, head.time), keep=keep)
 
     try:
         head, receiving = await read_framed(body, begin, length)
-        return await accepted_or_removed(receiving, lambda received: ingest.accept(head, received))
+        return await accept_or_remove(receiving, lambda received: ingest.accept(head, received))
     finally:
         for number in begun:
-            ingest.came(number)
+            ingest.end_receiving(number)
         await drain(body)
 
 
-def receiving_of(ingest: Ingest, head: FrameHead, seconds: float | None, *, keep: bool) -> Receiving:
-    """Begins to receive a record of the scene's frame log; `keep`: see `Receiving`."""
-    return Receiving(ingest.log.pictures.folder, head, seconds, partial(check_picture, ingest.rules.rig), keep=keep)
+def frame_receiver(ingest: Ingest, head: FrameHead, seconds: float | None, *, keep: bool) -> FrameReceiver:
+    """Returns a receiver for a record of the scene's frame log; see `FrameReceiver` for `keep`."""
+    return FrameReceiver(ingest.log.pictures.folder, head, seconds, partial(check_picture, ingest.rules.rig), keep=keep)
 
 
-async def accepted_or_removed(receiving: Receiving, accept: Callable[[Received], Coroutine[Any, Any, T]]) -> T:
-    """Completes even where the request is cancelled: a record that an event names, or will, must not be removed."""
+async def accept_or_remove(receiving: FrameReceiver, accept: Callable[[ReceivedFiles], Coroutine[Any, Any, T]]) -> T:
+    """Finishes a record and accepts it, or removes it if it is not accepted.
+
+    This completes even if the request is cancelled, because a record that an event references must not be removed.
+    """
 
     async def finish() -> T:
-        received = await _finished(receiving)
+        received = await _finish(receiving)
         try:
             return await accept(received)
         finally:
             if not received.kept:
                 await receiving.abort()
 
-    return await uncancelled(finish())
+    return await shield_and_wait(finish())
 
 
-async def _finished(receiving: Receiving) -> Received:
+async def _finish(receiving: FrameReceiver) -> ReceivedFiles:
     try:
         return await receiving.finish()
     except BaseException as error:
@@ -287,13 +303,13 @@ async def _finished(receiving: Receiving) -> Received:
 
 
 async def drain(body: AsyncIterator[bytes]) -> None:
-    """Reads the rest of a body that is refused: a sender that is still sending would not see the answer."""
+    """Reads the rest of a refused body, because a client that is still sending would not read the response."""
     async for _ in body:
         pass
 
 
 def check_index(head: FrameHead, index: int | None) -> None:
-    """Refuses a head with another index than the address (None: the address has none)."""
+    """Raises Problem (422) if the head's index differs from `index`, the one in the URL, if any."""
     if index is not None and head.index != index:
         raise Problem(
             422,

@@ -1,1 +1,1 @@
-"""Several services of one cluster: passes a request on to the service that has the scene."""
+"""Cooperation of the services in a cluster, which forward each request to the owner of its scene."""

@@ -1,4 +1,4 @@
-"""Peers, the other services of the cluster: which of them has a scene, and which scenes they have."""
+"""Peers of this service: the other services of the cluster and the scenes that they own."""
 
 from __future__ import annotations
 
@@ -17,22 +17,24 @@ from server.http.permissions import ALL, Permission
 from server.http.sharing import LONGEST_SECONDS, Sharing
 from server.problems import Problem
 
-PASSED = "x-scas4d-passed"
-"""Header of what a service asks of another: that one answers for its own scenes alone, and passes nothing on."""
+PROXIED_HEADER = "x-scas4d-proxied"
+"""Header of a request from one service to another, which must handle the request itself instead of forwarding it."""
 FRESH_S = 3.0
-"""A list of the peers is good for so long, and so is the answer that none has a scene."""
+"""Seconds for which a list of the peers, or the result that no peer owns a scene, is cached."""
 LIST_S = 2.0
-"""A request waits for the first list for so long; later ones get the list before."""
+"""Maximum seconds that a request waits for the first list of peers; later requests use the previous list."""
 ASK_S = 5.0
-"""A peer has so long to answer a question about its scenes."""
+"""Maximum seconds for a peer to answer a request about its scenes."""
 CONNECT_S = 3.0
+"""Maximum seconds to connect to a peer."""
 SILENT_S = 130.0
-"""A peer may be silent for so long over a request: longer than it allows a query."""
+"""Read timeout in seconds of a forwarded request, longer than the time limit of a query."""
 REMEMBERED_S = 600.0
-"""Seconds for which a lost service is awaited: clients of its scenes are asked to try again."""
+"""Seconds for which a lost service is expected to return; clients of its scenes are asked to retry."""
 MOST_KNOWN = 100_000
+"""Maximum number of scenes whose owner is remembered."""
 MOST_UNKNOWN = 1_000
-"""Ids that nobody has, remembered for a moment, so that guessed ids do not each reach every peer."""
+"""Maximum number of unknown scene ids that are cached, so that repeated requests for them do not reach every peer."""
 
 T = TypeVar("T")
 M = TypeVar("M", bound=BaseModel)
@@ -41,15 +43,15 @@ log = logging.getLogger("scas4d.server")
 
 
 class Peers:
-    """The other services of the cluster. On the event loop.
+    """The other services of the cluster, for use on the event loop.
 
     Args:
-        listed: returns the addresses of the peers, as `http://10.0.0.2:8000`; it may take long.
-        secret: the token, which all services of a cluster share; None: there is none.
-        client: of HTTP; by default one of its own.
+        listed: returns the addresses of the peers, such as `http://10.0.0.2:8000`; it may take long.
+        secret: token shared by all services of the cluster; None if there is none.
+        client: HTTP client; None creates a new one.
 
     Attributes:
-        client: passes requests on.
+        client: HTTP client that forwards requests.
     """
 
     def __init__(
@@ -58,7 +60,7 @@ class Peers:
         secret: str | None,
         client: httpx.AsyncClient | None = None,
     ) -> None:
-        self._listed = listed
+        self._list_addresses = listed
         self._secret = secret
         limits = httpx.Limits(max_connections=None, max_keepalive_connections=64)
         timeout = httpx.Timeout(SILENT_S, connect=CONNECT_S)
@@ -67,22 +69,22 @@ class Peers:
         self._asked = -FRESH_S
         self._listing: asyncio.Task[None] | None = None
         self._owners: OrderedDict[str, str] = OrderedDict()
-        """Addresses by scene."""
+        """Address of the owner of each known scene, keyed by scene id."""
         self._seen: dict[str, float] = {}
-        """When an address was last among the peers."""
+        """Time at which each address was last among the peers."""
         self._unknown: OrderedDict[str, float] = OrderedDict()
         self._refusing: set[str] = set()
-        """Addresses of those that refuse the token."""
+        """Addresses of peers that reject the token."""
         self._checked: OrderedDict[str, float] = OrderedDict()
 
     async def close(self) -> None:
-        """Ends connections to peers."""
+        """Closes the connections to peers."""
         if self._listing is not None:
             self._listing.cancel()
         await self.client.aclose()
 
     async def addresses(self) -> Sequence[str]:
-        """Addresses of the peers, as they were listed last."""
+        """Returns the latest addresses of the peers, and refreshes them in the background."""
         if self._listing is None and time.monotonic() - self._asked >= FRESH_S:
             self._listing = asyncio.get_running_loop().create_task(self._list())
         if self._listing is not None:
@@ -91,69 +93,72 @@ class Peers:
 
     async def _list(self) -> None:
         try:
-            before, self._addresses = self._addresses or (), await self._listed()
+            before, self._addresses = self._addresses or (), await self._list_addresses()
             now = time.monotonic()
             seen = {address: when for address, when in self._seen.items() if now - when < REMEMBERED_S}
-            self._seen = seen | dict.fromkeys((*before, *self._addresses), now)  # those before were there until now
-        except Exception:  # the cluster's head does not answer, or in words that nobody expects
+            self._seen = seen | dict.fromkeys((*before, *self._addresses), now)  # previous ones were present until now
+        except Exception:  # the head does not respond, or its response is unexpected
             log.exception("peers cannot be listed; those before are asked")
         finally:
             self._asked, self._listing = time.monotonic(), None
 
     def headers(self, permission: Permission) -> dict[str, str]:
-        """Headers with which a peer is asked, for somebody who may do so much."""
-        forwarded = {PASSED: "1"}
+        """Returns the headers of a request to a peer on behalf of a client with this permission."""
+        forwarded = {PROXIED_HEADER: "1"}
         if self._secret is not None:
             forwarded["authorization"] = f"Bearer {_bearer(permission, self._secret)}"
         return forwarded
 
     async def owner(self, scene: str) -> str | None:
-        """Returns the address of the peer that has a scene; None: none of them has it.
+        """Returns the address of the peer that owns a scene, or None if no peer owns it.
 
         Raises:
-            Problem: 503, the one that had it, or one that may have it, does not answer.
+            Problem: 503 if the previous owner, or a peer that may be the owner, does not respond.
         """
         peers, now = await self.addresses(), time.monotonic()
         known = self._owners.get(scene)
         if known in peers:
             return known
-        if self._addresses is None:  # it is not known yet whom to ask
-            raise unreachable(scene)
+        if self._addresses is None:  # the peers are not known yet
+            raise unreachable_problem(scene)
         if now - self._unknown.get(scene, -FRESH_S) < FRESH_S:
             return None
         answers = await asyncio.gather(*(self._has(address, scene) for address in peers))
         for address, has in zip(peers, answers, strict=True):
             if has:
-                _keep(self._owners, scene, address, MOST_KNOWN)
+                _remember(self._owners, scene, address, MOST_KNOWN)
                 return address
         if None in answers or (known in self._seen and now - self._seen[known] < REMEMBERED_S):
-            raise unreachable(scene, refused=not self._refusing.isdisjoint(peers))
+            raise unreachable_problem(scene, refused=not self._refusing.isdisjoint(peers))
         self.forget(scene)
-        _keep(self._unknown, scene, now, MOST_UNKNOWN)
+        _remember(self._unknown, scene, now, MOST_UNKNOWN)
         return None
 
     def forget(self, scene: str) -> None:
-        """Forgets who has a scene: that one says it has it no more."""
+        """Forgets the owner of a scene that the owner no longer has."""
         self._owners.pop(scene, None)
 
     async def check(self, owner: str, scene: str) -> None:
-        """Forgets the owner of a scene where it says that it does not have it; asks once in a while."""
+        """Forgets the owner of a scene if the owner reports that it does not have the scene.
+
+        Asks the owner at most once per `FRESH_S`.
+        """
         now = time.monotonic()
         if now - self._checked.get(scene, -FRESH_S) >= FRESH_S:
-            _keep(self._checked, scene, now, MOST_UNKNOWN)
+            _remember(self._checked, scene, now, MOST_UNKNOWN)
             if await self._has(owner, scene) is False:
                 self.forget(scene)
 
     async def scenes(self, permission: Permission) -> tuple[list[SceneStatus], list[str]]:
-        """Returns the scenes of all peers, and the addresses of those that do not answer."""
-        lists, silent = await self._every("/v1/scenes", permission, SceneList)
+        """Returns the scenes of all peers, and the addresses of peers that do not respond."""
+        lists, silent = await self._ask_all("/v1/scenes", permission, SceneList)
         return list({status.id: status for listing in lists for status in listing.scenes}.values()), silent
 
     async def clusters(self) -> tuple[list[Cluster], list[str]]:
-        """Returns what the peers' scenes take of nodes, and the addresses of those that do not answer."""
-        return await self._every("/v1/cluster", ALL, Cluster)
+        """Returns the peers' cluster descriptions, and the addresses of peers that do not respond."""
+        return await self._ask_all("/v1/cluster", ALL, Cluster)
 
-    async def _every(self, path: str, permission: Permission, model: type[M]) -> tuple[list[M], list[str]]:
+    async def _ask_all(self, path: str, permission: Permission, model: type[M]) -> tuple[list[M], list[str]]:
         peers = await self.addresses()
         answers = await asyncio.gather(*(self._get(address, path, permission) for address in peers))
         replies, silent = [], []
@@ -162,12 +167,12 @@ class Peers:
                 if answer is None or answer.status_code != 200:
                     raise ValueError(answer)
                 replies.append(model.model_validate_json(answer.content))
-            except (ValueError, ValidationError):  # a service of another version may have other words
+            except (ValueError, ValidationError):  # a service of another version may use another schema
                 silent.append(address)
         return replies, silent
 
     async def _has(self, address: str, scene: str) -> bool | None:
-        """Returns whether a peer has a scene; None: it does not say."""
+        """Returns whether a peer owns a scene, or None if the peer gives no valid answer."""
         answer = await self._get(address, f"/v1/scenes/{scene}", ALL)
         if answer is None:
             return None
@@ -190,11 +195,12 @@ class Peers:
         return answer
 
 
-def unreachable(scene: str, *, refused: bool = False) -> Problem:
-    """Makes the answer, 503, where the service that has a scene, or may have it, does not answer.
+def unreachable_problem(scene: str, *, refused: bool = False) -> Problem:
+    """Returns the 503 problem for a scene whose owner, or possible owner, does not respond.
 
     Args:
-        refused: it answers, and refuses the token of this one.
+        scene: id of the scene.
+        refused: whether the peer does respond, but rejects the token of this service.
     """
     fault, remedy = "does not answer", "ask again: what it acknowledged is on disk"
     if refused:
@@ -215,7 +221,7 @@ def _bearer(permission: Permission, secret: str) -> str:
     return Sharing(secret).issue(permission.scene, permission.end or round(time.time()) + LONGEST_SECONDS)
 
 
-def _keep(where: OrderedDict[str, T], scene: str, value: T, most: int) -> None:
+def _remember(where: OrderedDict[str, T], scene: str, value: T, most: int) -> None:
     where[scene] = value
     where.move_to_end(scene)
     while len(where) > most:

@@ -1,4 +1,4 @@
-"""Relays a WebSocket to the peer that has its scene: messages both ways, and how either end closes."""
+"""Relaying of a WebSocket to the peer that owns its scene: messages in both directions, and close codes."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from websockets.typing import Subprotocol
 
 from server import problems
 from server.connections.websocket import limit_messages
-from server.peers.peers import CONNECT_S, SILENT_S, unreachable
+from server.peers.peers import CONNECT_S, SILENT_S, unreachable_problem
 from server.problems import Problem
 
 SWITCHED = 101
-"""Of a handshake that is accepted."""
+"""HTTP status of an accepted handshake."""
 RESTARTS, ABNORMAL = 1012, 1006
-"""The service restarts; what stands for a connection that ended without a word, and is never sent."""
+"""Close codes: the service restarts; the connection ended without a close frame (never sent on the wire)."""
 
 
 async def proxy_websocket(
@@ -33,37 +33,43 @@ async def proxy_websocket(
     receive: Receive,
     send: Send,
 ) -> int:
-    """Relays until either end closes; returns the status with which the peer answered the handshake.
+    """Relays messages until either end closes, and returns the HTTP status of the peer's handshake response.
 
     Args:
-        address: at the peer, `http://…`. headers: for it. most_bytes: of a message of the client.
+        address: URL at the peer, `http://…`.
+        scene: id of the scene.
+        headers: headers of the request to the peer.
+        most_bytes: maximum size of a message from the client.
+        scope: ASGI scope of the client's WebSocket.
+        receive: ASGI receive of the client's WebSocket.
+        send: ASGI send of the client's WebSocket.
 
     Raises:
-        Problem: 503, the peer does not answer.
+        Problem: 503 if the peer does not respond.
     """
     try:
         peer = await connect(
             f"ws{address.removeprefix('http')}",
-            sock=await asyncio.wait_for(_connected(address), CONNECT_S),
+            sock=await asyncio.wait_for(_connect(address), CONNECT_S),
             subprotocols=[Subprotocol(name) for name in scope["subprotocols"]] or None,
             additional_headers=headers,
             user_agent_header=None,
             compression=None,
-            max_size=None,  # what a service sends is bounded by what was asked
-            max_queue=1,  # the peer notices a client that reads slowly, and sends it the newest only
-            open_timeout=SILENT_S,  # it may wake the scene first
+            max_size=None,  # the request bounds the size of messages from the peer
+            max_queue=1,  # lets the peer notice a slow client and send it only the newest messages
+            open_timeout=SILENT_S,  # the peer may have to wake the scene first
             proxy=None,
         )
     except InvalidStatus as refused:
-        await _refused(refused, scope, receive, send)
+        await _refuse_handshake(refused, scope, receive, send)
         return refused.response.status_code
     except (OSError, TimeoutError, WebSocketException):
-        raise unreachable(scene) from None
+        raise unreachable_problem(scene) from None
     limit_messages(scope, most_bytes)
     async with peer:
         assert (await receive())["type"] == "websocket.connect"
         await send({"type": "websocket.accept", "subprotocol": peer.subprotocol})
-        ends = {asyncio.ensure_future(_to_sibling(peer, receive)), asyncio.ensure_future(_from(peer, send))}
+        ends = {asyncio.ensure_future(_to_peer(peer, receive)), asyncio.ensure_future(_from_peer(peer, send))}
         try:
             await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
         finally:
@@ -73,8 +79,11 @@ async def proxy_websocket(
     return SWITCHED
 
 
-async def _connected(address: str) -> socket.socket:
-    """Connects by TCP: a machine that is gone is noticed sooner than a service that is busy."""
+async def _connect(address: str) -> socket.socket:
+    """Returns a connected TCP socket.
+
+    Connecting separately allows a short timeout for an unreachable machine and a long one for a busy service.
+    """
     where = urlsplit(address)
     assert where.hostname is not None
     family = socket.AF_INET6 if ":" in where.hostname else socket.AF_INET
@@ -89,16 +98,16 @@ async def _connected(address: str) -> socket.socket:
     return made
 
 
-async def _to_sibling(peer: ClientConnection, receive: Receive) -> None:
+async def _to_peer(peer: ClientConnection, receive: Receive) -> None:
     while (message := await receive())["type"] == "websocket.receive":
         text = message.get("text")
-        with contextlib.suppress(ConnectionClosed):  # `_from` notifies the client
+        with contextlib.suppress(ConnectionClosed):  # `_from_peer` notifies the client
             await peer.send(message["bytes"] if text is None else text)
     code = message.get("code") or RESTARTS
     await peer.close(code if _may_be_sent(code) else RESTARTS, message.get("reason") or "")
 
 
-async def _from(peer: ClientConnection, send: Send) -> None:
+async def _from_peer(peer: ClientConnection, send: Send) -> None:
     with contextlib.suppress(ConnectionClosed):
         while True:
             message = await peer.recv()
@@ -109,12 +118,12 @@ async def _from(peer: ClientConnection, send: Send) -> None:
 
 
 def _may_be_sent(code: int) -> bool:
-    """RFC 6455, 7.4: some codes stand for what happened, and are on no wire."""
+    """Returns whether a close code may be sent; some codes are reserved for local use (RFC 6455, 7.4)."""
     return 1000 <= code < 5000 and code not in (1004, 1005, ABNORMAL, 1015)
 
 
-async def _refused(refused: InvalidStatus, scope: Scope, receive: Receive, send: Send) -> None:
-    """Answers the handshake as the peer has answered it."""
+async def _refuse_handshake(refused: InvalidStatus, scope: Scope, receive: Receive, send: Send) -> None:
+    """Responds to the client's handshake with the response of the peer."""
     answer = refused.response
     if "websocket.http.response" not in scope.get("extensions", {}):
         problem = Problem(

@@ -13,7 +13,7 @@ from scas4d_core.compact import CompactWriter, FileError, FileHeader
 from scas4d_core.first_frame.calibration.report import effective_rig
 from scas4d_core.storage.history import History
 from server.messages import SceneSpec
-from server.processes.part_labels import fitted
+from server.processes.part_labels import resize_labels
 
 
 def compact_head(spec: SceneSpec, history: History) -> FileHeader:
@@ -74,4 +74,4 @@ def _copied(file: Path, history: History, frames: Sequence[int]) -> int | None:
 
 def _add_parts(writer: CompactWriter, history: History, last: int, labels: NDArray[Any] | None) -> None:
     if labels is not None:
-        writer.add_parts(last, fitted(labels, len(history.gaussians(last))))
+        writer.add_parts(last, resize_labels(labels, len(history.gaussians(last))))

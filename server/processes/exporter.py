@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scas4d_core.errors import InputError, message_of, without_paths
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.storage.history import DamagedFrameError, History, HistoryError
-from server.messages import Damaged, ExportEnded, ExportProgressed, ExportSpec
+from server.messages import DamageFound, ExportEnded, ExportProgressed, ExportSpec
 from server.processes.compact_answers import compact_head
-from server.processes.placement import begin_aside, end_aside, use_one_thread
+from server.processes.placement import enter_background, finish_background, use_one_thread
 from server.storage.disk import free_bytes, no_room
 
 NICE = 15
@@ -34,21 +34,21 @@ class ShortOfRoomError(RuntimeError):
 
 def main(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
     """Runs one export; the service ends the process when it is not wanted any more."""
-    begin_aside(NICE)
+    enter_background(NICE)
     fault: str | None = None
     try:
         _export(spec, connection)
     except Exception as error:  # whatever the core raises, the service goes on and says so
         known = isinstance(error, InputError | HistoryError | ShortOfRoomError) or no_room(error)
         log.warning("scene %s: an export failed: %s", spec.scene.folder.name, error, exc_info=not known)
-        fault = words(error)
-    end_aside(connection, ExportEnded(fault))
+        fault = explain(error)
+    finish_background(connection, ExportEnded(fault))
 
 
-def words(error: Exception) -> str:
+def explain(error: Exception) -> str:
     """Explains to a person why an export failed, without paths of this machine.
 
-    >>> words(InputError("parts: no Gaussian belongs to one", "ask for the parts"))
+    >>> explain(InputError("parts: no Gaussian belongs to one", "ask for the parts"))
     'parts: no Gaussian belongs to one; ask for the parts'
     """
     if isinstance(error, ShortOfRoomError) or no_room(error):
@@ -84,9 +84,9 @@ def _export(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
     folder = spec.file.parent
     try:
         if wanted.needs_parts or spec.format in WITH_PARTS:
-            from server.processes.renderer import Renderer  # it loads what encodes pictures
+            from server.processes.reader_process import QueryReader  # it loads what encodes pictures
 
-            renderer = Renderer(spec.scene)
+            renderer = QueryReader(spec.scene)
             history = renderer.history
             if history.newest.moving.any():
                 labels = renderer.labels(None)
@@ -117,7 +117,7 @@ def _export(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
         )
     finally:
         if history is not None and (faults := history.pop_faults()):
-            connection.send(Damaged(faults))
+            connection.send(DamageFound(faults))
 
 
 def _states(history: History, frames: tuple[int, ...]) -> Iterator[tuple[int, float, Gaussians]]:

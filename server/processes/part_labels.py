@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 log = logging.getLogger("scas4d.renderer")
 
 
-def fitted(labels: NDArray[Any], count: int) -> NDArray[Any]:
+def resize_labels(labels: NDArray[Any], count: int) -> NDArray[Any]:
     """Returns labels for so many Gaussians: those born since have none, and rows only ever come at the end."""
     return np.concatenate([labels, np.full(max(0, count - len(labels)), -1, labels.dtype)])[:count]
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class StoredLabels:
     """Labels [N] and the newest frame that they were found from."""
 
     labels: NDArray[np.int64]
@@ -46,7 +46,7 @@ class PartLabels:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._known: dict[int | None, Known] = {}
+        self._known: dict[int | None, StoredLabels] = {}
 
     def of(self, reader: CommittedScene, history: History, count: int | None) -> NDArray[np.int64]:
         """Returns [N] labels from all committed states; they are computed once for each newest frame.
@@ -59,8 +59,8 @@ class PartLabels:
         if known is None or known.frame != newest:
             before = None
             if known is not None and len(known.labels) == np.count_nonzero(history.born_at <= known.frame):
-                before = fitted(known.labels, history.count)
-            known = Known(reader.parts(count, before), newest)
+                before = resize_labels(known.labels, history.count)
+            known = StoredLabels(reader.parts(count, before), newest)
             self._write(count, known)
         self._known[count] = known
         return known.labels
@@ -68,18 +68,18 @@ class PartLabels:
     def _file(self, count: int | None) -> Path:
         return self._folder / f"{'chosen' if count is None else count}.npz"
 
-    def _read(self, count: int | None) -> Known | None:
+    def _read(self, count: int | None) -> StoredLabels | None:
         file = self._file(count)
         try:
             with file.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
-                return Known(arrays["labels"].astype(np.int64), int(arrays["frame"]))
+                return StoredLabels(arrays["labels"].astype(np.int64), int(arrays["frame"]))
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            log.warning("%s cannot be read (%s): parts are numbered anew", file, error)
+            log.warning("%s cannot be read (%s): parts get new numbers", file, error)
             return None
 
-    def _write(self, count: int | None, known: Known) -> None:
+    def _write(self, count: int | None, known: StoredLabels) -> None:
         arrays: dict[str, Any] = {"labels": known.labels.astype(np.int16), "frame": np.int64(known.frame)}
         file = self._file(count)
         beside = file.with_name(f".{file.name}.{secrets.token_hex(4)}.part")
@@ -89,6 +89,6 @@ class PartLabels:
                 np.savez(opened, **arrays)
             beside.replace(file)
         except OSError as error:  # a full disk costs the numbering after a restart, not the answer
-            log.warning("%s cannot be written (%s): after a restart parts are numbered anew", file, error)
+            log.warning("%s cannot be written (%s): after a restart parts get new numbers", file, error)
             with contextlib.suppress(OSError):
                 beside.unlink()

@@ -26,31 +26,31 @@ Entry = Callable[..., None]
 
 STOP_SECONDS = 5.0
 """Grace for a process to end by itself when a scene or the service stops; an unfinished frame is taken up again."""
-PARENT_EVERY_S = 0.5
+PARENT_CHECK_S = 0.5
 """A process notices so late that the service has ended."""
 
 _context = multiprocessing.get_context("spawn")
 
 
 class ProcessExit(str):
-    """The sentence that says why a process is gone.
+    """A sentence that says why a process ended.
 
     Attributes:
-        exit_code: as in multiprocessing: −N for signal N; None where it is not known.
-        lost: its machine is gone, or cannot be reached. starved: the kernel killed processes beside it for want of
-            memory; None: as this machine's control group allows.
+        exit_code: as in multiprocessing: −N for signal N; None if unknown.
+        lost: its machine is gone or unreachable. out_of_memory: the kernel killed processes of its control group for
+            lack of memory; None: look at the control group of this machine.
     """
 
     exit_code: int | None
     lost: bool
-    starved: bool | None
+    out_of_memory: bool | None
 
     def __new__(
-        cls, exit_code: int | None, why: str = "", *, lost: bool = False, starved: bool | None = None
+        cls, exit_code: int | None, why: str = "", *, lost: bool = False, out_of_memory: bool | None = None
     ) -> ProcessExit:
         """Makes the sentence for an exit code, or takes another."""
         self = super().__new__(cls, why or f"its process ended by itself (exit code {exit_code})")
-        self.exit_code, self.lost, self.starved = exit_code, lost, starved
+        self.exit_code, self.lost, self.out_of_memory = exit_code, lost, out_of_memory
         return self
 
 
@@ -61,13 +61,13 @@ def end_with_parent() -> None:
 
     def watch() -> None:
         while os.getppid() == parent:
-            time.sleep(PARENT_EVERY_S)
+            time.sleep(PARENT_CHECK_S)
         os._exit(0)
 
     threading.Thread(target=watch, daemon=True).start()
 
 
-def begin_aside(nice: int) -> None:
+def enter_background(nice: int) -> None:
     """Begins a process that does one thing beside the updates: less eager than they are, and gone with its parent.
 
     Args:
@@ -78,7 +78,7 @@ def begin_aside(nice: int) -> None:
     end_with_parent()
 
 
-def end_aside(connection: Connection[Any, Any], ended: Any) -> NoReturn:
+def finish_background(connection: Connection[Any, Any], ended: Any) -> NoReturn:
     """Ends it: sends its last message, and waits to be asked to stop. An end of its own would be taken for a fault."""
     with contextlib.suppress(EOFError, OSError):  # the service is gone
         connection.send(ended)
@@ -96,7 +96,7 @@ def use_one_thread() -> None:
     threadpool_limits(1)  # scikit-learn's threads spin while they wait: 16 s for a part query on busy cores
 
 
-class AnyProcess(Protocol):
+class ProcessHandle(Protocol):
     """A running process of a scene, wherever it is."""
 
     @property
@@ -110,7 +110,7 @@ class AnyProcess(Protocol):
         """Asks the process to end, waits for `seconds`, then kills it."""
 
 
-class Process:
+class LocalProcess:
     """A running process on this machine. Two threads move its messages, and the event loop never waits on a pipe."""
 
     def __init__(
@@ -145,11 +145,11 @@ class Process:
         return self._process.pid
 
     def send(self, message: Any) -> None:
-        """See `AnyProcess`."""
+        """See `ProcessHandle`."""
         self._outbox.put(message)
 
     async def stop(self, seconds: float = STOP_SECONDS) -> None:
-        """See `AnyProcess`."""
+        """See `ProcessHandle`."""
         self._stopping = True
         self.send(Stop())
         await asyncio.to_thread(self._join, seconds)
@@ -206,12 +206,12 @@ class Placement:
 
     Attributes:
         fenced: workers get epochs (`server.storage.fencing`): one may go on after it was taken for dead.
-        has_siblings: other services may have scenes of the same cluster.
+        has_peers: other services may have scenes of the same cluster.
         has_labels: it runs processes on nodes that have labels, of which a scene may ask for some.
     """
 
     fenced = False
-    has_siblings = False
+    has_peers = False
     has_labels = False
 
     def __init__(self, prepare: Callable[[], None] | None = None) -> None:
@@ -219,7 +219,7 @@ class Placement:
 
     def start(
         self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[ProcessExit], None]
-    ) -> AnyProcess:
+    ) -> ProcessHandle:
         """Starts a process.
 
         Args:
@@ -228,7 +228,7 @@ class Placement:
             on_message: called on the event loop with every message that the process sends.
             on_end: called on the event loop once, with the reason, when the process ended without being asked to.
         """
-        return Process(entry, spec, on_message, on_end, self.prepare)
+        return LocalProcess(entry, spec, on_message, on_end, self.prepare)
 
     async def cluster(self) -> Cluster | None:
         """The machines on which processes run; None: this one alone."""

@@ -92,7 +92,7 @@ class CompactQuery:
 Query = RenderQuery | TracksQuery | PartsQuery | LabelsQuery | GaussiansQuery | PlyQuery | CompactQuery
 
 
-def asked(query: Query) -> tuple[str, object]:
+def refused_field(query: Query) -> tuple[str, object]:
     """Returns field and value of the part of a query that only the reader can check."""
     if isinstance(query, TracksQuery | GaussiansQuery) and query.ids is not None:
         return "ids", list(query.ids)
@@ -106,7 +106,7 @@ def asked(query: Query) -> tuple[str, object]:
 
 
 @dataclass(frozen=True)
-class AskedQuery:
+class NumberedQuery:
     """A query with a number to find its answer by.
 
     `stale` are frames that were committed, deleted or taken back since the query before; None: any may have been.
@@ -128,7 +128,7 @@ class Answer:
 
 
 @dataclass(frozen=True)
-class Refused:
+class QueryRefused:
     """The query cannot be answered. `status` is that of the HTTP answer; `remedy` may be empty."""
 
     number: int

@@ -19,19 +19,19 @@ from numpy.typing import NDArray
 from server import counters
 from server.messages import SceneSpec
 from server.problems import SERVICE_FAULT, Problem
-from server.processes import renderer, track_answers
+from server.processes import reader_process, track_answers
 from server.processes.placement import STOP_SECONDS, Placement
 from server.processes.queries import (
     Answer,
     GaussiansQuery,
     LabelsQuery,
     Query,
-    Refused,
+    QueryRefused,
     RenderQuery,
     TracksQuery,
-    asked,
+    refused_field,
 )
-from server.processes.query_queue import Noticed, QueryQueue
+from server.processes.query_executor import OnDamage, QueryExecutor
 
 GRACE_VIEWS_S, GRACE_BULK_S = 10.0, 1.0
 """A process may go on for so long with a cancelled query: a new process takes a second or two to start."""
@@ -46,7 +46,7 @@ REMEDIES = {404: NOT_COMMITTED, 500: SERVICE_FAULT, 503: "ask again later"}
 
 
 @dataclass(frozen=True, eq=False)
-class Labels:
+class CachedLabels:
     """Part labels, computed from the frames up to one.
 
     Attributes:
@@ -65,14 +65,14 @@ class Readers:
         views, bulk: the two processes.
     """
 
-    def __init__(self, spec: SceneSpec, placement: Placement, damaged: Noticed) -> None:
+    def __init__(self, spec: SceneSpec, placement: Placement, damaged: OnDamage) -> None:
         self._spec = spec
-        of_all = partial(QueryQueue, spec=spec, placement=placement, damaged=damaged)
-        self.views = of_all(renderer.views, grace=GRACE_VIEWS_S)
-        self.bulk = of_all(renderer.bulk, grace=GRACE_BULK_S)
+        of_all = partial(QueryExecutor, spec=spec, placement=placement, damaged=damaged)
+        self.views = of_all(reader_process.run_view_reader, grace=GRACE_VIEWS_S)
+        self.bulk = of_all(reader_process.run_bulk_reader, grace=GRACE_BULK_S)
         self._commits = 0
-        self._labels: OrderedDict[int | None, Labels] = OrderedDict()
-        self._finding: dict[int | None, asyncio.Task[Labels]] = {}
+        self._labels: OrderedDict[int | None, CachedLabels] = OrderedDict()
+        self._finding: dict[int | None, asyncio.Task[CachedLabels]] = {}
 
     @property
     def busy(self) -> bool:
@@ -97,17 +97,17 @@ class Readers:
             outcome = "cancelled"  # by who asked: no fault
             raise
         finally:
-            counters.ANSWER_SECONDS.labels(query.kind, outcome).observe(time.perf_counter() - began)
+            counters.QUERY_SECONDS.labels(query.kind, outcome).observe(time.perf_counter() - began)
 
     async def _answer(self, query: Query) -> Answer:
         if isinstance(query, TracksQuery):
             return await self._tracks(query)
         if not isinstance(query, RenderQuery):
-            return _checked(await self.bulk.ask(query), query)
+            return _check_answer(await self.bulk.ask(query), query)
         if "parts" not in query.kinds:
-            return _checked(await self.views.ask(query), query)
+            return _check_answer(await self.views.ask(query), query)
         labels = await self._labels_of(query.parts)
-        answer = _checked(await self.views.ask(replace(query, labels=labels.labels)), query)
+        answer = _check_answer(await self.views.ask(replace(query, labels=labels.labels)), query)
         return replace(answer, headers={**answer.headers, "X-Parts-Frame": labels.frame})
 
     def refresh(self, frames: tuple[int, ...] | None = None) -> None:
@@ -127,13 +127,13 @@ class Readers:
 
     async def _tracks(self, query: TracksQuery) -> Answer:
         """Answers a track query; a long one in pieces, so that others come in between."""
-        pieces = track_answers.pieces(query)
+        pieces = track_answers.split_query(query)
         if len(pieces) * len(pieces[0]) == 1:
-            return _checked(await self.bulk.ask(query), query)
-        answers = [[_checked(await self.bulk.ask(piece), piece).body for piece in row] for row in pieces]
-        return Answer(0, *await asyncio.to_thread(track_answers.together, answers, query, self._spec))
+            return _check_answer(await self.bulk.ask(query), query)
+        answers = [[_check_answer(await self.bulk.ask(piece), piece).body for piece in row] for row in pieces]
+        return Answer(0, *await asyncio.to_thread(track_answers.join_and_encode, answers, query, self._spec))
 
-    async def _labels_of(self, count: int | None) -> Labels:
+    async def _labels_of(self, count: int | None) -> CachedLabels:
         """Returns the part labels for a view; only the first call waits, later ones get the labels found last.
 
         They are found from the whole history, which takes longer than a view. After a commit they are found anew while
@@ -143,18 +143,18 @@ class Readers:
         if known is not None and known.commits == self._commits:
             return known
         if count not in self._finding:
-            task = asyncio.ensure_future(self._find(count))
+            task = asyncio.ensure_future(self._start_finding(count))
             self._finding[count] = task
-            task.add_done_callback(partial(self._found, count))
+            task.add_done_callback(partial(self._on_labels, count))
         return await asyncio.shield(self._finding[count]) if known is None else known
 
-    async def _find(self, count: int | None) -> Labels:
+    async def _start_finding(self, count: int | None) -> CachedLabels:
         commits = self._commits
-        answer = _checked(await self.bulk.ask(LabelsQuery(count)), LabelsQuery(count))
+        answer = _check_answer(await self.bulk.ask(LabelsQuery(count)), LabelsQuery(count))
         labels = np.frombuffer(answer.body, "<i2")
-        return Labels(commits, answer.headers["X-Parts-Frame"], labels)
+        return CachedLabels(commits, answer.headers["X-Parts-Frame"], labels)
 
-    def _found(self, count: int | None, task: asyncio.Task[Labels]) -> None:
+    def _on_labels(self, count: int | None, task: asyncio.Task[CachedLabels]) -> None:
         del self._finding[count]
         if task.cancelled() or task.exception() is not None:
             return
@@ -164,13 +164,13 @@ class Readers:
             self._labels.popitem(last=False)
 
 
-def _checked(answer: Answer | Refused, query: Query) -> Answer:
+def _check_answer(answer: Answer | QueryRefused, query: Query) -> Answer:
     if isinstance(answer, Answer):
         return answer
     if answer.status != 422 and not (answer.status == 404 and isinstance(query, GaussiansQuery)):
         remedy = answer.remedy or REMEDIES[answer.status]
         headers = {"Retry-After": "1"} if answer.status == 503 else None
         raise Problem(answer.status, answer.fault, remedy=remedy, headers=headers)
-    field, value = asked(query)
+    field, value = refused_field(query)
     remedy = answer.remedy or f"give another {field}"
     raise Problem(answer.status, answer.fault, field=field, value=value, remedy=remedy)

@@ -9,8 +9,8 @@ from typing import Any
 
 from scas4d_core.errors import message_of
 from scas4d_core.storage.history import History
-from server.messages import Damaged, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated
-from server.processes.placement import begin_aside, end_aside, use_one_thread
+from server.messages import DamageFound, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated
+from server.processes.placement import enter_background, finish_background, use_one_thread
 from server.processes.worker import decode, read
 
 NICE = 15
@@ -23,14 +23,14 @@ log = logging.getLogger("scas4d.replayer")
 
 def main(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
     """Runs one replay; the service ends the process when its answer is not wanted any more."""
-    begin_aside(NICE)
+    enter_background(NICE)
     fault: str | None = None
     try:
         _replay(spec, connection)
     except Exception as error:  # whatever the core raises, the service goes on and says so
         log.exception("scene %s: the replay failed", spec.scene.folder.name)
         fault = f"{type(error).__name__}: {message_of(error)}"
-    end_aside(connection, ReplayEnded(fault))
+    finish_background(connection, ReplayEnded(fault))
 
 
 def _replay(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
@@ -43,7 +43,7 @@ def _replay(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
             history.gaussians(index)
     finally:
         if faults := history.pop_faults():
-            connection.send(Damaged(faults))
+            connection.send(DamageFound(faults))
     from scas4d_core.replay import replay  # in this process only: the one that imports this module stays light
     from scas4d_core.warm_up import compile_in_processes
 

@@ -21,7 +21,7 @@ KEPT_BYTES = 32_000_000
 AskReaders = Callable[[Query], Awaitable[Answer]]
 
 
-class Question(Protocol):
+class SharedQuery(Protocol):
     """A query and the key that is the same for all who would get the same answer."""
 
     @property
@@ -33,7 +33,7 @@ class Question(Protocol):
         """The query to the readers."""
 
 
-Q = TypeVar("Q", bound=Question)
+Q = TypeVar("Q", bound=SharedQuery)
 
 
 def fingerprint(value: Any) -> Hashable:

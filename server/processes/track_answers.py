@@ -56,7 +56,7 @@ def cameras_of(query: TracksQuery) -> list[Camera]:
     return own + [camera for camera in query.project if camera.name not in names]
 
 
-def find(reader: CommittedScene, history: History, query: TracksQuery) -> Arrays:
+def compute_tracks(reader: CommittedScene, history: History, query: TracksQuery) -> Arrays:
     """Computes trajectories: ``tracks_world`` [T, Q, 3], ``confidence`` [T, Q] and more, as in docs/tracks.md."""
     frames = list(query.frames)
     if query.ids is not None:
@@ -79,7 +79,7 @@ def find(reader: CommittedScene, history: History, query: TracksQuery) -> Arrays
     }
 
 
-def encoded(found: Arrays, query: TracksQuery, metres_per_unit: float) -> tuple[bytes, str]:
+def encode(found: Arrays, query: TracksQuery, metres_per_unit: float) -> tuple[bytes, str]:
     """Returns body and media type of the answer, in the format that the query asks for."""
     cameras = cameras_of(query)
     pixels = {camera.name: camera.project(found["tracks_world"])[0] for camera in cameras}
@@ -110,7 +110,7 @@ def _layout(found: Arrays, query: TracksQuery, cameras: Sequence[Camera], metres
     )
 
 
-def pieces(query: TracksQuery) -> list[list[TracksQuery]]:
+def split_query(query: TracksQuery) -> list[list[TracksQuery]]:
     """Cuts a query by points, then by frames; a short one stays one piece. Every piece is answered as npz."""
     queries = next(value for value in (query.ids, query.pixels, query.points) if value is not None)
     frames = min(PIECE_POINTS // min(len(queries), PIECE_QUERIES), PIECE_VIEWS // max(1, len(cameras_of(query))))
@@ -123,9 +123,9 @@ def pieces(query: TracksQuery) -> list[list[TracksQuery]]:
     ]
 
 
-def joined(answers: Sequence[Sequence[bytes]]) -> Arrays:
+def join_answers(answers: Sequence[Sequence[bytes]]) -> Arrays:
     """Joins the answers of pieces: inner ones follow each other in time, outer ones hold more points."""
-    rows = [_in_time([_found(body) for body in row]) for row in answers]
+    rows = [_join_in_time([_read_npz(body) for body in row]) for row in answers]
     once = ("frames", "times")
     return {
         name: rows[0][name]
@@ -135,19 +135,19 @@ def joined(answers: Sequence[Sequence[bytes]]) -> Arrays:
     }
 
 
-def together(answers: Sequence[Sequence[bytes]], query: TracksQuery, spec: SceneSpec) -> tuple[bytes, str]:
+def join_and_encode(answers: Sequence[Sequence[bytes]], query: TracksQuery, spec: SceneSpec) -> tuple[bytes, str]:
     """Joins the answers of pieces; returns body and media type of the whole answer."""
-    return encoded(joined(answers), query, metres_per_unit(spec))
+    return encode(join_answers(answers), query, metres_per_unit(spec))
 
 
-def _in_time(found: Sequence[Arrays]) -> Arrays:
+def _join_in_time(found: Sequence[Arrays]) -> Arrays:
     return {
         name: found[0][name] if name == "ids" else np.concatenate([piece[name] for piece in found]) for name in found[0]
     }
 
 
-def _found(body: bytes) -> Arrays:
-    """Reads the arrays of ``find`` from an answer as npz."""
+def _read_npz(body: bytes) -> Arrays:
+    """Reads the arrays of ``compute_tracks`` from an answer as npz."""
     names = ("tracks_world", "confidence", "ids", "frames", "times")
     with np.load(io.BytesIO(body), allow_pickle=False) as file:
         return {name: file[name] for name in file.files if name in names or name.startswith("visibility.")}

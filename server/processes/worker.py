@@ -24,27 +24,27 @@ from scas4d_core.errors import message_of
 from scas4d_core.storage.history import History, HistoryError
 from scas4d_core.storage.npz import read_npz
 from server.messages import (
-    Broken,
+    ChangeRetention,
     FrameCommitted,
+    FrameFailedInWorker,
     FrameReady,
-    KeepStates,
     Progressed,
     Ready,
     RecomputeState,
     RepairFiles,
+    ResumeFailed,
     SceneSpec,
-    Stalled,
     StatesRetained,
     Stop,
-    UpdateFailed,
+    WaitingForDisk,
 )
-from server.processes.compacting import Compacting
 from server.processes.kernels import wait_for_first, wait_for_updates
 from server.processes.placement import end_with_parent
+from server.processes.state_compactor import StateCompactor
 from server.repair import repairs
-from server.repair.repairs import mend_at_start
-from server.storage.disk import alone, no_room
-from server.storage.frame_store import FrameDamage, holds, read_pictures
+from server.repair.repairs import repair_at_start
+from server.storage.disk import lock_states, no_room
+from server.storage.frame_store import FrameDamage, has_record, read_pictures
 from server.storage.ledger import frame_identity
 
 if TYPE_CHECKING:
@@ -63,18 +63,18 @@ def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the service says when to stop
     os.nice(NICE)
     end_with_parent()
-    lock = alone(spec.folder)
+    lock = lock_states(spec.folder)
     worker = Worker(spec, connection)
     try:
-        if worker.open():
+        if worker.resume():
             while not isinstance(message := worker.next(), Stop):
                 match message:
                     case FrameReady():
-                        worker.take(message)
-                    case KeepStates():
-                        worker.keep(message)
+                        worker.handle_frame(message)
+                    case ChangeRetention():
+                        worker.set_retention(message)
                     case RepairFiles():
-                        worker.mend(message)
+                        worker.repair(message)
                     case RecomputeState():
                         worker.recompute(message)
     except (EOFError, OSError) as error:
@@ -94,7 +94,7 @@ class _Stopped(Exception):
 
 
 class Worker:
-    """Updates one scene. Every frame ends as `FrameCommitted` or `UpdateFailed`, or with the process."""
+    """Updates one scene. Every frame ends as `FrameCommitted` or `FrameFailedInWorker`, or with the process."""
 
     def __init__(self, spec: SceneSpec, connection: Connection[Any, Any]) -> None:
         self.spec = spec
@@ -108,9 +108,9 @@ class Worker:
         self._write_seconds: float | None = None
         self._publish_seconds = 0.0
         self._later: deque[Any] = deque()
-        self._compacting = Compacting(spec)
+        self._compacting = StateCompactor(spec)
 
-    def open(self) -> bool:
+    def resume(self) -> bool:
         """Resumes from the committed states and reports them; returns False if that cannot be done."""
         try:
             self.states = history = History.open(self.spec.folder.states)
@@ -122,21 +122,21 @@ class Worker:
                 wait_for_updates(self.spec.settings, None)
                 self._compiled = True
                 self.reconstruction = Reconstruction.resume(
-                    self.spec.rig, self.spec.settings, history, held=lambda index: holds(self._pictures, index)
+                    self.spec.rig, self.spec.settings, history, held=lambda index: has_record(self._pictures, index)
                 )
                 if self.reconstruction.resumed is not None:
                     undone = tuple(self.reconstruction.resumed.undone)
                     faults = tuple(self.reconstruction.resumed.faults)
-                faults += tuple(mend_at_start(history))
+                faults += tuple(repair_at_start(history))
             report = history.report(history.indices[-1]) if history.indices else {}
             self.connection.send(Ready(tuple(history.indices), dict(history.damaged), report, undone, faults))
         except (HistoryError, ValueError) as error:  # what is damaged says so with a ValueError
-            log.exception("scene %s cannot be taken up again", self.spec.folder.name)
-            self.connection.send(Broken(f"{type(error).__name__}: {message_of(error)}"))
+            log.exception("scene %s cannot be resumed", self.spec.folder.name)
+            self.connection.send(ResumeFailed(f"{type(error).__name__}: {message_of(error)}"))
             return False
         return True
 
-    def take(self, message: FrameReady) -> None:
+    def handle_frame(self, message: FrameReady) -> None:
         """Reconstructs one frame; while the disk is full, tries again until there is room."""
         stall = STALL_S
         while True:
@@ -150,14 +150,14 @@ class Worker:
                 if not no_room(error):
                     raise
                 log.warning("scene %s, frame %d: %s", self.spec.folder.name, message.index, error)
-                self.connection.send(Stalled(message.index, message_of(error), stall))
+                self.connection.send(WaitingForDisk(message.index, message_of(error), stall))
             self._await_room(stall)
             stall = min(2 * stall, LONGEST_STALL_S)
 
     def next(self) -> Any:
         """Returns the next message; those that came while a frame waited for room go first. Compacts meanwhile."""
-        if self.states is not None and len(self.states) > (self.spec.kept.exact_states or len(self.states)):
-            self._compacting.meanwhile(self.states, lambda: bool(self._later) or self.connection.poll(0))
+        if self.states is not None and len(self.states) > (self.spec.retention.exact_states or len(self.states)):
+            self._compacting.compact_while_idle(self.states, lambda: bool(self._later) or self.connection.poll(0))
         return self._later.popleft() if self._later else self.connection.recv()
 
     def _await_room(self, seconds: float) -> None:
@@ -173,7 +173,7 @@ class Worker:
                 raise _Stopped
             self._later.append(message)
 
-    def finish(self, message: FrameReady) -> FrameCommitted | UpdateFailed:
+    def finish(self, message: FrameReady) -> FrameCommitted | FrameFailedInWorker:
         """Commits a frame, or returns the reason why it fails.
 
         Raises:
@@ -186,28 +186,30 @@ class Worker:
             least = self.spec.minimum_cameras
             if len(frame.images) < least:
                 reason = f"{len(frame.images)} cameras' pictures are left, the scene's minimum is {least}"
-                return UpdateFailed(message.index, reason, dropped)
+                return FrameFailedInWorker(message.index, reason, dropped)
             return self.reconstruct(frame, dropped, message.budget, began)
         except FrameDamage as error:
-            return UpdateFailed(message.index, f"its record in the frame log is damaged: {error}", dropped)
+            return FrameFailedInWorker(message.index, f"its record in the frame log is damaged: {error}", dropped)
         except Exception as error:  # whatever the core raises, the service goes on and says so
             if no_room(error):
                 raise
             log.exception("scene %s, frame %d", self.spec.folder.name, message.index)
             # Without a first frame there is nothing to go on from.
             first = self.reconstruction is None
-            return UpdateFailed(message.index, f"{type(error).__name__}: {message_of(error)}", dropped, fatal=first)
+            return FrameFailedInWorker(
+                message.index, f"{type(error).__name__}: {message_of(error)}", dropped, fatal=first
+            )
 
-    def keep(self, message: KeepStates) -> None:
+    def set_retention(self, message: ChangeRetention) -> None:
         """Keeps states by other rules, and reports which that deletes."""
-        self.spec = replace(self.spec, kept=message.rules)
-        self._compacting.keep(message.rules)
+        self.spec = replace(self.spec, retention=message.rules)
+        self._compacting.set_rules(message.rules)
         self.connection.send(StatesRetained(tuple(self.retain())))
 
-    def mend(self, message: RepairFiles) -> None:
+    def repair(self, message: RepairFiles) -> None:
         """Checks files that were found damaged, and reports the outcome of each."""
         assert self.states is not None
-        for mended in repairs.mend(self.states, self.reconstruction, message):
+        for mended in repairs.repair_files(self.states, self.reconstruction, message):
             self.connection.send(mended)
 
     def recompute(self, message: RecomputeState) -> None:
@@ -218,7 +220,7 @@ class Worker:
         def pictures() -> tuple[Frame, dict[str, str]]:
             return decode(self.spec.rig, frame, read(self._pictures, frame))
 
-        for mended in repairs.recompute(self.spec, self.states, message, pictures):
+        for mended in repairs.recompute_state(self.spec, self.states, message, pictures):
             self.connection.send(mended)
 
     def reconstruct(self, frame: Frame, dropped: dict[str, str], budget: Budget, began: float) -> FrameCommitted:
@@ -260,7 +262,7 @@ class Worker:
     def retain(self) -> list[int]:
         """Deletes old states by the scene's rule and returns their indices; failures are tried again next time."""
         assert self.states is not None
-        rule = self.spec.kept.keep_states
+        rule = self.spec.retention.keep_states
         last, size = (None if value is None else max(1, value) for value in (rule.last, rule.bytes))
         return self.states.retain(last=last, size_bytes=size)
 

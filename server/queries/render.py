@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from client.wire import RenderFormat, RenderRequest
-from server.problems import Problem, counted
+from server.problems import Problem, count_noun
 from server.processes.queries import RenderQuery
 from server.scene.scene import Scene
 
@@ -36,7 +36,7 @@ def render_query(scene: Scene, request: RenderRequest) -> RenderQuery:
     if request.format not in SEVERAL and len(kinds) > 1:
         raise Problem(
             422,
-            f"{request.format} cannot hold {counted(len(kinds), 'kind')}",
+            f"{request.format} cannot contain {count_noun(len(kinds), 'kind')}",
             field="kinds",
             value=", ".join(kinds),
             remedy="ask for one kind, or for npz or float32",

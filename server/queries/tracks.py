@@ -9,7 +9,7 @@ import numpy as np
 
 from client.wire import CameraModel, TracksRequest
 from scas4d_core.cameras import Camera
-from server.problems import Problem, counted
+from server.problems import Problem, count_noun
 from server.processes import track_answers
 from server.processes.queries import TracksQuery
 from server.queries.render import MOST_PIXELS
@@ -55,7 +55,7 @@ def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
     if len(queries) * len(frames) > MOST_POINTS:
         raise Problem(
             422,
-            f"{counted(len(queries), 'point')} over {counted(len(frames), 'frame')}",
+            f"{count_noun(len(queries), 'point')} over {count_noun(len(frames), 'frame')}",
             field=field,
             value=len(queries) * len(frames),
             remedy=f"ask for at most {MOST_POINTS} points times frames at once",
@@ -63,7 +63,7 @@ def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
     if request.format == "json" and len(queries) * len(frames) > MOST_JSON_POINTS:
         raise Problem(
             422,
-            f"{counted(len(queries), 'point')} over {counted(len(frames), 'frame')} as JSON",
+            f"{count_noun(len(queries), 'point')} over {count_noun(len(frames), 'frame')} as JSON",
             field="format",
             value="json",
             remedy=f"ask for npz, or for at most {MOST_JSON_POINTS} points times frames",
@@ -92,7 +92,7 @@ def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
         camera=None if request.camera is None else _camera(scene, request.camera),
         pixels=None if request.pixels is None else np.array(request.pixels),
         points=None if request.points is None else np.array(request.points),
-        project=_different([_camera(scene, camera) for camera in request.project]),
+        project=_check_camera_names([_camera(scene, camera) for camera in request.project]),
         format=request.format,
     )
     _check_pixels(query)
@@ -100,7 +100,7 @@ def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
     if len(cameras) * len(frames) > MOST_VIEWS:
         raise Problem(
             422,
-            f"visibility in {counted(len(cameras), 'camera')} over {counted(len(frames), 'frame')}",
+            f"visibility in {count_noun(len(cameras), 'camera')} over {count_noun(len(frames), 'frame')}",
             field="project" if request.project else "camera",
             value=len(cameras) * len(frames),
             remedy=f"ask for at most {MOST_VIEWS} cameras times frames: fewer frames or cameras at once",
@@ -125,7 +125,7 @@ def _check_pixels(query: TracksQuery) -> None:
         )
 
 
-def _different(cameras: list[Camera]) -> tuple[Camera, ...]:
+def _check_camera_names(cameras: list[Camera]) -> tuple[Camera, ...]:
     """Checks that cameras of one name are the same: answers go by the name."""
     by_name: dict[str, Camera] = {}
     for camera in cameras:
@@ -161,5 +161,5 @@ def check_ids(ids: Iterable[int]) -> None:
     """Refuses ids that no Gaussian can have."""
     for id in ids:
         if not 0 <= id <= LARGEST_ID:
-            remedy = "take ids out of an answer"
+            remedy = "take ids from an answer"
             raise Problem(422, f"no Gaussian can have the id {id}", field="ids", value=id, remedy=remedy)

@@ -1,1 +1,1 @@
-"""Finds damaged files and repairs them."""
+"""Detection and repair of damaged files."""

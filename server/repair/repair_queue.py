@@ -1,8 +1,8 @@
-"""Decides about damage that is found while a scene runs: reports it, and has the worker write or make states again.
+"""Queue of repairs for damage found while a scene runs; the worker rewrites or recomputes the affected states.
 
-Damaged files of the states' folder are noticed by a reader, a replay or a scrub. Between two frames the worker checks
-each and writes again what it has in memory or as a copy. Other states are made again from their pictures when no frame
-waits; until then queries for them get 503, and where that is not possible the state is reported as lost.
+Readers, replays and scrubs report damaged files of the states folder. Between two frames, the worker checks each file
+and rewrites it from memory or from a copy if possible. Other states are recomputed from their images when no frame is
+waiting, and queries for them return 503 until then. If recomputation is impossible, the state is reported as lost.
 """
 
 from __future__ import annotations
@@ -24,19 +24,21 @@ from server.storage.events import StatesDeleted
 from server.storage.ledger import SceneLog
 
 SENTENCES_KEPT = 100
-"""Sentences about damage that are kept: the newest."""
-AGAIN_S = 5.0
-"""RepairQueue for which the disk had no room is tried again after so long."""
-OF_RECOMPUTE = frozenset({RepairOutcome.RECOMPUTED, RepairOutcome.LOST, RepairOutcome.LATER, RepairOutcome.NO_ROOM})
-"""Outcomes that end the remaking of a state; others may be of the same file, asked about before."""
-DEATHS = 2
-"""A state is given up after so many deaths of the worker while it made it again."""
+"""Maximum number of damage messages kept; the oldest are dropped."""
+RETRY_S = 5.0
+"""Seconds before a repair that failed because of a full disk is retried."""
+RECOMPUTE_OUTCOMES = frozenset(
+    {RepairOutcome.RECOMPUTED, RepairOutcome.LOST, RepairOutcome.LATER, RepairOutcome.NO_ROOM}
+)
+"""Outcomes that end the recomputation of a state; others may answer an earlier request for the same file."""
+MAX_DEATHS = 2
+"""Number of worker crashes during the recomputation of a state after which the state is given up."""
 
 log = logging.getLogger("scas4d.server")
 
 
 class DamageKind(StrEnum):
-    """Kinds of damaged file."""
+    """Kinds of damaged files."""
 
     STATE = "state"
     CHECKPOINT = "checkpoint"
@@ -48,12 +50,12 @@ class DamageKind(StrEnum):
 
 
 class DamageLog:
-    """Sentences about damage found in one scene; the newest, so that a dying disk does not fill the memory.
+    """Log of the newest damage messages of one scene, limited so that a failing disk does not fill the memory.
 
-    A sentence that comes again is counted, or left out where it is of the same damage.
+    A repeated message is counted, or ignored if it concerns the same lasting damage.
 
     Args:
-        sentences: from the start of the service.
+        sentences: messages from the recovery of the scene.
     """
 
     def __init__(self, sentences: Iterable[str] = ()) -> None:
@@ -62,8 +64,8 @@ class DamageLog:
         for sentence in sentences:
             self._keep(without_paths(sentence))
 
-    def say(self, kind: DamageKind, sentence: str, *, lasting: bool = False) -> None:
-        """Adds a sentence. `lasting`: nothing mends the damage, and each check finds it again."""
+    def add(self, kind: DamageKind, sentence: str, *, lasting: bool = False) -> None:
+        """Adds a message; `lasting` marks damage that cannot be repaired, so that every check finds it again."""
         sentence = without_paths(sentence)
         if lasting and sentence in self._counts:
             return
@@ -78,22 +80,24 @@ class DamageLog:
 
     @property
     def sentences(self) -> list[str]:
-        """The newest sentences, in order; the first one says how many came before them."""
+        """Newest messages in order, preceded by the number of older ones, if any."""
         before = [f"{self._more} more before these; the service's log has them"] if self._more else []
         return [*before, *(text if count == 1 else f"{text} ({count} times)" for text, count in self._counts.items())]
 
 
 class RepairQueue:
-    """Mends the damage of one scene. On the event loop.
+    """Repair queue of one scene. All methods run on the event loop.
 
     Args:
-        log, damage, background: of the scene.
-        to_worker: posts a message; returns False where no worker can receive one.
-        recompute: frames whose states were found damaged at the start, with the reason.
+        log: journal, ledger and frame log of the scene.
+        damage: damage messages of the scene.
+        background: background tasks of the scene.
+        to_worker: sends a message to the worker and returns False if no worker can receive it.
+        recompute: frames whose states were found damaged during recovery, with the reason.
 
     Attributes:
-        at_work: the frame whose state the worker is making again, or None.
-        waiting: frames whose states are to be made again, with the reason: their pictures are needed.
+        at_work: frame whose state the worker is recomputing, or None.
+        waiting: frames whose states must be recomputed, with the reason. Their images must be kept.
     """
 
     def __init__(
@@ -110,7 +114,7 @@ class RepairQueue:
         self._damage = damage
         self._background = background
         self._to_worker = to_worker
-        self._asked: dict[str, str] = {}
+        self._requested: dict[str, str] = {}
         self.waiting: dict[int, str] = {}
         self._deaths: dict[int, int] = {}
         self._timers: dict[str, asyncio.TimerHandle] = {}
@@ -121,35 +125,39 @@ class RepairQueue:
             self._decide(index, reason)
 
     @property
-    def trouble(self) -> str | None:
-        """A sentence about damage that is being mended, or None."""
+    def current_repair(self) -> str | None:
+        """Message about damage that is being repaired, or None."""
         if self.waiting:
-            return f"the state of frame {min(self.waiting)} was damaged on disk and is being made again"
-        if self._asked:
-            return f"{next(iter(self._asked))} was found damaged on disk and is being checked"
+            return f"the state of frame {min(self.waiting)} was damaged on disk and is being recomputed"
+        if self._requested:
+            return f"{next(iter(self._requested))} was found damaged on disk and is being checked"
         return None
 
-    def noticed(self, files: Mapping[str, str]) -> None:
-        """Has the worker check files of the states' folder that could not be read, by name with the reason."""
+    def report_damage(self, files: Mapping[str, str]) -> None:
+        """Requests that the worker checks unreadable files of the states folder.
+
+        Args:
+            files: reason of the fault by file name.
+        """
         new = {}
         for name, reason in files.items():
             index = frame_of(name)
             entry = None if index is None else self._ledger.frames.get(index)
             gone = index is not None and (entry is None or entry.deleted or entry.state != FrameState.COMMITTED)
-            if not gone and name not in self._asked and index not in self.waiting:
+            if not gone and name not in self._requested and index not in self.waiting:
                 new[name] = reason
-        self._asked |= new
+        self._requested |= new
         self._ask(new)
 
-    def taken_up(self, damaged: Mapping[int, str]) -> None:
-        """Asks a new worker about all that the one before did not answer, and about states that it found damaged."""
+    def resume(self, damaged: Mapping[int, str]) -> None:
+        """Resends unanswered requests to a new worker and adds the damaged states that it found."""
         if self.at_work is not None:
             self._deaths[self.at_work] = self._deaths.get(self.at_work, 0) + 1
-            if self._deaths[self.at_work] >= DEATHS:
-                self._lost(self.at_work, "the worker died each time that it was made again")
+            if self._deaths[self.at_work] >= MAX_DEATHS:
+                self._give_up(self.at_work, "the worker died each time that it was made again")
             self.at_work = None
-        self._ask(self._asked)
-        self.noticed({frame_file(index): reason for index, reason in damaged.items()})
+        self._ask(self._requested)
+        self.report_damage({frame_file(index): reason for index, reason in damaged.items()})
 
     def _ask(self, names: Iterable[str]) -> None:
         known: dict[int, dict[str, Any]] = {}
@@ -164,22 +172,22 @@ class RepairQueue:
             self._to_worker(RepairFiles(message, times, known))
 
     def begin(self) -> float:
-        """Gives an idle worker the next state to make again, if one waits.
+        """Sends the next waiting state to an idle worker for recomputation.
 
         Returns:
-            The seconds until this is to be called again, where the disk was full; else 0.
+            The seconds after which to call this method again if the disk was full, otherwise 0.
         """
         if (left := self._full_until - asyncio.get_running_loop().time()) > 0:
             return left
         for index in sorted(self.waiting):
             base = self._base(index)
             if base is None:
-                self._lost(index, "the state before it cannot be read")
+                self._give_up(index, "the state before it cannot be read")
                 continue
             entry = self._ledger.frames[index]
             receipt = entry.receipt
             if receipt is None or not entry.files:
-                self._lost(index, "its pictures are no longer held")
+                self._give_up(index, "its pictures are no longer held")
                 continue
             frame = FrameReady(index, receipt.time, entry.files, receipt.identity, self._ledger.budget_of(index))
             if self._to_worker(RecomputeState(frame, base)):
@@ -188,108 +196,110 @@ class RepairQueue:
         return 0.0
 
     def handle_result(self, message: RepairResult) -> tuple[int, ...]:
-        """Acts on the worker's answer about a file or a state; returns the frames that readers have to read again."""
+        """Handles the worker's repair result and returns the frames that readers must reload."""
         index = frame_of(message.name)
-        reason = self._asked.pop(message.name, message.reason)
-        if index is not None and index == self.at_work and message.outcome in OF_RECOMPUTE:
+        reason = self._requested.pop(message.name, message.reason)
+        if index is not None and index == self.at_work and message.outcome in RECOMPUTE_OUTCOMES:
             self.at_work = None
         match message.outcome:
             case RepairOutcome.WHOLE:
                 log.warning("%s could not be read once (%s), and is whole", message.name, reason)
             case RepairOutcome.WRITTEN:
-                self._say(message.name, f"{message.reason}; it was written again, and nothing is lost")
+                self._log_damage(message.name, f"{message.reason}; it was written again, and nothing is lost")
             case RepairOutcome.REPORT_LOST:
-                self._say(
+                self._log_damage(
                     message.name, f"{message.reason}; its state is whole and was written again, its report is lost"
                 )
             case RepairOutcome.DAMAGED if index is not None:
                 self._decide(index, message.reason)
             case RepairOutcome.DAMAGED if checkpoint_of(message.name) is not None:
-                self._say(message.name, f"{message.reason}; it is needed by nothing but a second damage", lasting=True)
+                self._log_damage(
+                    message.name, f"{message.reason}; it is needed by nothing but a second damage", lasting=True
+                )
             case RepairOutcome.DAMAGED:
-                self._say(message.name, f"{message.reason}; it cannot be made again", lasting=True)
+                self._log_damage(message.name, f"{message.reason}; it cannot be recomputed", lasting=True)
             case RepairOutcome.RECOMPUTED:
                 assert index is not None
                 reason = self.waiting.pop(index, reason)
                 self._ledger.frames.set_unreadable(index, False)
-                self._ledger.frames.amend(index, message.report)
-                self._say(
+                self._ledger.frames.replace_record(index, message.report)
+                self._log_damage(
                     message.name,
                     f"frame {index}: {reason}; its state was made again from its pictures, not with the same bits",
                 )
             case RepairOutcome.LOST:
                 assert index is not None
-                self._lost(index, message.reason)
+                self._give_up(index, message.reason)
             case RepairOutcome.NO_ROOM:
                 if index is None or index not in self.waiting:
-                    self._asked[message.name] = reason
+                    self._requested[message.name] = reason
                     self._ask_later(message.name)
                 else:
-                    self._full_until = asyncio.get_running_loop().time() + AGAIN_S
+                    self._full_until = asyncio.get_running_loop().time() + RETRY_S
             case RepairOutcome.GONE | RepairOutcome.LATER:
                 pass
         return () if index is None else (index,)
 
     def _ask_later(self, name: str) -> None:
-        """Asks about a file again after a while; there is one timer a file, however often it is asked about."""
+        """Schedules another check of a file, with at most one timer per file."""
         if self._stopped:
             return
         if (timer := self._timers.pop(name, None)) is not None:
             timer.cancel()
-        self._timers[name] = asyncio.get_running_loop().call_later(AGAIN_S, self._ask_again, name)
+        self._timers[name] = asyncio.get_running_loop().call_later(RETRY_S, self._ask_again, name)
 
     def _ask_again(self, name: str) -> None:
-        if name in self._asked:
+        if name in self._requested:
             self._ask({name})
 
-    def retired(self, frames: Iterable[int]) -> None:
-        """Forgets states that retention has deleted."""
+    def forget_states(self, frames: Iterable[int]) -> None:
+        """Drops repairs of states that retention has deleted."""
         for index in frames:
-            self._asked.pop(frame_file(index), None)
+            self._requested.pop(frame_file(index), None)
             if self.waiting.pop(index, None) is not None:
                 self._ledger.frames.set_unreadable(index, False)
 
     def stop(self) -> None:
-        """Cancels the timers, and starts no other."""
+        """Cancels all timers and prevents new ones."""
         self._stopped = True
         for timer in self._timers.values():
             timer.cancel()
 
     def _decide(self, index: int, reason: str) -> None:
-        """Queues a damaged state to be made again from its pictures, or gives it up."""
+        """Queues a damaged state for recomputation from its images, or gives it up."""
         entry = self._ledger.frames[index]
         degraded = None if entry.record is None else entry.record.get("degraded")
         self.waiting[index] = reason
         self._ledger.frames.set_unreadable(index, True)
         if not entry.files:
-            self._lost(index, "its pictures are no longer held")
+            self._give_up(index, "its pictures are no longer held")
         elif degraded is not None:
-            self._lost(index, f"it was {degraded}")
+            self._give_up(index, f"it was {degraded}")
         elif self._base(index) is None:
-            self._lost(index, "the state before it cannot be read")
+            self._give_up(index, "the state before it cannot be read")
 
     def _base(self, index: int) -> int | None:
-        """Returns the committed frame that a frame was updated from; None where its state is gone."""
+        """Returns the committed frame from which a frame was updated, or None if its state no longer exists."""
         for before in range(index - 1, -1, -1):
             entry = self._ledger.frames[before]
             if entry.state == FrameState.COMMITTED:
                 return None if entry.deleted else before
         return None
 
-    def _lost(self, index: int, why: str) -> None:
+    def _give_up(self, index: int, why: str) -> None:
         reason = self.waiting.pop(index, "its state is damaged")
-        sentence = f"the state of frame {index} was damaged on disk and cannot be made again: {why}"
+        sentence = f"the state of frame {index} was damaged on disk and cannot be recomputed: {why}"
         self._ledger.frames.set_unreadable(index, False)
         event = StatesDeleted(frames=(index,), reason=sentence)
         self._ledger.apply(event)
-        self._damage.say(DamageKind.STATE, f"{sentence} ({reason})")
+        self._damage.add(DamageKind.STATE, f"{sentence} ({reason})")
         self._background.run(self._log.write(event))
 
-    def _say(self, name: str, sentence: str, *, lasting: bool = False) -> None:
+    def _log_damage(self, name: str, sentence: str, *, lasting: bool = False) -> None:
         kind = DamageKind.FIXED
         if frame_of(name) is not None:
             kind = DamageKind.STATE
         elif checkpoint_of(name) is not None:
             kind = DamageKind.CHECKPOINT
-        self._damage.say(kind, sentence, lasting=lasting)
+        self._damage.add(kind, sentence, lasting=lasting)
         log.warning("%s", sentence)

@@ -1,4 +1,4 @@
-"""Repairs damaged files of the states in the worker process: from memory, from copies, or from pictures."""
+"""Repair of damaged state files in the worker process: from memory, from copies, or from images."""
 
 from __future__ import annotations
 
@@ -32,30 +32,32 @@ Decode = Callable[[], tuple[Frame, dict[str, str]]]
 log = logging.getLogger("scas4d.worker")
 
 
-def mend_at_start(history: History) -> list[str]:
-    """What every frame needs, and its copies, written again where they are damaged; a sentence for each."""
+def repair_at_start(history: History) -> list[str]:
+    """Rewrites damaged files that every frame needs, and their copies, and returns one message per file."""
     try:
         mended = history.repair_fixed()
-    except OSError as error:  # states can be read all the same: a disk that takes nothing must not keep them away
-        log.warning("what every frame needs cannot be mended: %s", error)
+    except OSError as error:  # the states stay readable, so an unwritable disk must not prevent startup
+        log.warning("a file that every frame needs cannot be repaired: %s", error)
         return []
-    history.pop_faults()  # of files that were just written again, or that `History.damaged` names
+    history.pop_faults()  # these files were just rewritten or are listed in `History.damaged`
     return [f"{reason}; it was written again from its copy" for reason in mended.values()]
 
 
-def mend(history: History, reconstruction: Reconstruction | None, message: RepairFiles) -> Iterator[RepairResult]:
-    """Looks at each file and writes it again where it can be, the same bits."""
+def repair_files(
+    history: History, reconstruction: Reconstruction | None, message: RepairFiles
+) -> Iterator[RepairResult]:
+    """Checks each file, rewrites it with identical content if possible, and yields the results."""
     assert history.files is not None
     for name in message.names:
         try:
-            outcome, reason = _mend(history, history.files, reconstruction, name, message)
+            outcome, reason = _repair_file(history, history.files, reconstruction, name, message)
         except Exception as error:
-            log.exception("%s cannot be mended", name)
+            log.exception("%s cannot be repaired", name)
             outcome, reason = RepairOutcome.NO_ROOM if no_room(error) else RepairOutcome.DAMAGED, message_of(error)
         yield RepairResult(name, outcome, reason)
 
 
-def _mend(
+def _repair_file(
     history: History, files: FrameFiles, reconstruction: Reconstruction | None, name: str, message: RepairFiles
 ) -> tuple[RepairOutcome, str]:
     index, known = frame_of(name), history.indices
@@ -63,7 +65,7 @@ def _mend(
     if fault is None:
         return RepairOutcome.WHOLE, ""
     birth = born_of(name)
-    if birth is not None and birth not in history.born_at:  # of a frame that was taken back
+    if birth is not None and birth not in history.born_at:  # of a frame that was rolled back
         return RepairOutcome.GONE, ""
     if birth is not None or name in (FIXED_FILE, FIXED_COPY, FIRST_COPY) or (known and index == known[0]):
         if name in history.repair_fixed():
@@ -74,7 +76,7 @@ def _mend(
             return RepairOutcome.GONE, ""
         if history.rewrite(index):
             return RepairOutcome.WRITTEN, fault
-        return _written_in_part(history, files, index, message), fault
+        return _rewrite_with_report(history, files, index, message), fault
     checkpoint = checkpoint_of(name)
     if checkpoint not in known[-NEWEST_KEPT:]:
         return RepairOutcome.GONE, ""
@@ -82,8 +84,8 @@ def _mend(
     return (RepairOutcome.WRITTEN if again else RepairOutcome.DAMAGED), fault
 
 
-def _written_in_part(history: History, files: FrameFiles, index: int, message: RepairFiles) -> RepairOutcome:
-    """Writes a file again of which only the report or the time is damaged: the state is whole in it."""
+def _rewrite_with_report(history: History, files: FrameFiles, index: int, message: RepairFiles) -> RepairOutcome:
+    """Rewrites a file with an intact state in which only the report or the time is damaged."""
     try:
         arrays = files.read(index, PER_FRAME, WHOLES)
         report = message.reports.get(index)
@@ -99,7 +101,7 @@ def _written_in_part(history: History, files: FrameFiles, index: int, message: R
 
 
 def _report_of(files: FrameFiles, index: int) -> dict[str, Any] | None:
-    """The report of a frame, where that is what is whole."""
+    """Returns the report of a frame, or None if it is damaged or missing."""
     try:
         report: dict[str, Any] = json.loads(files.read(index, ("report",))["report"].tobytes())
     except (ValueError, FileNotFoundError):
@@ -107,17 +109,19 @@ def _report_of(files: FrameFiles, index: int) -> dict[str, Any] | None:
     return report
 
 
-def recompute(spec: SceneSpec, history: History, message: RecomputeState, decode: Decode) -> Iterator[RepairResult]:
-    """Makes a state again from its pictures; whatever comes of it, the scene goes on as before.
+def recompute_state(
+    spec: SceneSpec, history: History, message: RecomputeState, decode: Decode
+) -> Iterator[RepairResult]:
+    """Recomputes a state from its images and yields the results; a failure does not affect the running scene.
 
-    Damage often has neighbours: where the state before it is damaged too, and nobody has noticed, that comes first.
+    Damage often affects neighbouring files, so the preceding state is checked and repaired first.
     """
     index = message.frame.index
     assert history.files is not None
     name = history.files.path(index).name
     base = history.files.path(message.base).name
     if (fault := history.files.fault(message.base)) is not None:
-        for mended in mend(history, None, RepairFiles((base,), {}, {})):
+        for mended in repair_files(history, None, RepairFiles((base,), {}, {})):
             yield mended
             match mended.outcome:
                 case RepairOutcome.WRITTEN | RepairOutcome.WHOLE | RepairOutcome.REPORT_LOST:
@@ -129,11 +133,11 @@ def recompute(spec: SceneSpec, history: History, message: RecomputeState, decode
                 case _:
                     yield RepairResult(name, RepairOutcome.LOST, "the state before it is gone")
             return
-    yield _remade(spec, history, message, decode)
+    yield _recompute(spec, history, message, decode)
 
 
-def _remade(spec: SceneSpec, history: History, message: RecomputeState, decode: Decode) -> RepairResult:
-    from scas4d_core.recompute import recompute as remake_state  # in the worker only: the service stays light
+def _recompute(spec: SceneSpec, history: History, message: RecomputeState, decode: Decode) -> RepairResult:
+    from scas4d_core.recompute import recompute as recompute_core  # worker only: keeps the service small
 
     index = message.frame.index
     assert history.files is not None
@@ -145,10 +149,10 @@ def _remade(spec: SceneSpec, history: History, message: RecomputeState, decode: 
             return RepairResult(name, RepairOutcome.LOST, reason)
         budget = message.frame.budget.model_dump()
         notes = {"budget": budget}
-        report = remake_state(
+        report = recompute_core(
             spec.rig, spec.settings, history, message.base, frame, budget, dropped=dropped, notes=notes
         )
         return RepairResult(name, RepairOutcome.RECOMPUTED, report=report)
-    except Exception as error:  # whatever the core raises, the service goes on and says so
-        log.exception("scene %s, frame %d cannot be made again", spec.folder.name, index)
+    except Exception as error:  # any error is reported as the outcome and must not stop the worker
+        log.exception("scene %s, frame %d cannot be recomputed", spec.folder.name, index)
         return RepairResult(name, RepairOutcome.NO_ROOM if no_room(error) else RepairOutcome.LOST, message_of(error))

@@ -1,7 +1,7 @@
-"""Scrubs a scene: reads all its files again, slowly, and compares checksums, to find damage before a file is needed.
+"""Scrubbing of a scene: slowly rereads all files and verifies checksums to find damage before a file is needed.
 
-Files are read one after the other, a piece at a time in a thread, with pauses that keep to the rate of the settings, or
-to a quarter of it while a frame is at work. Pages that were read for this alone are given back to the system.
+Files are read sequentially in pieces in a thread. Pauses keep the read rate to the configured limit, or to a quarter of
+it while a frame is being updated. Pages that only the scrub needed are dropped from the page cache.
 """
 
 from __future__ import annotations
@@ -32,30 +32,35 @@ from scas4d_core.storage.npz import iter_verified
 from server import counters
 from server.repair.repair_queue import DamageKind, DamageLog, RepairQueue
 from server.storage.definition import Definition, check_definition, write_definition
-from server.storage.frame_store import checked
-from server.storage.journal import checked_journal
+from server.storage.frame_store import verify_record
+from server.storage.journal import verify_journal
 from server.storage.layout import SceneFolder
 from server.storage.ledger import SceneLog
 
 AT_WORK = 0.25
-"""Share of the rate while a frame is at work."""
-EVENTS_WEIGH = 8
-"""A byte of the journal, many small records, takes so many times the processor time of a byte of an array."""
-LOOK_S = 5.0
-"""Seconds between checks that the journal has its name."""
+"""Fraction of the read rate that is used while a frame is being updated."""
+EVENT_WEIGHT = 8
+"""CPU cost per byte of the journal relative to arrays, because the journal consists of many small records."""
+CHECK_S = 5.0
+"""Seconds between checks that the journal file is still at its path."""
 
 GONE = "gone"
-"""Fault of a file that is not there."""
+"""Fault of a missing file."""
 
 log = logging.getLogger("scas4d.server")
 
 
 class Scrub:
-    """Scrubs one scene, pass after pass.
+    """Periodic scrubbing of one scene.
 
     Args:
-        definition, folder, log, damage, mending: of the scene.
-        mb_per_second: of reading; 0: never. pause_seconds: before each pass.
+        definition: definition of the scene.
+        folder: folder of the scene.
+        log: journal, ledger and frame log of the scene.
+        damage: damage messages of the scene.
+        mending: repair queue of the scene.
+        mb_per_second: maximum read rate in MB/s; 0 disables scrubbing.
+        pause_seconds: pause before each pass, in seconds.
     """
 
     def __init__(
@@ -79,20 +84,20 @@ class Scrub:
         self._pause = pause_seconds
 
     async def run(self) -> None:
-        """Scrubs until it is cancelled."""
+        """Scrubs the scene repeatedly until cancelled."""
         while True:
             left = self._pause
             while left > 0 or self._bytes_per_second == 0:
-                await asyncio.sleep(min(left, LOOK_S) if left > 0 else LOOK_S)
-                left -= LOOK_S
-                self._journal.look()
+                await asyncio.sleep(min(left, CHECK_S) if left > 0 else CHECK_S)
+                left -= CHECK_S
+                self._journal.rewrite_if_moved()
             try:
                 await self.once()
-            except Exception:  # a scrub that fails is no fault of the scene
+            except Exception:  # a failed scrub must not stop the scene
                 log.exception("scene %s cannot be scrubbed", self._folder.name)
 
     async def once(self) -> None:
-        """Makes one pass over all files."""
+        """Runs one pass over all files."""
         await self._scrub_definition()
         await self._scrub_journal()
         await self._scrub_states()
@@ -100,7 +105,7 @@ class Scrub:
         await self._scrub_frames()
 
     async def _read(self, pieces: Iterator[int], weight: int = 1) -> str | None:
-        """Reads a file to its end; returns its fault, or None, or `GONE`."""
+        """Reads a file to its end and returns its fault, `GONE` if it is missing, or None."""
         try:
             while (size := await asyncio.to_thread(next, pieces, None)) is not None:
                 counters.SCRUBBED.inc(size)
@@ -114,17 +119,19 @@ class Scrub:
         fault = await asyncio.to_thread(check_definition, self._folder)
         if fault is None:
             return
-        with contextlib.suppress(OSError):  # the next pass tries again
+        with contextlib.suppress(OSError):  # the next pass retries
             await asyncio.to_thread(write_definition, self._folder, self._definition)
-            self._damage.say(DamageKind.DEFINITION, f"{fault}; it was written again")
+            self._damage.add(DamageKind.DEFINITION, f"{fault}; it was written again")
 
     async def _scrub_journal(self) -> None:
         journal = self._journal
-        journal.look()
-        file, good = journal.place
-        fault = await self._read(checked_journal(journal.path, good), EVENTS_WEIGH)
-        if fault is not None and fault != GONE and journal.place[0] == file:  # else it was written anew meanwhile
-            journal.renew(f"{journal.path.name} is damaged ({fault})")
+        journal.rewrite_if_moved()
+        file, good = journal.file_position
+        fault = await self._read(verify_journal(journal.path, good), EVENT_WEIGHT)
+        if (
+            fault is not None and fault != GONE and journal.file_position[0] == file
+        ):  # otherwise the journal was rewritten during the scrub
+            journal.rewrite(f"{journal.path.name} is damaged ({fault})")
 
     async def _scrub_states(self) -> None:
         ledger, folder = self._ledger, self._folder.states
@@ -142,40 +149,40 @@ class Scrub:
             await self._state(folder / name, lambda: False)
         newest = checkpoint_file(ledger.committed[-1])
         if listed and not self._ledger.updating and not await asyncio.to_thread((folder / newest).exists):
-            self._repair_queue.noticed({newest: f"{newest} is gone"})
+            self._repair_queue.report_damage({newest: f"{newest} is gone"})
         await asyncio.to_thread(files.chunks.refresh)
         for index in reversed(committed):
             if index in files.chunks and not files.path(index).exists():
                 continue
             await self._state(files.path(index), partial(self._expected, files, index))
             if index not in committed[-FRAMES_KEPT:]:
-                await asyncio.to_thread(_forget, files.path(index))
+                await asyncio.to_thread(_drop_page_cache, files.path(index))
         for chunk in list(files.chunks.known.values()):
             if await self._read(checked_records(chunk.path)) not in (None, GONE):
                 await self._scrub_frames_of(files, chunk)
-            await asyncio.to_thread(_forget, chunk.path)
+            await asyncio.to_thread(_drop_page_cache, chunk.path)
 
     async def _scrub_frames_of(self, files: FrameFiles, chunk: Chunk) -> None:
-        """Notices the frames of a damaged chunk that cannot be read."""
+        """Reports the unreadable frames of a damaged chunk to the repair queue."""
         for index in chunk.times:
             fault = await asyncio.to_thread(files.chunks.fault, index)
             if fault is not None and index in self._ledger.committed and not files.path(index).exists():
-                self._repair_queue.noticed({files.path(index).name: fault})
+                self._repair_queue.report_damage({files.path(index).name: fault})
 
     def _expected(self, files: FrameFiles, index: int) -> bool:
-        """True for a committed frame that has not gone to a chunk since it was listed."""
+        """Returns whether a committed frame should still have its own file, as it has not moved to a chunk."""
         if index in self._ledger.committed:
             files.chunks.refresh()
             return index not in files.chunks
         return False
 
     async def _state(self, path: Path, expected: Callable[[], bool]) -> None:
-        """Scrubs one file; `expected`: returns whether a missing file is damage."""
+        """Scrubs one file of the states; `expected` returns whether a missing file counts as damage."""
         fault = await self._read(iter_verified(path))
         if fault == GONE and await asyncio.to_thread(expected):
-            self._repair_queue.noticed({path.name: f"{path.name} is gone"})
+            self._repair_queue.report_damage({path.name: f"{path.name} is gone"})
         elif fault is not None and fault != GONE:
-            self._repair_queue.noticed({path.name: fault})
+            self._repair_queue.report_damage({path.name: fault})
 
     async def _scrub_points(self) -> None:
         path = self._folder.points
@@ -183,21 +190,21 @@ class Scrub:
         if fault is None or fault == GONE:
             return
         used = "the first frame is committed, and needs it no more" if self._ledger.committed else "put it again"
-        self._damage.say(DamageKind.POINTS, f"{fault}; {used}", lasting=True)
+        self._damage.add(DamageKind.POINTS, f"{fault}; {used}", lasting=True)
 
     async def _scrub_frames(self) -> None:
         names = [(entry.index, name) for entry in self._ledger.frames.with_pictures() for name in entry.files]
         for index, name in names:
-            fault = await self._read(checked(self._folder.frames, name))
-            await asyncio.to_thread(_forget, self._folder.frames / name)
+            fault = await self._read(verify_record(self._folder.frames, name))
+            await asyncio.to_thread(_drop_page_cache, self._folder.frames / name)
             entry = self._ledger.frames.get(index)
-            if fault is None or entry is None or name not in entry.files:  # deleted meanwhile
+            if fault is None or entry is None or name not in entry.files:  # deleted during the scrub
                 continue
             what = "it fails when its turn comes"
             if entry.state == FrameState.COMMITTED:
                 what = "its state is not touched by that"
             sentence = f"frame {index}: its record in the frame log is damaged: {fault}; {what}"
-            self._damage.say(DamageKind.FRAME, sentence, lasting=True)
+            self._damage.add(DamageKind.FRAME, sentence, lasting=True)
 
 
 def _checkpoints(folder: Path) -> list[str]:
@@ -207,7 +214,7 @@ def _checkpoints(folder: Path) -> list[str]:
         return []
 
 
-def _forget(path: Path) -> None:
-    """Gives the pages of a file back to the system: nobody else is about to read them."""
+def _drop_page_cache(path: Path) -> None:
+    """Drops a file from the page cache, because nothing else is expected to read it soon."""
     with contextlib.suppress(OSError), path.open("rb") as file:
         os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)

@@ -41,12 +41,12 @@ SceneId = Annotated[str, Path(max_length=64)]
 
 
 async def _scene(request: Request, id: SceneId) -> AsyncIterator[Scene]:
-    async with _scenes(request).using(id) as scene:
+    async with _scenes(request).use(id) as scene:
         yield scene
 
 
 async def _record(request: Request, id: SceneId) -> AsyncIterator[Scene]:
-    async with _scenes(request).using(id, place=False) as scene:
+    async with _scenes(request).use(id, place=False) as scene:
         yield scene
 
 

@@ -9,8 +9,8 @@ from fastapi import APIRouter, Request, Response
 
 from client.wire import Cluster, Node, RigModel
 from server.health.estimate import estimate, machine_mb
-from server.peers.clusters import together
-from server.peers.peers import PASSED, Peers
+from server.peers.clusters import merge_clusters
+from server.peers.peers import PROXIED_HEADER, Peers
 from server.processes.placement import Placement
 from server.routes.access import AllScenes, TheSettings
 from server.scene.scenes import Scenes
@@ -28,9 +28,9 @@ async def get(request: Request, response: Response, scenes: AllScenes, server: T
     placement: Placement = request.app.state.placement
     peers: Peers | None = request.app.state.peers
     cluster_status = await placement.cluster() or _alone(scenes, server)
-    if peers is not None and PASSED not in request.headers:
+    if peers is not None and PROXIED_HEADER not in request.headers:
         others, silent = await peers.clusters()
-        cluster_status = together(cluster_status, others)
+        cluster_status = merge_clusters(cluster_status, others)
         if silent:
             response.headers["X-Unreachable"] = ", ".join(silent)
     return cluster_status
@@ -38,7 +38,7 @@ async def get(request: Request, response: Response, scenes: AllScenes, server: T
 
 def _alone(scenes: Scenes, server: ServerSettings) -> Cluster:
     """Returns this machine, as the only one."""
-    awake = sorted(id for id, scene in scenes.by_id.items() if scene.has_place)
+    awake = sorted(id for id, scene in scenes.awake.items() if scene.has_place)
     made = [scenes[id].spec for id in awake]
     taken = sum(estimate(RigModel.of(spec.rig), spec.settings, server).memory_mb for spec in made)
     here = Node(
@@ -46,10 +46,10 @@ def _alone(scenes: Scenes, server: ServerSettings) -> Cluster:
         host=socket.gethostname(),
         alive=True,
         cpus=os.cpu_count() or 1,
-        cpus_taken=len(awake),
+        cpus_reserved=len(awake),
         gpus=0,
         memory_mb=round(machine_mb(), 1),
-        memory_taken_mb=round(taken, 1),
+        memory_reserved_mb=round(taken, 1),
         scenes=awake,
     )
     return Cluster(placement="local", nodes=[here], waiting=[])

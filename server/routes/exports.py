@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Path, Request, Response
 
 from client.wire import ExportList, ExportModel, ExportRequest, ExportState
-from server.http.unchanging import unchanging_file
+from server.http.immutable import immutable_file_response
 from server.problems import Problem
 from server.routes.access import AllExports, SceneId, TheRecord
 from server.scene.exports import MEDIA_TYPES
@@ -16,7 +16,7 @@ from server.scene.scene import Scene
 
 router = APIRouter(prefix="/v1/scenes", tags=["exports"])
 
-ExportId = Annotated[str, Path(max_length=64, description="Of the export.")]
+ExportId = Annotated[str, Path(max_length=64, description="Id of the export.")]
 KINDS = (*MEDIA_TYPES.values(), "application/octet-stream")
 FILE: dict[int | str, dict[str, Any]] = {
     200: {
@@ -73,7 +73,7 @@ async def file(id: SceneId, export: ExportId, exports: AllExports, request: Requ
             else "ask for another export",
         )
     try:
-        return await unchanging_file(
+        return await immutable_file_response(
             request, file_export.spec.file, tag=file_export.id, media_type=file_export.media_type, name=file_export.name
         )
     except FileNotFoundError:  # removed between the two

@@ -12,13 +12,13 @@ from starlette.requests import ClientDisconnect
 
 from client.wire import (
     FRAME_MEDIA_TYPE,
+    CameraReceipt,
     FileKind,
     FrameReceipt,
     FrameReportModel,
     MissingRequest,
-    PartReceipt,
 )
-from server.http.unchanging import unchanging
+from server.http.immutable import immutable_response
 from server.ingest.camera_files import receive_camera, receive_file, receive_form
 from server.ingest.receive import receive_frame
 from server.problems import Problem
@@ -64,9 +64,12 @@ SENT_AS = {b"\xff\xd8": ("image/jpeg", ".jpg"), b"\x89P": ("image/png", ".png"),
 FILE: dict[int | str, dict[str, Any]] = {
     200: {"content": {kind: {"schema": BINARY} for kind, _ in SENT_AS.values()}, "description": "As it was sent."}
 }
-CameraPath = Annotated[str, Path(max_length=64, description="Of the rig.")]
+CameraPath = Annotated[str, Path(max_length=64, description="Name of a camera of the rig.")]
 Seconds = Annotated[
-    float | None, Query(allow_inf_nan=False, description="Of the frame; the first given by a camera holds for all.")
+    float | None,
+    Query(
+        allow_inf_nan=False, description="Time of the frame in seconds; the first value that a camera sends applies."
+    ),
 ]
 
 
@@ -90,7 +93,7 @@ async def put(scene: TheScene, n: FrameIndex, request: Request) -> FrameReceipt:
         f"a frame is {FRAME_MEDIA_TYPE} or multipart/form-data",
         field="Content-Type",
         value=request.headers.get("content-type", ""),
-        remedy="send one file a camera, the field called like the camera",
+        remedy="send one file per camera, the field called like the camera",
     )
 
 
@@ -104,7 +107,7 @@ async def put_camera(
     kind: Annotated[FileKind, Query(description="Send a mask before its picture, or both in one S4DF.")] = (
         FileKind.IMAGE
     ),
-) -> PartReceipt:
+) -> CameraReceipt:
     """Takes one camera's picture of frame n, where each camera has its own sender. On disk when this answers.
 
     The frame closes when all cameras' pictures are in, on POST …/close, or at the scene's deadline. A camera may be
@@ -124,7 +127,7 @@ async def picture(
     n: FrameIndex,
     c: CameraPath,
     request: Request,
-    kind: Annotated[FileKind, Query(description="The picture, or its mask.")] = FileKind.IMAGE,
+    kind: Annotated[FileKind, Query(description="The picture or its mask.")] = FileKind.IMAGE,
 ) -> Response:
     """Returns one camera's picture of frame n, byte for byte as it was sent.
 
@@ -134,7 +137,7 @@ async def picture(
     data = await _stored(scene, n, c, kind)
     media_type, ending = SENT_AS[bytes(data[:2])]
     name = f"{scene.id[:8]}-{n:06d}-{c}{'' if kind == FileKind.IMAGE else '-mask'}{ending}"
-    return unchanging(request, data, media_type=media_type, name=name, inline=True)
+    return immutable_response(request, data, media_type=media_type, name=name, inline=True)
 
 
 @router.post("/{id}/frames/{n}/close", status_code=202)
@@ -159,10 +162,10 @@ async def report(scene: TheRecord, n: FrameIndex) -> FrameReportModel:
     if frame_report is None:
         raise Problem(
             404,
-            f"frame {n} has not come",
+            f"frame {n} has not arrived",
             field="n",
             value=n,
-            remedy=f"send it, or wait for it: the next is {scene.next_frame}",
+            remedy=f"send it or wait for it: the next frame is {scene.next_frame}",
         )
     return frame_report
 
@@ -175,7 +178,7 @@ async def report(scene: TheRecord, n: FrameIndex) -> FrameReportModel:
 async def ply(scene: TheScene, n: FrameIndex, request: Request) -> Response:
     """Exports a committed frame in the file format of 3D Gaussian Splatting."""
     answer = await ask(request, scene, PlyQuery(scene.committed_frame(n, "n")))
-    return unchanging(request, answer.body, media_type=answer.media_type, name=f"{scene.id[:8]}-{n:06d}.ply")
+    return immutable_response(request, answer.body, media_type=answer.media_type, name=f"{scene.id[:8]}-{n:06d}.ply")
 
 
 @router.get(
@@ -198,9 +201,9 @@ async def ply(scene: TheScene, n: FrameIndex, request: Request) -> Response:
 async def compact(
     scene: TheScene,
     request: Request,
-    first: Annotated[int, Query(ge=0, le=1_000_000_000, description="The first frame; later ones follow.")] = 0,
-    limit: Annotated[int, Query(ge=1, le=MOST_STATES, description="Frames at most.")] = MOST_STATES,
-    parts: Annotated[bool, Query(description="With the parts of all Gaussians, as they are seen now.")] = False,
+    first: Annotated[int, Query(ge=0, le=1_000_000_000, description="First frame.")] = 0,
+    limit: Annotated[int, Query(ge=1, le=MOST_STATES, description="Maximum number of frames.")] = MOST_STATES,
+    parts: Annotated[bool, Query(description="Include the current part labels of all Gaussians.")] = False,
 ) -> Response:
     """Exports committed frames as a compact 4D file, which `scas4d export` turns into other formats.
 
@@ -223,7 +226,7 @@ async def compact(
     following = scene.committed[after : after + 1]
     headers = {**answer.headers, **({"X-Next-Frame": str(following[0])} if len(following) else {})}
     name = f"{scene.id[:8]}-{frames[0]:06d}.s4d"
-    return unchanging(request, answer.body, media_type=answer.media_type, name=name, headers=headers)
+    return immutable_response(request, answer.body, media_type=answer.media_type, name=name, headers=headers)
 
 
 async def _stored(scene: Scene, n: int, c: str, kind: FileKind) -> memoryview:
@@ -236,8 +239,8 @@ async def _stored(scene: Scene, n: int, c: str, kind: FileKind) -> memoryview:
         raise Problem(404, f"the rig has no camera {c!r}", field="c", value=c, remedy=f"one of {scene.rig.names}")
     entry = scene.ledger.frames.get(n)
     if entry is None:
-        remedy = f"wait for it: the next is {scene.next_frame}"
-        raise Problem(404, f"frame {n} has not come", field="n", value=n, remedy=remedy)
+        remedy = f"wait for it: the next frame is {scene.next_frame}"
+        raise Problem(404, f"frame {n} has not arrived", field="n", value=n, remedy=remedy)
     field, fault = "n", f"the pictures of frame {n} are not kept any more"
     for name in entry.files:
         try:

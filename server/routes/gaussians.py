@@ -21,7 +21,7 @@ ANSWERS: dict[int | str, dict[str, Any]] = {200: {"model": GaussiansModel}}
 async def gaussians(
     scene: TheScene,
     request: Request,
-    ids: Annotated[str, Query(min_length=1, max_length=10_000, description="Separated by commas.")],
+    ids: Annotated[str, Query(min_length=1, max_length=10_000, description="Ids, separated by commas.")],
 ) -> Response:
     """Returns the frames in which Gaussians were born, retired and revived. An id is never used for another thing."""
     scene.committed_frame(None, "id")

@@ -10,11 +10,11 @@ from collections.abc import AsyncIterator
 from fastapi import APIRouter, WebSocket, WebSocketDisconnect
 
 from client.wire import (
+    CameraReceipt,
     FrameHead,
     FrameReceipt,
     FramingError,
     IngestAnswer,
-    PartReceipt,
     head_length,
     parse_head,
 )
@@ -52,17 +52,17 @@ async def ingest(socket: WebSocket, id: str) -> None:
     server: ServerSettings = socket.app.state.settings
     async with contextlib.AsyncExitStack() as held:
         try:
-            scene = await held.enter_async_context(scenes.using(id))
-            scene.ingest.join()
+            scene = await held.enter_async_context(scenes.use(id))
+            scene.ingest.add_socket()
         except Problem as problem:  # the handshake is answered like any request
-            await socket.send_denial_response(problems.answer(problem.document, problem.headers))
+            await socket.send_denial_response(problems.problem_response(problem.document, problem.headers))
             return
         limit_messages(socket.scope, min(int(server.max_body_mb * 1e6), largest_frame(scene.rig)))
         try:
             await socket.accept()
             await _serve(socket, scenes, id)
         finally:
-            scene.ingest.leave()
+            scene.ingest.remove_socket()
 
 
 async def _serve(socket: WebSocket, scenes: Scenes, id: str) -> None:
@@ -89,7 +89,7 @@ async def _serve(socket: WebSocket, scenes: Scenes, id: str) -> None:
                 await socket.close(SCENE_RESTARTS if away else SCENE_GONE, "the scene is not here")
                 return
             head = _head(data)
-            whole = isinstance(head, FrameHead) and not head.part
+            whole = isinstance(head, FrameHead) and not head.single_camera
             if not (whole and whole_before):
                 await taking.join()  # what a part decides may depend on all that came before, and the other way round
             whole_before = whole
@@ -125,8 +125,8 @@ async def _take(scene: Scene, head: FrameHead | Problem, data: bytes) -> IngestA
         return _refusal(None, head)
     body, size = _one(data), len(data)
     try:
-        receipt: FrameReceipt | PartReceipt
-        if head.part:
+        receipt: FrameReceipt | CameraReceipt
+        if head.single_camera:
             receipt = await receive_camera(scene.open_frames, None, None, body, size)
         else:
             receipt = await receive_frame(scene.ingest, None, body, size)

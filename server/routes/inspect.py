@@ -25,8 +25,8 @@ async def rig(scene: TheRecord) -> RigModel:
 @router.get("/{id}/frames", tags=["frames"])
 async def frames(
     scene: TheScene,
-    first: Annotated[int, Query(ge=0, le=1_000_000_000, description="Index of the first.")] = 0,
-    limit: Annotated[int, Query(ge=1, le=MOST_FRAMES, description="So many at most.")] = MOST_FRAMES,
+    first: Annotated[int, Query(ge=0, le=1_000_000_000, description="Index of the first frame.")] = 0,
+    limit: Annotated[int, Query(ge=1, le=MOST_FRAMES, description="Maximum number of frames.")] = MOST_FRAMES,
 ) -> FrameList:
     """Returns the reports of many frames, from `first` on; `next` is the index to go on from."""
     after = min(first + limit, scene.next_frame)  # frames are numbered without gaps

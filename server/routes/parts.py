@@ -19,7 +19,9 @@ ANSWERS: dict[int | str, dict[str, Any]] = {200: {"model": PartsModel}}
 async def parts(
     scene: TheScene,
     request: Request,
-    count: Annotated[int | None, Query(ge=1, le=254, description="How many; chosen by a rule if not given.")] = None,
+    count: Annotated[
+        int | None, Query(ge=1, le=254, description="Number of parts; by default chosen automatically.")
+    ] = None,
 ) -> Response:
     """Returns a label for every Gaussian, from its motion over all committed frames."""
     scene.committed_frame(None, "id")

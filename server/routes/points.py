@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from client.wire import PointsReceipt
 from scas4d_core.rig_checks import RigError, check_points, rig_warnings
 from scas4d_core.storage.npz import write_npz
-from server.problems import Problem, counted, of_rig
+from server.problems import Problem, count_noun, rig_problem
 from server.routes.access import AllScenes, TheScene
 from server.storage.disk import full_disk, no_room
 from server.storage.points import points_sha256
@@ -39,7 +39,10 @@ async def put(
     scenes: AllScenes,
     request: Request,
     reconstruction: Annotated[
-        int | None, Query(ge=0, description="Its number: the scene's, if not given, or the next one, to be begun.")
+        int | None,
+        Query(
+            ge=0, description="Number of the reconstruction: the scene's (default), or the next one, before it starts."
+        ),
     ] = None,
 ) -> PointsReceipt:
     """Takes the cloud that frame 0 starts from; it has to come before frame 0.
@@ -55,7 +58,7 @@ async def put(
     try:
         await asyncio.to_thread(check_points, scene.rig, arrays["positions"])
     except RigError as error:
-        raise of_rig(error) from None
+        raise rig_problem(error) from None
     own = scene.ledger.reconstruction
     number = own if reconstruction is None else reconstruction
     receipt = PointsReceipt(points=len(arrays["positions"]), sha256=sha256, reconstruction=number)
@@ -95,7 +98,7 @@ def check_number(number: int, own: int, next_frame: int) -> None:
         fault,
         field="points" if number <= own else "reconstruction",
         value=number,
-        remedy=f"send them with ?reconstruction={own + 1}, then begin anew from them: PUT …/reconstructions/{own + 1}",
+        remedy=f"send them with ?reconstruction={own + 1}, then restart from them: PUT …/reconstructions/{own + 1}",
         expected=own + 1,
     )
 
@@ -119,9 +122,9 @@ def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
     except (zipfile.BadZipFile, ValueError, OSError, EOFError, KeyError, RuntimeError, NotImplementedError) as error:
         raise Problem(
             422,
-            f"the body is no npz that can be read without pickle ({error})",
+            f"the body is not an npz file that can be read without pickle ({error})",
             field="points",
-            value=counted(len(body), "byte"),
+            value=count_noun(len(body), "byte"),
             remedy="send numpy.savez(positions=…, colours=…, foreground=…) of plain numbers",
         ) from None
     if (data := arrays.pop("data", None)) is not None and "positions" not in arrays:

@@ -10,11 +10,11 @@ from client.wire import ReconstructionRequest, SceneStatus
 from scas4d_core.presets import changed
 from server.routes.access import AllExports, AllScenes, TheScene, TheSettings
 from server.routes.scenes import check_settings, setting_problems
-from server.scene.beginning import Beginning
+from server.scene.new_reconstruction import NewReconstruction
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
-Number = Annotated[int, Path(ge=1, le=1_000_000_000, description="One more than the scene's `reconstruction`.")]
+Number = Annotated[int, Path(ge=1, le=1_000_000_000, description="The scene's `reconstruction` + 1.")]
 
 
 @router.put("/{id}/reconstructions/{n}")
@@ -37,7 +37,7 @@ async def put(
         settings = changed(scene.spec.settings, asked.settings)
     check_settings(scene.request, settings, server)
     begun = scene.ledger.reconstruction < n
-    status = await scenes.begin_again(scene, Beginning(n, asked, settings, scene.rig))
+    status = await scenes.begin_again(scene, NewReconstruction(n, asked, settings, scene.rig))
     if begun:
         await exports.forget(scene.id)
     return status

@@ -8,13 +8,13 @@ from pathlib import Path
 from fastapi import APIRouter, Request
 from starlette.responses import RedirectResponse, Response
 
-from server.http.files import MEDIA_TYPES, policy, served
+from server.http.files import MEDIA_TYPES, security_headers, serve_file
 
 router = APIRouter(include_in_schema=False)
 
 FOLDER = Path(__file__).parents[1] / "reference"
 VENDORED = ("swagger-ui-bundle.js", "swagger-ui.css")
-HEADERS = policy(style_src="'self' 'unsafe-inline'", img_src="'self' data:")
+HEADERS = security_headers(style_src="'self' 'unsafe-inline'", img_src="'self' data:")
 """As the viewer's, but Swagger UI sets styles and shows small pictures that its own code has."""
 
 
@@ -34,7 +34,7 @@ FILES = _files()
 @router.get("/docs")
 async def page(request: Request) -> Response:
     """Returns the page."""
-    return served(request, FILES, "index.html", HEADERS, "/docs")
+    return serve_file(request, FILES, "index.html", HEADERS, "/docs")
 
 
 @router.get("/redoc")
@@ -46,4 +46,4 @@ async def elsewhere() -> Response:
 @router.get("/docs/{name}")
 async def file(request: Request, name: str) -> Response:
     """Returns a file of the page."""
-    return served(request, FILES, name, HEADERS, "/docs")
+    return serve_file(request, FILES, name, HEADERS, "/docs")

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Query, Request, Response
 
 from client import __version__
 from client.wire import MAX_PIXELS_A_SIDE, RenderFormat, RenderKind, RenderRequest
-from server.http.unchanging import disposition, is_known
+from server.http.immutable import content_disposition, matches_etag
 from server.problems import Problem
 from server.queries.render import render_query
 from server.routes.access import TheScene, ask
@@ -40,14 +40,22 @@ async def render(scene: TheScene, request: Request, view: RenderRequest) -> Resp
 async def render_by_name(
     scene: TheScene,
     request: Request,
-    camera: Annotated[str | None, Query(max_length=64, description="Of the rig; its first where not given.")] = None,
-    frame: Annotated[int | None, Query(ge=0, description="A committed one; the last where not given.")] = None,
+    camera: Annotated[
+        str | None, Query(max_length=64, description="Name of a camera of the rig; by default the first.")
+    ] = None,
+    frame: Annotated[int | None, Query(ge=0, description="Index of a committed frame; by default the last.")] = None,
     kind: RenderKind = RenderKind.COLOUR,
     format: RenderFormat = RenderFormat.PNG,
-    width: Annotated[int | None, Query(ge=1, le=MAX_PIXELS_A_SIDE, description="Of the picture, in pixels.")] = None,
-    quality: Annotated[int | None, Query(ge=1, le=100, description="Of JPEG and WebP.")] = None,
-    background: Annotated[str | None, Query(max_length=64, description="Red, green, blue in 0…1, as 1,1,1.")] = None,
-    parts: Annotated[int | None, Query(ge=1, le=254, description="How many; chosen by the scene if not given.")] = None,
+    width: Annotated[
+        int | None, Query(ge=1, le=MAX_PIXELS_A_SIDE, description="Width of the picture in pixels.")
+    ] = None,
+    quality: Annotated[int | None, Query(ge=1, le=100, description="Quality of JPEG and WebP.")] = None,
+    background: Annotated[
+        str | None, Query(max_length=64, description="Red, green, blue in 0…1, such as 1,1,1.")
+    ] = None,
+    parts: Annotated[
+        int | None, Query(ge=1, le=254, description="Number of parts; by default chosen by the scene.")
+    ] = None,
 ) -> Response:
     """Renders a committed frame from a camera of the rig; the address can stand in an `<img>`."""
     view = RenderRequest(
@@ -70,12 +78,12 @@ async def render_by_name(
             "Cache-Control": "private, no-cache",
             "ETag": f'W/"{__version__}-{scene.ledger.reconstruction}-{view.frame}"',
         }
-        if is_known(request, keep["ETag"]):
+        if matches_etag(request, keep["ETag"]):
             return Response(status_code=304, headers=keep)
     response = await ask(request, scene, query)
     seen_by = view.camera if isinstance(view.camera, str) else "view"
     name = f"{scene.id[:8]}-{query.frame:06d}-{seen_by}-{query.kinds[0]}{ENDINGS[view.format]}"
-    keep["Content-Disposition"] = disposition(name, inline=True)
+    keep["Content-Disposition"] = content_disposition(name, inline=True)
     return Response(response.body, media_type=response.media_type, headers={**response.headers, **keep})
 
 

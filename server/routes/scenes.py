@@ -15,8 +15,8 @@ from scas4d_core.settings import Settings
 from server.health import estimate
 from server.http import validation
 from server.http.permissions import ALL, PERMISSION, Permission
-from server.peers.peers import PASSED, Peers
-from server.problems import Problem, of_rig
+from server.peers.peers import PROXIED_HEADER, Peers
+from server.problems import Problem, rig_problem
 from server.processes.placement import Placement
 from server.routes.access import AllExports, AllScenes, SceneId, TheRecord, TheScene, TheSettings
 from server.settings import ServerSettings
@@ -37,7 +37,7 @@ def setting_problems() -> Iterator[None]:
         yield
     except SettingError as error:
         if error.validation is not None:
-            raise validation.first_of(error.validation, model=Settings, prefix="settings") from None
+            raise validation.first_problem(error.validation, model=Settings, prefix="settings") from None
         unknown = error.setting == "preset"
         fault = f"there is no preset {error.value!r}" if unknown else error.fault
         field = error.setting if unknown else f"settings.{error.setting}"
@@ -51,7 +51,7 @@ def check_rig(request: SceneCreate, settings: Settings) -> None:
         rig.world_frame(unit)
         check_scene(rig, settings.scene)
     except RigError as error:
-        raise of_rig(error) from None
+        raise rig_problem(error) from None
     except CameraError as error:
         field = "settings.scene.metres_per_unit"
         raise Problem(422, error.fault, field=field, value=unit, remedy=error.remedy) from None
@@ -72,7 +72,7 @@ def check_nodes(request: SceneCreate, placement: Placement) -> None:
 def check_settings(request: SceneCreate, settings: Settings, server: ServerSettings) -> None:
     """Refuses settings that cannot work with the rig."""
     check_rig(request, settings)
-    estimate.check(request.rig, settings, server)
+    estimate.refuse_if_too_large(request.rig, settings, server)
 
 
 @router.post("", status_code=201)
@@ -106,7 +106,7 @@ async def listed(scenes: AllScenes, request: Request, response: Response) -> Sce
     permission: Permission = request.scope.get(PERMISSION, ALL)
     summaries = scenes.statuses()
     peers: Peers | None = request.app.state.peers
-    if peers is not None and PASSED not in request.headers:
+    if peers is not None and PROXIED_HEADER not in request.headers:
         others, silent = await peers.scenes(permission)
         summaries = sorted([*summaries, *others], key=lambda status: status.created)
         if silent:
@@ -127,7 +127,7 @@ async def edit(id: SceneId, scenes: AllScenes, request: SceneEdit) -> SceneStatu
     It is on disk when this answers. States that a shorter `keep_states` deletes go within seconds, for good; the scene
     wakes for that.
     """
-    async with scenes.using(id, place=request.keep_states is not None or request.exact_states is not None) as scene:
+    async with scenes.use(id, place=request.keep_states is not None or request.exact_states is not None) as scene:
         await scene.edit(request)
         return scene.status()
 
@@ -149,11 +149,11 @@ async def resume(scene: TheScene) -> SceneStatus:
 @router.post("/{id}/sleep")
 async def put_to_sleep(id: SceneId, scenes: AllScenes) -> SceneStatus:
     """Ends the processes of a scene that is idle: it wakes by itself when it is asked or sent something."""
-    if (scene := scenes.by_id.get(id)) is not None:
+    if (scene := scenes.awake.get(id)) is not None:
         if not scene.idle:
             raise Problem(
                 409,
-                "the scene is not idle: frames of it wait, or a request, a page or a sender is connected to it",
+                "the scene is not idle: frames are waiting, or a request, a page or a sender is connected to it",
                 field="id",
                 value=id,
                 remedy="wait for its frames, and close pages and senders",

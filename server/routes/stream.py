@@ -31,11 +31,11 @@ async def stream(websocket: WebSocket, id: str) -> None:
     hub: Hub = websocket.app.state.hub
     async with contextlib.AsyncExitStack() as held:
         try:
-            scene = await held.enter_async_context(scenes.using(id))
+            scene = await held.enter_async_context(scenes.use(id))
             _require_protocol(websocket)
             subscriber = hub.join(id, scene.readers.ask, lambda channel: Subscriber(scene, channel))
         except Problem as problem:  # the handshake is answered like any request: browsers see only that it failed
-            await websocket.send_denial_response(problems.answer(problem.document, problem.headers))
+            await websocket.send_denial_response(problems.problem_response(problem.document, problem.headers))
             return
         limit_messages(websocket.scope, 4 * subscriber.limits().message_bytes)  # `_read` says more
         try:
@@ -67,7 +67,7 @@ async def _serve(websocket: WebSocket, subscriber: Subscriber, end: float | None
         seconds = None if end is None else max(0.0, end - time.time())
         done, _ = await asyncio.wait((reading, writing), timeout=seconds, return_when=asyncio.FIRST_COMPLETED)
         if not done:
-            await websocket.close(1008, "the link has ended")
+            await websocket.close(1008, "the link has expired")
     finally:
         for task in (reading, writing):
             task.cancel()
@@ -86,7 +86,7 @@ async def _read(websocket: WebSocket, subscriber: Subscriber) -> None:
         if text is not None and len(text) > limit:  # characters: a bound on the bytes within a factor of four
             await websocket.close(TOO_BIG, f"a message of {len(text)} characters; {limit} bytes are taken")
             return
-        await subscriber.take(text)
+        await subscriber.handle_message(text)
 
 
 async def _write(websocket: WebSocket, subscriber: Subscriber) -> None:
@@ -96,7 +96,7 @@ async def _write(websocket: WebSocket, subscriber: Subscriber) -> None:
         else:
             await websocket.send_bytes(message)
 
-    await subscriber.outbox.empty_into(send)
+    await subscriber.outbox.send_all(send)
     if websocket.application_state == WebSocketState.CONNECTED:
         with contextlib.suppress(RuntimeError):
             await websocket.close(*subscriber.closing)

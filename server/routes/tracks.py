@@ -31,14 +31,20 @@ async def query(scene: TheScene, http: Request, request: TracksRequest) -> Respo
 async def tracks(
     scene: TheScene,
     http: Request,
-    ids: Annotated[str | None, Query(max_length=10_000, description="Of Gaussians, separated by commas.")] = None,
-    pixel: Annotated[Many, Query(description="u,v in the picture of `camera`, repeated.")] = None,
-    camera: Annotated[str | None, Query(max_length=64, description="Of the rig: where the pixels are.")] = None,
-    point: Annotated[Many, Query(description="x,y,z in the rig's world and units, repeated.")] = None,
-    at: Annotated[int | None, Query(ge=0, description="Frame of the pixels or points; the first committed.")] = None,
-    first: Annotated[int | None, Query(alias="from", ge=0, description="First frame; the first committed.")] = None,
+    ids: Annotated[str | None, Query(max_length=10_000, description="Ids of Gaussians, separated by commas.")] = None,
+    pixel: Annotated[Many, Query(description="u,v in the picture of `camera`; may be repeated.")] = None,
+    camera: Annotated[
+        str | None, Query(max_length=64, description="Name of the rig's camera that the pixels belong to.")
+    ] = None,
+    point: Annotated[Many, Query(description="x,y,z in the rig's world and units; may be repeated.")] = None,
+    at: Annotated[
+        int | None, Query(ge=0, description="Frame of the pixels or points; by default the first committed frame.")
+    ] = None,
+    first: Annotated[
+        int | None, Query(alias="from", ge=0, description="First frame; by default the first committed frame.")
+    ] = None,
     last: Annotated[
-        int | None, Query(alias="to", ge=0, description="Last frame, included; the last committed.")
+        int | None, Query(alias="to", ge=0, description="Last frame, inclusive; by default the last committed frame.")
     ] = None,
     project: Annotated[Many, Query(max_length=64, description="Cameras of the rig to project into.")] = None,
     format: Literal["json", "npz"] = "json",

@@ -41,19 +41,19 @@ async def answer(scene: Scene) -> TradeoffModel:
     newest = scene.committed[-tradeoff.NEWEST :]
     frame_reports = [await scene.report(index) for index in newest]
     first = scene.committed[0] if newest else 0
-    reports = tradeoff.telling([report for report in frame_reports if report is not None], first)
-    write = tradeoff.writing(reports)
+    reports = tradeoff.usable_reports([report for report in frame_reports if report is not None], first)
+    write = tradeoff.commit_milliseconds(reports)
     replayed = [
         point.model_copy(update={"milliseconds": point.milliseconds + write})
         for _, point in sorted(scene.replays.points.items())
     ]
-    points = [*tradeoff.measured(reports), *replayed]
+    points = [*tradeoff.measured_points(reports), *replayed]
     model = tradeoff.time_model(reports)
     threads = reports[-1].threads if reports else None
     return TradeoffModel(
         scene=scene.id,
-        points=[*points, *tradeoff.extrapolated(model, points, threads)],
-        curve=tradeoff.curve(reports),
+        points=[*points, *tradeoff.extrapolated_points(model, points, threads)],
+        curve=tradeoff.mean_curves(reports),
         model=model,
         budget=scene.budget().effective,
         replay=scene.replays.status,

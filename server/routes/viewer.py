@@ -7,7 +7,7 @@ from pathlib import Path
 from fastapi import APIRouter, Request
 from starlette.responses import RedirectResponse, Response
 
-from server.http.files import MEDIA_TYPES, policy, served
+from server.http.files import MEDIA_TYPES, security_headers, serve_file
 
 router = APIRouter(include_in_schema=False)
 
@@ -18,14 +18,14 @@ FILES = {
     if file.suffix in MEDIA_TYPES and file.parent.name != "player"  # of the page that `scas4d export --player` writes
 }
 """The files that are served: these names and no others."""
-HEADERS = policy(worker_src="'self'")  # what a rig or a scene is called stays text
+HEADERS = security_headers(worker_src="'self'")  # what a rig or a scene is called stays text
 
 
 @router.get("/")
 @router.get("/viewer/")
 async def page(request: Request) -> Response:
     """Returns the page."""
-    return served(request, FILES, "index.html", HEADERS, "/viewer/")
+    return serve_file(request, FILES, "index.html", HEADERS, "/viewer/")
 
 
 @router.get("/viewer")
@@ -37,4 +37,4 @@ async def elsewhere() -> Response:
 @router.get("/viewer/{name:path}")
 async def file(request: Request, name: str) -> Response:
     """Returns a file of the page."""
-    return served(request, FILES, name, HEADERS, "/viewer/")
+    return serve_file(request, FILES, name, HEADERS, "/viewer/")

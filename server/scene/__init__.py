@@ -1,1 +1,1 @@
-"""The life of a scene: creation, status, sleep, replays, exports, a new beginning, deletion."""
+"""Life cycle of a scene: creation, status, sleep, replays, exports, reconstruction restart and deletion."""

@@ -1,7 +1,7 @@
-"""Exports of the scenes: one at a time in a process of its own, the others wait; files go after a while.
+"""Scene exports, which run one at a time in a separate process; their files expire after a day.
 
-An export is known to this process alone, and its file lies in the data folder: what an earlier process left is removed
-at the start. A scene that sleeps sleeps on: only its folder is read.
+Exports are tracked only in memory, while their files are in the data folder, so leftovers of an earlier service are
+removed at startup. An export does not wake a sleeping scene, because it reads only the scene's folder.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from typing import Any
 from client.wire import ExportModel, ExportRequest, ExportState
 from client.wire.exports import SUFFIXES
 from scas4d_core.errors import message_of
-from server.messages import Damaged, ExportEnded, ExportProgressed, ExportSpec
-from server.problems import Problem, counted
+from server.messages import DamageFound, ExportEnded, ExportProgressed, ExportSpec
+from server.problems import Problem, count_noun
 from server.processes import exporter
 from server.processes.placement import Placement, ProcessExit
 from server.scene.scene import Scene
@@ -29,27 +29,42 @@ from server.scene.scenes import Scenes
 from server.storage.disk import free_bytes
 from server.storage.layout import DataFolder
 
-MOST_WAITING = 16
-"""Exports of all scenes that are not over; more get 429."""
-MOST_A_SCENE = 8
-"""Exports of one scene that wait, run or are done; more get 409. Of those that failed as many are remembered."""
+MAX_WAITING = 16
+"""Maximum number of unfinished exports of all scenes; further requests get 429."""
+MAX_PER_SCENE = 8
+"""Maximum number of waiting, running and finished exports per scene; further requests get 409.
+
+The same number of failed or cancelled exports is remembered.
+"""
 KEEP_S = 24 * 3600.0
-"""The file of an export stays for so long."""
-BYTES_EACH = {"ply": 68, "splat": 32, "spz": 20, "spz4": 20, "glb": 70, "usd": 120, "tracks": 60, "s4d": 12}
-"""About so many bytes a Gaussian and frame, without gloss; USD takes its room twice. Other formats are small."""
+"""Seconds for which the file of an export is kept."""
+BYTES_PER_GAUSSIAN = {"ply": 68, "splat": 32, "spz": 20, "spz4": 20, "glb": 70, "usd": 120, "tracks": 60, "s4d": 12}
+"""Approximate bytes per Gaussian and frame, without view-dependent colour; other formats are small.
+
+USD temporarily needs twice its size.
+"""
 MEDIA_TYPES = {".zip": "application/zip", ".glb": "model/gltf-binary", ".csv": "text/csv"}
-OVER = frozenset({ExportState.DONE, ExportState.FAILED, ExportState.CANCELLED})
+FINAL_STATES = frozenset({ExportState.DONE, ExportState.FAILED, ExportState.CANCELLED})
 
 log = logging.getLogger("scas4d.server")
 
 
 @dataclass(eq=False)
 class Export:
-    """One export.
+    """State of one export.
 
     Attributes:
-        spec: of its process. name: of the file, for those who save it. done: frames; size: bytes on disk.
-        timer: removes it. task: makes it.
+        id: export ID.
+        spec: specification for the export process.
+        name: suggested name for the downloaded file.
+        created: time of the request.
+        state: current state.
+        done: number of exported frames.
+        size: bytes on disk.
+        error: reason of a failure, or None.
+        ended: time at which the export finished, or None.
+        timer: timer that removes the export.
+        task: task that runs the export.
     """
 
     id: str
@@ -66,7 +81,7 @@ class Export:
 
     @property
     def scene(self) -> str:
-        """Id of the scene."""
+        """ID of the scene."""
         return self.spec.scene.folder.name
 
     @property
@@ -75,7 +90,7 @@ class Export:
         return MEDIA_TYPES.get(self.spec.file.suffix, "application/octet-stream")
 
     def model(self) -> ExportModel:
-        """The export as it goes over the wire."""
+        """Returns the API model of the export."""
         place = f"/v1/scenes/{self.scene}/exports/{self.id}"
         return ExportModel.model_validate(
             {
@@ -98,10 +113,11 @@ class Export:
 
 
 class Exports:
-    """All exports of the service. On the event loop.
+    """All exports of the service. All methods run on the event loop.
 
     Args:
-        scenes: of the service. placement: starts the processes.
+        scenes: scenes of the service.
+        placement: placement that starts the processes.
     """
 
     def __init__(self, scenes: Scenes, placement: Placement) -> None:
@@ -112,23 +128,23 @@ class Exports:
         self._known: dict[str, dict[str, Export]] = {}
 
     async def open(self) -> None:
-        """Removes what an earlier process left; it holds the lock of the data folder."""
+        """Removes leftovers of an earlier service; the caller must hold the lock of the data folder."""
         await asyncio.to_thread(shutil.rmtree, self._folder, ignore_errors=True)
 
     def of(self, scene: str) -> list[Export]:
-        """Lists the exports of a scene, oldest first.
+        """Returns the exports of a scene, oldest first.
 
         Raises:
-            Problem: 404 or 503, there is no such scene.
+            Problem: 404 or 503, the scene does not exist or is not available yet.
         """
         self._scenes.status(scene)
         return list(self._known.get(scene, {}).values())
 
     def get(self, scene: str, export: str) -> Export:
-        """Returns an export.
+        """Returns an export by its ID.
 
         Raises:
-            Problem: 404, there is none.
+            Problem: 404, the export does not exist.
         """
         self._scenes.status(scene)
         known_export = self._known.get(scene, {}).get(export)
@@ -141,7 +157,8 @@ class Exports:
         """Queues an export of committed frames.
 
         Raises:
-            Problem: 409, the scene has too many; 429, too many wait; 507, the disk has too little room.
+            Problem: 409, the scene has too many exports; 429, too many are waiting; 507, there is too little disk
+                space.
         """
         self._scenes.check_current(scene)
         self._check(scene, request, len(frames))
@@ -160,34 +177,39 @@ class Exports:
         title = re.sub(r"[^A-Za-z0-9]+", "-", scene.status().name).strip("-")[:40] or scene.id[:8]
         name = f"{title}-{frames[0]:06d}-{frames[-1]:06d}-{request.format}{suffix}"
         known[id] = export = Export(id, spec, name, datetime.now(UTC))
-        export.task = asyncio.create_task(self._make(export))
+        export.task = asyncio.create_task(self._run_in_turn(export))
         return export
 
     def _check(self, scene: Scene, request: ExportRequest, frames: int) -> None:
         id = scene.id
-        waiting = [one for each in self._known.values() for one in each.values() if one.state not in OVER]
-        if len(waiting) >= MOST_WAITING:
+        waiting = [one for each in self._known.values() for one in each.values() if one.state not in FINAL_STATES]
+        if len(waiting) >= MAX_WAITING:
             raise Problem(
                 429,
-                f"{counted(len(waiting), 'export')} of the service not over",
+                f"{count_noun(len(waiting), 'export')} of the service not over",
                 field="id",
                 value=id,
                 remedy="ask again when one is over",
                 headers={"Retry-After": "10"},
             )
         kept = [
-            one for one in self._known.get(id, {}).values() if one.state not in OVER or one.state == ExportState.DONE
+            one
+            for one in self._known.get(id, {}).values()
+            if one.state not in FINAL_STATES or one.state == ExportState.DONE
         ]
-        if len(kept) >= MOST_A_SCENE:
+        if len(kept) >= MAX_PER_SCENE:
             raise Problem(
                 409,
-                f"the scene has {counted(len(kept), 'export')}, as many as it may",
+                f"the scene has {count_noun(len(kept), 'export')}, as many as it may",
                 field="id",
                 value=id,
                 remedy=f"remove one: DELETE /v1/scenes/{id}/exports/EXPORT, as {kept[0].id}",
             )
         parent = self._folder.parent
-        needed = BYTES_EACH.get(request.format, 0) * frames * (scene.status().gaussians or 0) + exporter.RESERVE_BYTES
+        needed = (
+            BYTES_PER_GAUSSIAN.get(request.format, 0) * frames * (scene.status().gaussians or 0)
+            + exporter.RESERVE_BYTES
+        )
         if (free := free_bytes(parent)) < needed:
             raise Problem(
                 507,
@@ -198,14 +220,14 @@ class Exports:
                 remedy="export fewer frames, a smaller format (spz, s4d), or remove exports that are done",
             )
 
-    async def _make(self, export: Export) -> None:
-        """Waits for its turn, runs the process, and notes how it ended."""
+    async def _run_in_turn(self, export: Export) -> None:
+        """Waits for its turn, runs the export process and records the outcome."""
         folder, fault = export.spec.file.parent, None
         try:
             async with self._turns:
                 await asyncio.to_thread(folder.mkdir, parents=True)
                 export.state = ExportState.RUNNING
-                fault = await self._process(export)
+                fault = await self._run_process(export)
             if fault is None:
                 export.size = (await asyncio.to_thread(export.spec.file.stat)).st_size
         except Exception as error:
@@ -213,20 +235,20 @@ class Exports:
             fault = f"the service failed: {type(error).__name__}: {message_of(error)}"
         if fault is not None:
             log.warning("scene %s: export %s failed: %s", export.scene, export.id, fault)
-            await self._clear(folder)
-        self._over(export, ExportState.DONE if fault is None else ExportState.FAILED, fault)
+            await self._remove_files(folder)
+        self._finish(export, ExportState.DONE if fault is None else ExportState.FAILED, fault)
 
-    def _over(self, export: Export, state: ExportState, error: str | None) -> None:
+    def _finish(self, export: Export, state: ExportState, error: str | None) -> None:
         export.state, export.error, export.ended = state, error, datetime.now(UTC)
         export.size = export.size if state == ExportState.DONE else 0
         export.timer = asyncio.get_running_loop().call_later(KEEP_S, self._expire, export)
         known = self._known.get(export.scene, {}).values()
         failed = [one for one in known if one.state in (ExportState.FAILED, ExportState.CANCELLED)]
-        for one in failed[:-MOST_A_SCENE]:
+        for one in failed[:-MAX_PER_SCENE]:
             self._drop(one)
 
-    async def _process(self, export: Export) -> str | None:
-        """Runs the process of an export; returns why it failed."""
+    async def _run_process(self, export: Export) -> str | None:
+        """Runs the process of an export and returns the reason of a failure, or None."""
         ended: asyncio.Future[str | None] = asyncio.get_running_loop().create_future()
 
         def end(fault: str | None) -> None:
@@ -236,25 +258,25 @@ class Exports:
         def gone(reason: ProcessExit) -> None:
             end(f"the export is gone: {reason}")
 
-        process = self._placement.start(exporter.main, export.spec, partial(self._receive, export, end), gone)
+        process = self._placement.start(exporter.main, export.spec, partial(self._on_message, export, end), gone)
         try:
             return await ended
         finally:
             await asyncio.shield(process.stop(1.0 if ended.done() and not ended.cancelled() else 0))
 
-    def _receive(self, export: Export, end: Any, message: Any) -> None:
+    def _on_message(self, export: Export, end: Any, message: Any) -> None:
         match message:
             case ExportProgressed():
                 export.done, export.size = message.done, message.size
-            case Damaged():
-                scene = self._scenes.by_id.get(export.scene)
-                if scene is not None and scene.has_place:  # of one that sleeps the next pass over it finds them
-                    scene.repair_queue.noticed(message.files)
+            case DamageFound():
+                scene = self._scenes.awake.get(export.scene)
+                if scene is not None and scene.has_place:  # for a sleeping scene, the next scrub finds the damage
+                    scene.repair_queue.report_damage(message.files)
             case ExportEnded():
                 end(message.fault)
 
     def _drop(self, export: Export) -> None:
-        """Forgets an export that is over."""
+        """Removes a finished export from the list and cancels its timer."""
         known = self._known.get(export.scene, {})
         if known.get(export.id) is export:
             del known[export.id]
@@ -268,27 +290,27 @@ class Exports:
         asyncio.get_running_loop().run_in_executor(None, partial(shutil.rmtree, export.spec.file.parent, True))
 
     async def remove(self, scene: str, export: str) -> None:
-        """Cancels an export that waits or runs; removes one that is over, and its file.
+        """Cancels a waiting or running export, or removes a finished one and its file.
 
         Raises:
-            Problem: 404, there is none.
+            Problem: 404, the export does not exist.
         """
         removed = self.get(scene, export)
-        if removed.state in OVER:
+        if removed.state in FINAL_STATES:
             self._drop(removed)
-            await self._clear(removed.spec.file.parent)
+            await self._remove_files(removed.spec.file.parent)
         else:
             await self._cancel(removed)
 
     async def forget(self, scene: str) -> None:
-        """Ends and removes all exports of a scene that was deleted, or whose reconstruction was begun anew."""
+        """Cancels and removes all exports of a scene that was deleted or whose reconstruction was restarted."""
         for export in list(self._known.get(scene, {}).values()):
             await self._cancel(export)
             self._drop(export)
-        await self._clear(self._folder / scene)
+        await self._remove_files(self._folder / scene)
 
     async def stop(self) -> None:
-        """Ends all processes; the files go at the next start."""
+        """Stops all export processes; their files are removed at the next startup."""
         for known in list(self._known.values()):
             for export in list(known.values()):
                 await self._cancel(export)
@@ -296,13 +318,13 @@ class Exports:
                     export.timer.cancel()
 
     async def _cancel(self, export: Export) -> None:
-        """Ends an export that waits or runs."""
+        """Cancels a waiting or running export."""
         if export.task is not None and not export.task.done():
             export.task.cancel()
             await asyncio.wait({export.task})
-        if export.state not in OVER:  # else it was quicker
-            self._over(export, ExportState.CANCELLED, "it was cancelled")
-            await self._clear(export.spec.file.parent)
+        if export.state not in FINAL_STATES:  # otherwise it finished before the cancellation
+            self._finish(export, ExportState.CANCELLED, "it was cancelled")
+            await self._remove_files(export.spec.file.parent)
 
-    async def _clear(self, folder: Path) -> None:
+    async def _remove_files(self, folder: Path) -> None:
         await asyncio.to_thread(shutil.rmtree, folder, ignore_errors=True)

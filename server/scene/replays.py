@@ -8,10 +8,10 @@ from typing import Any
 
 from client.wire import PointKind, ReplayRequest, ReplayState, ReplayStatus, TradeoffPoint
 from server.background import Background
-from server.messages import Damaged, FrameReady, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated, SceneSpec
-from server.problems import Problem, counted
+from server.messages import DamageFound, FrameReady, ReplayEnded, ReplayPoint, ReplaySpec, ReplayUpdated, SceneSpec
+from server.problems import Problem, count_noun
 from server.processes import replayer
-from server.processes.placement import AnyProcess, Placement, ProcessExit
+from server.processes.placement import Placement, ProcessExit, ProcessHandle
 from server.scene.status import effective_budget
 from server.storage.ledger import Ledger
 
@@ -46,7 +46,7 @@ class Replays:
         self._placement = placement
         self._damaged = damaged
         self._background = background
-        self._process: AnyProcess | None = None
+        self._process: ProcessHandle | None = None
         self._life: object = None
         self.status = ReplayStatus()
         self.points: dict[int, TradeoffPoint] = {}
@@ -66,7 +66,7 @@ class Replays:
         if self._process is not None:
             raise Problem(
                 409,
-                f"a replay of this scene is running: {self.status.done} of {counted(self.status.total, 'update')} over",
+                f"a replay of this scene is running: {self.status.done} of {count_noun(self.status.total, 'update')}",
                 field="id",
                 value=id,
                 remedy=f"wait for it: GET /v1/scenes/{id}/tradeoff reports its progress",
@@ -80,8 +80,8 @@ class Replays:
         self._process = self._placement.start(
             replayer.main,
             spec,
-            lambda message: self._receive(life, message),
-            lambda reason: self._ended(life, reason),
+            lambda message: self._on_message(life, message),
+            lambda reason: self._on_end(life, reason),
         )
         self.status = ReplayStatus(
             state=ReplayState.RUNNING,
@@ -98,8 +98,8 @@ class Replays:
         if len(committed) < count + 2:
             raise Problem(
                 409,
-                f"{counted(len(committed), 'committed state')} can be read, {count + 2} are needed: the one to start "
-                f"from, one to warm up, and {counted(count, 'frame')} that count",
+                f"{count_noun(len(committed), 'committed state')} can be read, {count + 2} are needed: the one to "
+                f"start from, one to warm up, and {count_noun(count, 'frame')} that count",
                 field="frames",
                 value=count,
                 remedy="ask again when more frames are committed, or for fewer frames (ingest.keep_states says how "
@@ -120,10 +120,10 @@ class Replays:
             held = len(indices) - 1 - indices.index(bare[-1])
             raise Problem(
                 409,
-                f"the pictures of frame {bare[-1]} are not held any more",
+                f"the pictures of frame {bare[-1]} are no longer kept",
                 field="frames",
                 value=count,
-                remedy=(f"ask for at most {counted(held - 1, 'frame')}, or " if held > 1 else "")
+                remedy=(f"ask for at most {count_noun(held - 1, 'frame')}, or " if held > 1 else "")
                 + "make scenes that keep more pictures (ingest.keep_frames)",
             )
         return base, indices
@@ -149,11 +149,11 @@ class Replays:
         assert receipt is not None  # it has files
         return FrameReady(index, receipt.time, entry.files, receipt.identity)
 
-    def _receive(self, life: object, message: Any) -> None:
+    def _on_message(self, life: object, message: Any) -> None:
         if life is not self._life:
             return
         match message:
-            case Damaged():
+            case DamageFound():
                 self._damaged(message.files)
             case ReplayUpdated():
                 self.status.done += 1
@@ -171,14 +171,14 @@ class Replays:
                     threads=replayer.THREADS,
                 )
             case ReplayEnded():
-                self._over(message.fault)
+                self._finish(message.fault)
 
-    def _ended(self, life: object, reason: ProcessExit) -> None:
+    def _on_end(self, life: object, reason: ProcessExit) -> None:
         if life is self._life:
             self._process = None
-            self._over(f"the replay is gone: {reason}")
+            self._finish(f"the replay is gone: {reason}")
 
-    def _over(self, fault: str | None) -> None:
+    def _finish(self, fault: str | None) -> None:
         self.status.state = ReplayState.DONE if fault is None else ReplayState.FAILED
         self.status.error = fault
         self._life = None

@@ -15,17 +15,17 @@ from scas4d_core.first_frame.calibration.report import effective_rig
 from scas4d_core.rig_checks import RigError, check_start
 from server.background import Background
 from server.hub import Hub, Publisher
-from server.ingest.acknowledge import Ingest, IngestRules, uncancelled
+from server.ingest.acknowledge import Ingest, IngestRules, shield_and_wait
 from server.ingest.open_frames import OpenFrames
 from server.messages import SceneSpec
-from server.problems import Problem, counted, of_rig
+from server.problems import Problem, count_noun, rig_problem
 from server.processes.placement import STOP_SECONDS, Placement
 from server.processes.readers import Readers
 from server.repair.repair_queue import DamageKind, DamageLog, RepairQueue
 from server.repair.scrub import Scrub
-from server.scene.found import FoundScene
 from server.scene.replays import Replays
 from server.scene.status import SceneFacts, camera_of, effective_budget
+from server.scene.stored_scene import StoredScene
 from server.settings import ServerSettings
 from server.storage.events import BudgetChanged, JournalEvent, PauseChanged, SceneCreated, SceneEdited
 from server.storage.frame_store import FrameLogIndex
@@ -48,7 +48,7 @@ class Scene:
     aside, missing or skipped. The ledger has all that is known of them; acknowledged changes are journalled first.
 
     The way of a frame: `Ingest.acknowledge` journals it, `Updates.begin` sends it to the worker, `Updates._commit`
-    records that it is committed, and `Publisher.finished` publishes its report.
+    records that it is committed, and `Publisher.publish_frame` publishes its report.
 
     Args:
         found: the content of its folder, of a new scene too.
@@ -65,7 +65,7 @@ class Scene:
 
     def __init__(
         self,
-        found: FoundScene,
+        found: StoredScene,
         server: ServerSettings,
         placement: Placement,
         hub: Hub,
@@ -107,8 +107,8 @@ class Scene:
         self.repair_queue = RepairQueue(
             self.log, self._damage, self._background, to_worker=worker.send, recompute=content.recompute
         )
-        self.readers = Readers(self.spec, placement, self.repair_queue.noticed)
-        self._reports = FrameReports(self.ledger, folder.states, self.repair_queue.noticed)
+        self.readers = Readers(self.spec, placement, self.repair_queue.report_damage)
+        self._reports = FrameReports(self.ledger, folder.states, self.repair_queue.report_damage)
         self.updates = Updates(
             self.log,
             self._damage,
@@ -126,8 +126,8 @@ class Scene:
         # Frames that come in.
         self.ingest = Ingest(self.log, self.rules, self.updates, self._publisher, can_begin=self._check_start)
         self.open_frames = OpenFrames(self.ingest, self._background)
-        self.updates.when_room_is_made(self.open_frames.close_due)
-        self.replays = Replays(self.spec, self.ledger, placement, self.repair_queue.noticed, self._background)
+        self.updates.on_queue_room(self.open_frames.close_due)
+        self.replays = Replays(self.spec, self.ledger, placement, self.repair_queue.report_damage, self._background)
 
         if content.events:
             self._background.run(self.log.write(*content.events))
@@ -147,7 +147,7 @@ class Scene:
         try:
             check_start(self.rig, self.points_sha256 is not None)
         except RigError as error:
-            raise of_rig(error) from None
+            raise rig_problem(error) from None
 
     # Questions.
 
@@ -178,7 +178,7 @@ class Scene:
             first=updates.first,
             damage=self._damage.sentences,
             warnings=self.warnings,
-            trouble=self._trouble.sentence or self.repair_queue.trouble,
+            trouble=self._trouble.sentence or self.repair_queue.current_repair,
             at_work=updates.at_work,
             progress=updates.progress,
             worker_deaths=updates.worker.deaths.count,
@@ -202,7 +202,7 @@ class Scene:
     @property
     def idle(self) -> bool:
         """True where nothing is under way that would be lost or delayed if its processes ended."""
-        closing = bool(self.ledger.open) and self.rules.part_seconds is not None
+        closing = bool(self.ledger.open) and self.rules.open_frame_seconds is not None
         busy = self.updates.has_work or self.readers.busy or self.replays.busy or self._background.busy
         return not (self.users or closing or busy or self.log.lock.locked() or self._publisher.listeners)
 
@@ -220,7 +220,7 @@ class Scene:
         if not frames.committed:
             raise Problem(
                 409,
-                "no frame of this scene is committed yet",
+                "this scene has no committed frame yet",
                 field=field,
                 remedy="wait until `committed` in the scene's status is above 0",
                 state=self.state,
@@ -231,7 +231,7 @@ class Scene:
         if entry is not None and entry.unreadable:
             raise Problem(
                 503,
-                f"the state of frame {index} was damaged on disk and is being made again",
+                f"the state of frame {index} was damaged on disk and is being recomputed",
                 field=field,
                 value=index,
                 remedy="ask again, or for another frame",
@@ -261,7 +261,7 @@ class Scene:
         """Describes the budget of frames that are not begun."""
         since, asked = self.ledger.budgets[-1]
         effective = effective_budget(self.spec.settings, asked)
-        return SceneBudget(scene=self.id, asked=asked, effective=effective, since=since)
+        return SceneBudget(scene=self.id, requested=asked, effective=effective, since=since)
 
     # Changes.
 
@@ -278,9 +278,9 @@ class Scene:
                 if self.ledger.budgets[-1][1] == budget:
                     return
                 with self.updates.paused():
-                    await self.log.append(BudgetChanged(index=self.ledger.begins_next(), budget=budget))
+                    await self.log.append(BudgetChanged(index=self.ledger.next_to_begin(), budget=budget))
 
-        await uncancelled(change())
+        await shield_and_wait(change())
 
     async def pause(self, paused: bool) -> None:
         """Begins no frame after the one at work, or goes on; holds over a restart."""
@@ -290,7 +290,7 @@ class Scene:
                 if self.ledger.paused != paused:
                     await self.log.append(PauseChanged(paused=paused))
 
-        await uncancelled(change())
+        await shield_and_wait(change())
         self.updates.begin()
 
     async def edit(self, edit: SceneEdit) -> None:
@@ -305,19 +305,19 @@ class Scene:
                 if edit.archived:
                     self._refuse_unfinished()
                 event = SceneEdited(**dict(edit))
-                if event.after(self.ledger.edited) != self.ledger.edited:
+                if event.merged_with(self.ledger.edited) != self.ledger.edited:
                     await self.log.append(event)
 
-        await uncancelled(change())
+        await shield_and_wait(change())
         kept = self.ledger.edited.rules(self.request.ingest)
-        await self.updates.keep(kept)
+        await self.updates.set_retention(kept)
 
     def _refuse_unfinished(self) -> None:
         waiting = self.ledger.unfinished + len(self.ledger.open)
         if waiting and self.ledger.fatal is None:
             raise Problem(
                 409,
-                f"{counted(waiting, 'frame')} of the scene not finished",
+                f"{count_noun(waiting, 'frame')} of the scene not finished",
                 field="archived",
                 value=True,
                 remedy="wait until `queued` and `open_frames` of its status are empty (POST …/resume if it is paused)",
@@ -344,10 +344,10 @@ class Scene:
         return chain((SceneCreated(definition=self._definition.as_json()),), events_of(self.ledger.copy()))
 
     def _journal_renewed(self, fault: str) -> None:
-        self._damage.say(DamageKind.JOURNAL, f"{fault}; it was written anew from what the service knows")
-        self._publisher.changed()
+        self._damage.add(DamageKind.JOURNAL, f"{fault}; it was written anew from what the service knows")
+        self._publisher.publish_status()
 
     def _failed(self, error: BaseException) -> None:
         self.ledger.fatal = f"the service failed: {type(error).__name__}: {message_of(error)}"
         log.error("scene %s", self.id, exc_info=error)
-        self._publisher.changed()
+        self._publisher.publish_status()

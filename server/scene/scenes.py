@@ -19,12 +19,12 @@ from server.hub import Hub
 from server.problems import Problem
 from server.processes.placement import Placement
 from server.scene import sleep
-from server.scene.beginning import Beginning, begins_anew, journal_beginning
-from server.scene.found import find, make
-from server.scene.recovering import Recovering
+from server.scene.new_reconstruction import NewReconstruction, journal_new_reconstruction, restarting_problem
 from server.scene.scene import Scene
-from server.scene.sleep import SleepingScene, Turns
-from server.scene.status_cache import write_card
+from server.scene.sleep import SleepingScene, Transitions
+from server.scene.startup_recovery import StartupRecovery
+from server.scene.status_cache import write_status_cache
+from server.scene.stored_scene import create_folder, read_stored_scene
 from server.settings import ServerSettings
 from server.storage.definition import Definition, DefinitionError
 from server.storage.disk import FolderLock, full_disk, lock_data, no_room
@@ -46,17 +46,17 @@ class Scenes:
         self.server = server
         self.placement = placement
         self.hub = hub
-        self.by_id: dict[str, Scene] = {}
+        self.awake: dict[str, Scene] = {}
         self.asleep: dict[str, SleepingScene] = {}
         self.unreadable: dict[str, str] = {}
         self._data = DataFolder(server.data.resolve())
-        self.recovering = Recovering(self._data, self._restore)
+        self.recovering = StartupRecovery(self._data, self._restore)
         self._lock: FolderLock | None = None
         self._promised = 0
         """Places that are given to scenes which are not in `by_id` yet."""
         self._beginning: dict[str, asyncio.Task[None]] = {}
         """Scenes whose reconstruction is being begun anew."""
-        self._turns = Turns()
+        self._turns = Transitions()
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def open(self) -> None:
@@ -69,21 +69,21 @@ class Scenes:
             folder.mkdir(parents=True, exist_ok=True)
         self._lock = lock_data(self.server.data)
         await self.recovering.begin()
-        self._run(self._look())
+        self._run(self._put_idle_to_sleep())
 
     # Awake, asleep.
 
     def __len__(self) -> int:
         """Number of scenes, awake or asleep."""
-        return len(self.by_id.keys() | self.asleep.keys())
+        return len(self.awake.keys() | self.asleep.keys())
 
     def __contains__(self, id: str) -> bool:
-        return any(id in known for known in (self.by_id, self.asleep, self.unreadable, self.recovering))
+        return any(id in known for known in (self.awake, self.asleep, self.unreadable, self.recovering))
 
     def statuses(self) -> list[SceneStatus]:
         """The status of every scene that is recovered, oldest first; none is woken."""
-        entries = [(scene.created, scene.status) for id, scene in self.asleep.items() if id not in self.by_id]
-        entries += [(scene.created, scene.status()) for scene in self.by_id.values()]
+        entries = [(scene.created, scene.status) for id, scene in self.asleep.items() if id not in self.awake]
+        entries += [(scene.created, scene.status()) for scene in self.awake.values()]
         return [status for _, status in sorted(entries, key=lambda one: one[0])]
 
     def status(self, id: str) -> SceneStatus:
@@ -92,12 +92,12 @@ class Scenes:
         Raises:
             Problem: see `refuse`.
         """
-        if id not in self.by_id and id not in self._beginning and id in self.asleep:
+        if id not in self.awake and id not in self._beginning and id in self.asleep:
             return self.asleep[id].status
         return self[id].status()
 
     @asynccontextmanager
-    async def using(self, id: str, *, place: bool = True) -> AsyncIterator[Scene]:
+    async def use(self, id: str, *, place: bool = True) -> AsyncIterator[Scene]:
         """A scene for a request or a connection, woken where it is asleep; it does not fall asleep inside.
 
         Args:
@@ -118,62 +118,62 @@ class Scenes:
         while True:
             if id in self._turns:
                 await self._turns.end(id)
-            elif id in self.asleep and id not in self.by_id and id not in self._beginning:
+            elif id in self.asleep and id not in self.awake and id not in self._beginning:
                 self._turns.begin(id, self._wake(id))
             elif (scene := self[id]).has_place or not place:
                 return scene
             else:
-                await self._promise()
+                await self._reserve_place()
                 self._promised -= 1
-                if self.by_id.get(id) is scene and id not in self._turns:
+                if self.awake.get(id) is scene and id not in self._turns:
                     scene.has_place = True
 
     @property
-    def _places_left(self) -> int:
-        return self.server.max_scenes - sum(scene.has_place for scene in self.by_id.values()) - self._promised
+    def _free_places(self) -> int:
+        return self.server.max_scenes - sum(scene.has_place for scene in self.awake.values()) - self._promised
 
-    async def _promise(self) -> None:
+    async def _reserve_place(self) -> None:
         """Promises a place to a scene; another one falls asleep for it where there is none.
 
         Raises:
             Problem: 429, none is idle.
         """
-        while self._places_left <= 0:
-            if falling := [id for id in self._turns if id in self.by_id]:
+        while self._free_places <= 0:
+            if falling := [id for id in self._turns if id in self.awake]:
                 await self._turns.end(falling[0])
             else:
-                await self.put_to_sleep(sleep.makes_room(self.by_id.values(), self.server))
+                await self.put_to_sleep(sleep.scene_to_put_to_sleep(self.awake.values(), self.server))
         self._promised += 1
 
     async def put_to_sleep(self, scene: Scene) -> None:
         """Ends the processes of a scene that is idle still, and gives its place back; its folder has all that it is."""
-        if self.by_id.get(scene.id) is scene and scene.id not in self._turns and scene.idle:
+        if self.awake.get(scene.id) is scene and scene.id not in self._turns and scene.idle:
             self._turns.begin(scene.id, self._fall_asleep(scene))
         await self._turns.end(scene.id)
 
     async def _fall_asleep(self, scene: Scene) -> None:
-        self._sleeps(status := scene.status().model_copy(update={"asleep": True}))
+        self._note_asleep(status := scene.status().model_copy(update={"asleep": True}))
         try:
             await scene.stop()
-            await asyncio.to_thread(write_card, scene.spec.folder, status)
+            await asyncio.to_thread(write_status_cache, scene.spec.folder, status)
         except Exception:  # its folder has all that it is
             log.exception("scene %s did not end as it should", scene.id)
-        del self.by_id[scene.id]
+        del self.awake[scene.id]
         log.info("scene %s sleeps", scene.id)
 
-    def _sleeps(self, status: SceneStatus) -> None:
+    def _note_asleep(self, status: SceneStatus) -> None:
         self.asleep[status.id] = SleepingScene(status.id, datetime.fromisoformat(status.created), status)
 
     async def _wake(self, id: str) -> None:
         if not await self._restore(self._data.scene(id), self.asleep[id].status.damage, wake=True):
-            raise sleep.cannot_wake(id, self.unreadable.pop(id))
+            raise sleep.cannot_wake_problem(id, self.unreadable.pop(id))
         del self.asleep[id]
 
-    async def _look(self) -> None:
+    async def _put_idle_to_sleep(self) -> None:
         """Puts scenes to sleep that have been idle for long enough."""
-        while (seconds := sleep.look_seconds(self.server)) is not None:
+        while (seconds := sleep.check_interval(self.server)) is not None:
             await asyncio.sleep(seconds)
-            for scene in sleep.tired(tuple(self.by_id.values()), self.server):
+            for scene in sleep.idle_scenes(tuple(self.awake.values()), self.server):
                 try:
                     await self.put_to_sleep(scene)
                 except Exception:  # one that cannot fall asleep keeps no other awake
@@ -188,21 +188,24 @@ class Scenes:
             folder: of the scene. said: of damage that was found before. wake: have it in memory in any case.
         """
         try:
-            if not wake and (status := await asyncio.to_thread(sleep.sleeps_on, folder, self.server)) is not None:
-                self._sleeps(status)
+            if (
+                not wake
+                and (status := await asyncio.to_thread(sleep.status_if_still_asleep, folder, self.server)) is not None
+            ):
+                self._note_asleep(status)
                 return True
-            restored = await asyncio.to_thread(find, folder, self._data.bury, said)
-            goes_on = not wake and sleep.was_awake(restored.used, self.server) and self._places_left > 0
+            restored = await asyncio.to_thread(read_stored_scene, folder, self._data.move_to_deleted, said)
+            goes_on = not wake and sleep.was_awake(restored.used, self.server) and self._free_places > 0
             if restored.has_work or goes_on or wake:
                 scene = Scene(restored, self.server, self.placement, self.hub)
                 scene.has_place = restored.has_work or goes_on
-                self.by_id[scene.id] = scene
+                self.awake[scene.id] = scene
                 if goes_on:
                     scene.start()
                 scene.updates.begin()
             else:
-                self._sleeps(status := restored.facts(self.server.queue_frames).status())
-                await asyncio.to_thread(write_card, folder, status)
+                self._note_asleep(status := restored.facts(self.server.queue_frames).status())
+                await asyncio.to_thread(write_status_cache, folder, status)
         except Exception as error:  # a fault of one scene is no fault of the others
             known = isinstance(error, DefinitionError | OSError)
             reason = message_of(error) if known else f"the service failed: {type(error).__name__}: {message_of(error)}"
@@ -226,14 +229,14 @@ class Scenes:
             fault = "the reconstruction of this scene was begun anew while this request came"
             raise Problem(503, fault, field="id", value=scene.id, remedy="send the request again")
 
-    async def begin_again(self, scene: Scene, beginning: Beginning) -> SceneStatus:
+    async def begin_again(self, scene: Scene, beginning: NewReconstruction) -> SceneStatus:
         """Begins the reconstruction of a scene anew; the same request again returns the scene as it is.
 
         The scene is stopped, the event journalled, and the scene recovered from its folder, as after a crash; until
         then it answers 503. A refusal leaves it as it was.
 
         Raises:
-            Problem: see `Beginning.event`; 507, the disk is full.
+            Problem: see `NewReconstruction.event`; 507, the disk is full.
         """
         id, current = scene.id, self[scene.id]
         if beginning.event(current.ledger, current.spec.folder) is None:
@@ -244,21 +247,21 @@ class Scenes:
         await asyncio.shield(task)
         return self.status(id)
 
-    async def _begin_again(self, scene: Scene, beginning: Beginning) -> None:
+    async def _begin_again(self, scene: Scene, beginning: NewReconstruction) -> None:
         self.hub.restart(scene.id)
         async with scene.log.lock:  # points that are being written are whole, and later ones are refused
             pass
         await scene.stop(0)
         folder, said = self._data.scene(scene.id), scene.status().damage
         try:
-            said += await journal_beginning(folder, beginning)
+            said += await journal_new_reconstruction(folder, beginning)
         finally:
             if await self._restore(folder, said, wake=True):
-                self.by_id[scene.id].has_place = True
-                self.by_id[scene.id].start()
+                self.awake[scene.id].has_place = True
+                self.awake[scene.id].start()
             else:
-                del self.by_id[scene.id]
-        self._run(asyncio.to_thread(self._data.sweep))
+                del self.awake[scene.id]
+        self._run(asyncio.to_thread(self._data.remove_deleted))
 
     # Created, deleted.
 
@@ -270,11 +273,11 @@ class Scenes:
                 recovered; 507, the disk is full.
         """
         self.recovering.check()  # they may need places
-        await self._promise()
+        await self._reserve_place()
         definition = Definition(secrets.token_hex(6), datetime.now(UTC), request, settings)
         folder = self._data.scene(definition.id)
         try:
-            created = await make(folder, definition)
+            created = await create_folder(folder, definition)
         except OSError as error:
             await asyncio.to_thread(shutil.rmtree, folder.path, ignore_errors=True)
             if no_room(error):
@@ -284,7 +287,7 @@ class Scenes:
             self._promised -= 1
         scene = Scene(created, self.server, self.placement, self.hub)
         scene.has_place = True
-        self.by_id[definition.id] = scene
+        self.awake[definition.id] = scene
         scene.start()
         return scene
 
@@ -295,10 +298,10 @@ class Scenes:
             Problem: see `refuse`; 503, its reconstruction is being begun anew.
         """
         if id in self._beginning:
-            raise begins_anew(id)
-        if id not in self.by_id:
+            raise restarting_problem(id)
+        if id not in self.awake:
             self.refuse(id)
-        return self.by_id[id]
+        return self.awake[id]
 
     def refuse(self, id: str) -> NoReturn:
         """Says why there is no such scene.
@@ -324,10 +327,10 @@ class Scenes:
             del self.asleep[id]
         else:
             scene = self[id]
-            del self.by_id[id]
+            del self.awake[id]
             self.hub.close(id, "the scene was deleted")
             await scene.stop()
-        grave = await asyncio.to_thread(self._data.bury, folder, folder.name)
+        grave = await asyncio.to_thread(self._data.move_to_deleted, folder, folder.name)
         await asyncio.to_thread(shutil.rmtree, grave, ignore_errors=True)
 
     def _run(self, coroutine: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
@@ -344,6 +347,6 @@ class Scenes:
             await asyncio.wait(self._beginning.values())
         for task in tuple(self._tasks):
             task.cancel()
-        await asyncio.gather(*(scene.stop() for scene in self.by_id.values()))
+        await asyncio.gather(*(scene.stop() for scene in self.awake.values()))
         if self._lock is not None:
             self._lock.release()

@@ -13,15 +13,15 @@ from datetime import datetime
 from typing import Any
 
 from client.wire import SceneStatus
-from server.problems import Problem, counted
+from server.problems import Problem, count_noun
 from server.scene.scene import Scene
-from server.scene.status_cache import read_card
+from server.scene.status_cache import read_status_cache
 from server.settings import ServerSettings
 from server.storage.layout import SceneFolder
 
 GRACE_S = 30.0
 """A scene that was used so lately does not make room for another one: a rig may send a frame in a moment."""
-LOOK_S = 5.0
+CHECK_S = 5.0
 """Seconds between looks for scenes that have been idle for long enough; more often where they sleep sooner."""
 
 
@@ -38,7 +38,7 @@ class SleepingScene:
     status: SceneStatus
 
 
-class Turns(dict[str, asyncio.Task[None]]):
+class Transitions(dict[str, asyncio.Task[None]]):
     """Scenes that are falling asleep or waking, by id: each is at one turn at a time."""
 
     def begin(self, id: str, coroutine: Coroutine[Any, Any, None]) -> None:
@@ -58,15 +58,15 @@ class Turns(dict[str, asyncio.Task[None]]):
             await asyncio.shield(task)
 
 
-def look_seconds(settings: ServerSettings) -> float | None:
+def check_interval(settings: ServerSettings) -> float | None:
     """Seconds between looks for scenes that may fall asleep; None: none ever does by itself."""
-    return min(LOOK_S, settings.sleep_seconds / 2) or None
+    return min(CHECK_S, settings.sleep_seconds / 2) or None
 
 
-def tired(scenes: Iterable[Scene], settings: ServerSettings) -> list[Scene]:
+def idle_scenes(scenes: Iterable[Scene], settings: ServerSettings) -> list[Scene]:
     """Lists the scenes that have been idle for long enough; archived ones are at once."""
     now = time.monotonic()
-    return [scene for scene in scenes if now - scene.used >= _patience(scene, settings.sleep_seconds) and scene.idle]
+    return [scene for scene in scenes if now - scene.used >= _idle_limit(scene, settings.sleep_seconds) and scene.idle]
 
 
 def was_awake(used: float, settings: ServerSettings) -> bool:
@@ -74,20 +74,20 @@ def was_awake(used: float, settings: ServerSettings) -> bool:
     return settings.sleep_seconds == 0 or time.time() - used < settings.sleep_seconds
 
 
-def sleeps_on(folder: SceneFolder, settings: ServerSettings) -> SceneStatus | None:
+def status_if_still_asleep(folder: SceneFolder, settings: ServerSettings) -> SceneStatus | None:
     """Returns the status on the card of a scene that would have slept on had the service not been away. Blocking."""
     if folder.journal.exists() and was_awake(folder.journal.stat().st_mtime, settings):
         return None
-    if (status := read_card(folder)) is None:
+    if (status := read_status_cache(folder)) is None:
         return None
     return status.model_copy(update={"queue_limit": status.ingest.queue_frames or settings.queue_frames})
 
 
-def _patience(scene: Scene, seconds: float) -> float:
+def _idle_limit(scene: Scene, seconds: float) -> float:
     return min(GRACE_S, seconds) if scene.ledger.edited.archived else seconds
 
 
-def makes_room(scenes: Iterable[Scene], settings: ServerSettings) -> Scene:
+def scene_to_put_to_sleep(scenes: Iterable[Scene], settings: ServerSettings) -> Scene:
     """Returns the scene that makes room for another one: of those that are idle, the one used least lately.
 
     Raises:
@@ -101,7 +101,7 @@ def makes_room(scenes: Iterable[Scene], settings: ServerSettings) -> Scene:
         return min(idle, key=lambda scene: scene.used)
     raise Problem(
         429,
-        f"{counted(len(here), 'scene')} of at most {settings.max_scenes} are awake, and none of them is idle",
+        f"{count_noun(len(here), 'scene')} of at most {settings.max_scenes} are awake, and none of them is idle",
         field="SCAS4D_MAX_SCENES",
         value=settings.max_scenes,
         remedy="ask again when one is: nothing waits in it, and no page or sender is connected to it; put one to sleep "
@@ -110,7 +110,7 @@ def makes_room(scenes: Iterable[Scene], settings: ServerSettings) -> Scene:
     )
 
 
-def cannot_wake(id: str, reason: str) -> Problem:
+def cannot_wake_problem(id: str, reason: str) -> Problem:
     """Makes the answer, 503, for a scene whose folder cannot be read: it sleeps on, as the disk may be what fails."""
     remedy = "look after the scene's folder in the data folder, then ask again"
     return Problem(503, f"the scene cannot be read: {reason}", field="id", value=id, remedy=remedy)

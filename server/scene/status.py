@@ -21,7 +21,7 @@ from scas4d_core.effects.switches import decode_switches, first_switches
 from scas4d_core.frame_outcome import first_warnings, timing_warnings
 from scas4d_core.settings import Settings
 from server.problems import Problem
-from server.scene.beginning import how_to_begin_again
+from server.scene.new_reconstruction import restart_remedy
 from server.storage.definition import Definition
 from server.storage.frame_store import FrameLogIndex
 from server.storage.ledger import Ledger
@@ -48,7 +48,7 @@ class SceneFacts:
 
     Attributes:
         definition, ledger, pictures: of the scene. has_points: it has an initial cloud. queue_limit: in frames.
-        first: see `of_first_report`. damage, warnings: sentences; the warnings, about the rig.
+        first: see `first_frame_facts`. damage, warnings: sentences; the warnings, about the rig.
         trouble: why it is degraded, or None. at_work: a frame is. progress: of frame 0, while it is at work.
         worker_deaths: since it was taken up. asleep: it has no place among those that may have processes.
     """
@@ -71,7 +71,7 @@ class SceneFacts:
     def error(self) -> str | None:
         """Sentence that says why the scene is failed or degraded, or None."""
         fatal = self.ledger.fatal
-        return self.trouble if fatal is None else f"{fatal}; {how_to_begin_again(self.ledger)}"
+        return self.trouble if fatal is None else f"{fatal}; {restart_remedy(self.ledger)}"
 
     @property
     def state(self) -> SceneState:

@@ -20,7 +20,7 @@ from server.storage.definition import FORMAT
 from server.storage.layout import EXPORT, SceneFolder
 
 
-def write_card(folder: SceneFolder, status: SceneStatus) -> None:
+def write_status_cache(folder: SceneFolder, status: SceneStatus) -> None:
     """Writes the card of a scene that has fallen asleep, or was found asleep. Blocking; a full disk costs no more.
 
     A scene with damage gets none: each start looks again.
@@ -32,16 +32,16 @@ def write_card(folder: SceneFolder, status: SceneStatus) -> None:
         return
     status = status.model_copy(update={"worker_deaths": 0})
     text = json.dumps({"of": _of(folder), "status": status.model_dump(mode="json")})
-    beside = folder.card.with_suffix(".part")
+    beside = folder.status_cache.with_suffix(".part")
     with contextlib.suppress(OSError):
         beside.write_text(json.dumps({"blake3": blake3(text.encode()).hexdigest(), "card": text}))
-        os.replace(beside, folder.card)
+        os.replace(beside, folder.status_cache)
 
 
-def read_card(folder: SceneFolder) -> SceneStatus | None:
+def read_status_cache(folder: SceneFolder) -> SceneStatus | None:
     """Reads a scene's status from its card; None where there is none that can be believed. Blocking."""
     try:
-        data = json.loads(folder.card.read_bytes())
+        data = json.loads(folder.status_cache.read_bytes())
         if blake3(data["card"].encode()).hexdigest() != data["blake3"]:
             return None
         card = json.loads(data["card"])
@@ -60,7 +60,7 @@ def _of(folder: SceneFolder) -> dict[str, Any]:
 
 def _fingerprint(folder: SceneFolder) -> list[Any]:
     """Names, sizes and times of change of what lies in the folder; those of a folder in it change with its names."""
-    own = {folder.card.name, folder.card.with_suffix(".part").name, folder.worker_lock.name}
+    own = {folder.status_cache.name, folder.status_cache.with_suffix(".part").name, folder.worker_lock.name}
     with os.scandir(folder.path) as entries:
         others = [entry for entry in entries if entry.name not in own and not entry.name.startswith(f"{EXPORT}.")]
         stats = [(entry.name, entry.stat()) for entry in others]

@@ -19,7 +19,7 @@ NEAR = 0.1
 """Iterations that differ by no more than this share are not extrapolated beside measured ones."""
 
 
-def telling(reports: Iterable[FrameReportModel], first: int) -> list[FrameReportModel]:
+def usable_reports(reports: Iterable[FrameReportModel], first: int) -> list[FrameReportModel]:
     """Selects the updates that measure their iterations: committed whole at the first attempt, and not frame 0.
 
     Nor the first update, which ran several times.
@@ -31,24 +31,24 @@ def telling(reports: Iterable[FrameReportModel], first: int) -> list[FrameReport
         and report.index != first
         and report.iterations is not None
         and report.degraded is None
-        and len(report.tries) <= 1
+        and len(report.attempts) <= 1
         and "total" in report.seconds
         and OTHER_ORDERS not in report.seconds
     ]
 
 
-def writing(reports: Iterable[FrameReportModel]) -> float:
+def commit_milliseconds(reports: Iterable[FrameReportModel]) -> float:
     """Returns the median milliseconds of writing a commit; 0 where it is not known."""
     known = [report.write_seconds for report in reports if report.write_seconds is not None]
     return 1000 * median(known) if known else 0.0
 
 
-def measured(reports: Sequence[FrameReportModel]) -> list[TradeoffPoint]:
+def measured_points(reports: Sequence[FrameReportModel]) -> list[TradeoffPoint]:
     """Makes a point for each number of iterations that frames ran, to two digits, and of threads."""
-    write = writing(reports)
+    write = commit_milliseconds(reports)
     points = []
     for (iterations, threads), group in _groups(reports, lambda report: (_rounded(report.iterations), report.threads)):
-        errors = [report.errors.get(report.kept or "end") for report in group]
+        errors = [report.errors.get(report.candidate or "end") for report in group]
         points.append(
             TradeoffPoint(
                 kind=PointKind.MEASURED,
@@ -63,7 +63,7 @@ def measured(reports: Sequence[FrameReportModel]) -> list[TradeoffPoint]:
     return points
 
 
-def curve(reports: Sequence[FrameReportModel]) -> list[CurveMean]:
+def mean_curves(reports: Sequence[FrameReportModel]) -> list[CurveMean]:
     """Averages the curves of updates that had the same number of iterations."""
     steps = [
         (_rounded(report.iterations), _rounded(point.iterations), point)
@@ -94,10 +94,14 @@ def time_model(reports: Sequence[FrameReportModel]) -> TimeModel | None:
         return None
     each = median(slopes)
     rest = [1000 * report.seconds["total"] - each * (report.iterations or 0) for report in reports if report.curve]
-    return TimeModel(fixed=max(0.0, median(rest)) + writing(reports), per_iteration=each, frames=len(slopes))
+    return TimeModel(
+        fixed=max(0.0, median(rest)) + commit_milliseconds(reports), per_iteration=each, frames=len(slopes)
+    )
 
 
-def extrapolated(model: TimeModel | None, known: Sequence[TradeoffPoint], threads: int | None) -> list[TradeoffPoint]:
+def extrapolated_points(
+    model: TimeModel | None, known: Sequence[TradeoffPoint], threads: int | None
+) -> list[TradeoffPoint]:
     """Makes points for iterations not measured on as many threads: the model's time, and no accuracy."""
     if model is None:
         return []

@@ -1,1 +1,1 @@
-"""Durability: frame log, journal, ledger, epochs, recovery."""
+"""Durable storage of scenes: frame log, journal, ledger, epochs and recovery."""

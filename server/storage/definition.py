@@ -1,5 +1,7 @@
-"""Definition of a scene: rig, settings, ingest rules. Written before the scene is acknowledged, and again when its
-reconstruction was begun anew: the journal has that first.
+"""Scene definition: rig, settings and ingest rules, stored in `scene.json`.
+
+The file is written before the scene is acknowledged. It is written again after a restart of the reconstruction has been
+journalled.
 """
 
 from __future__ import annotations
@@ -20,19 +22,23 @@ from server.storage.events import JournalEvent, ReconstructionBegun, SceneCreate
 from server.storage.journal import replay
 from server.storage.layout import SceneFolder
 
-FORMAT = 2
-"""Of the folder of a scene: its definition, journal, frame log and points. Every change of one of them raises it."""
+FORMAT = 3
+"""Format version of a scene folder.
+
+Increment it with every format change of the definition, journal, frame log or points.
+"""
 
 
 class DefinitionError(ValueError):
-    """A folder has no definition that can be read: the message says why."""
+    """Error for a scene folder without a readable definition; the message states the reason."""
 
 
 @dataclass(frozen=True)
 class Definition:
-    """A scene as it was created. `settings` are the preset's with the request's changes, as they were then.
+    """A scene's creation request together with its resolved settings.
 
-    Where the reconstruction was begun anew, they are the settings of that, and `begun` is its event.
+    `settings` are the preset's values at creation time with the request's overrides applied. If the reconstruction was
+    restarted, `settings` are those of the restart and `begun` is its event.
     """
 
     id: str
@@ -41,11 +47,11 @@ class Definition:
     settings: Settings
     begun: ReconstructionBegun | None = None
 
-    def after(self, event: ReconstructionBegun | None) -> Definition:
-        """The definition once the reconstruction was begun anew; the same one where it knows of the event.
+    def with_reconstruction(self, event: ReconstructionBegun | None) -> Definition:
+        """Returns the definition after a restart of the reconstruction, or this one if it already includes the event.
 
         Raises:
-            DefinitionError: this version does not accept its settings.
+            DefinitionError: this version does not accept the event's settings.
         """
         if event is None or (self.begun is not None and self.begun.number >= event.number):
             return self
@@ -55,7 +61,7 @@ class Definition:
             raise DefinitionError(f"the settings cannot be read: {message_of(error)}") from None
 
     def as_json(self) -> dict[str, Any]:
-        """Returns the content of `scene.json`, and of the journal's first event."""
+        """Returns the content of `scene.json`, which the journal's first event repeats."""
         return {
             "format": FORMAT,
             "id": self.id,
@@ -66,11 +72,11 @@ class Definition:
         }
 
     @classmethod
-    def of_json(cls, data: Any) -> Definition:
-        """Reads the definition from what `as_json` made.
+    def from_json(cls, data: Any) -> Definition:
+        """Parses a definition from the output of `as_json`.
 
         Raises:
-            DefinitionError: it is of another format, or this version does not accept it.
+            DefinitionError: the definition has another format, or this version does not accept it.
         """
         try:
             written = data["format"]
@@ -84,7 +90,7 @@ class Definition:
                 datetime.fromisoformat(data["created"]).astimezone(UTC),
                 SceneCreate.model_validate(data["request"]),
                 Settings.model_validate(data["settings"]),
-                begun_of(data),
+                reconstruction_of(data),
             )
         except DefinitionError:
             raise
@@ -92,14 +98,14 @@ class Definition:
             raise DefinitionError(f"the definition cannot be read: {message_of(error)}") from None
 
 
-def begun_of(data: Mapping[str, Any]) -> ReconstructionBegun | None:
-    """The event in what `as_json` made; None: the reconstruction is that which came with the scene."""
+def reconstruction_of(data: Mapping[str, Any]) -> ReconstructionBegun | None:
+    """Returns the restart event in the output of `as_json`, or None if the reconstruction was never restarted."""
     begun = data.get("begun")
     return None if begun is None else ReconstructionBegun.model_validate(begun)
 
 
 def write_definition(folder: SceneFolder, definition: Definition) -> None:
-    """Writes `scene.json`: the scene exists from here on."""
+    """Writes `scene.json`; the scene exists once this file does."""
     text = json.dumps(definition.as_json(), indent=1)
     path = folder.definition
     with open_atomically(path, path.with_suffix(".part")) as file:
@@ -107,35 +113,35 @@ def write_definition(folder: SceneFolder, definition: Definition) -> None:
 
 
 def read_definition(folder: SceneFolder) -> tuple[Definition, str | None]:
-    """Reads the definition from `scene.json`, or from the journal where that file is damaged or gone.
+    """Reads the definition from `scene.json`, or from the journal if that file is damaged or missing.
 
     Returns:
-        The definition, and a sentence about damage that was found, or None.
+        The definition, and a sentence that describes any damage found, or None.
 
     Raises:
-        DefinitionError: it is in neither of them, or it is of another format, or this version does not accept it.
+        DefinitionError: neither file contains it, it has another format, or this version does not accept it.
     """
-    data, fault = _checked(folder)
+    data, fault = _read_checked(folder)
     if fault is None:
-        return Definition.of_json(data), None
+        return Definition.from_json(data), None
     created: list[SceneCreated] = []
     replay(folder.journal, lambda event: created.append(event) if isinstance(event, SceneCreated) else None)
     if created:
-        return Definition.of_json(created[0].definition), f"{fault}; taken from the journal"
+        return Definition.from_json(created[0].definition), f"{fault}; taken from the journal"
     raise DefinitionError(f"{fault}, and the journal does not have it either")
 
 
 def check_definition(folder: SceneFolder) -> str | None:
-    """Checks `scene.json`; returns its fault, or None."""
-    return _checked(folder)[1]
+    """Checks `scene.json` and returns a description of its fault, or None."""
+    return _read_checked(folder)[1]
 
 
-def _checked(folder: SceneFolder) -> tuple[Any, str | None]:
-    """Reads what `as_json` made from `scene.json`, and the fault of the file; with a fault there is nothing else."""
+def _read_checked(folder: SceneFolder) -> tuple[Any, str | None]:
+    """Returns the content of `scene.json` and None, or None and a description of the file's fault."""
     try:
         text = folder.definition.read_text(encoding="utf-8")
         data = json.loads(text)
-        if _digest(_inner(text)) == data["blake3"]:
+        if _digest(_scene_text(text)) == data["blake3"]:
             return data["scene"], None
     except FileNotFoundError:
         return None, f"{folder.definition.name} is gone"
@@ -144,18 +150,18 @@ def _checked(folder: SceneFolder) -> tuple[Any, str | None]:
     return None, f"{folder.definition.name} is damaged (it fails its checksum)"
 
 
-def _inner(text: str) -> str:
-    """The text of the scene within the text of the file, as `write_definition` wrote it; the digest is of that.
+def _scene_text(text: str) -> str:
+    """Returns the scene's JSON text within the file, as `write_definition` hashed it.
 
-    To encode the scene again takes longer than to read it, and a service starts over hundreds of them.
+    Encoding the scene again would take longer than reading it, and a service may load hundreds of scenes at startup.
     """
     return text.partition('\n "scene": ')[2].removesuffix("\n}").replace("\n ", "\n")
 
 
 def never_acknowledged(folder: SceneFolder) -> bool:
-    """True for a folder without `scene.json` whose scene was never acknowledged.
+    """Returns whether the scene of a folder without `scene.json` was never acknowledged.
 
-    Such a folder has no frame, no state, no points, and no event but that of its creation.
+    Such a folder contains no frames, states or points, and at most the creation event.
     """
     if folder.definition.exists() or folder.points.exists():
         return False

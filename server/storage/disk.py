@@ -1,4 +1,4 @@
-"""Full disks, and locks of folders."""
+"""Handling of full disks, and folder locks."""
 
 from __future__ import annotations
 
@@ -14,11 +14,14 @@ from server.problems import Problem
 from server.storage.layout import DataFolder, SceneFolder
 
 NO_ROOM = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG})
-"""Errors of a full disk: they go away once there is room."""
+"""Error numbers that mean a full disk; the errors disappear once space is available."""
 
 
 def no_room(error: BaseException | None) -> bool:
-    """True for an error of a full disk, and for one raised while such an error was handled (as zipfile does)."""
+    """Returns whether an error, or one that it was raised from, means a full disk.
+
+    For example, zipfile raises another error while it handles the original one.
+    """
     while error is not None:
         if isinstance(error, OSError) and error.errno in NO_ROOM:
             return True
@@ -27,7 +30,7 @@ def no_room(error: BaseException | None) -> bool:
 
 
 def full_disk(error: Exception) -> Problem:
-    """Makes the answer, 507, for a full disk."""
+    """Returns the 507 response for a full disk."""
     return Problem(
         507,
         f"the disk has no room: {message_of(error)}",
@@ -37,16 +40,16 @@ def full_disk(error: Exception) -> Problem:
 
 
 def free_bytes(path: Path) -> int:
-    """Returns the bytes that are free where a folder lies."""
+    """Returns the number of free bytes on the file system that contains a folder."""
     return shutil.disk_usage(path).free
 
 
 class FolderLock:
-    """Lock of a folder, held by one process at a time; the kernel releases it when the process ends.
+    """Folder lock held by one process at a time; the kernel releases it when the process ends.
 
     Args:
-        path: of the lock's file; made when missing.
-        wait: until it is free; otherwise BlockingIOError where another process holds it.
+        path: path of the lock file, which is created if missing.
+        wait: whether to wait until the lock is free; otherwise BlockingIOError is raised if another process holds it.
     """
 
     def __init__(self, path: Path, *, wait: bool) -> None:
@@ -58,7 +61,7 @@ class FolderLock:
             raise
 
     def write(self, text: str) -> None:
-        """Writes a note for people into the file, such as the holder's process id."""
+        """Writes a human-readable note to the file, such as the holder's process ID."""
         os.ftruncate(self._file, 0)
         os.pwrite(self._file, text.encode(), 0)
 
@@ -68,10 +71,10 @@ class FolderLock:
 
 
 def lock_data(data: Path) -> FolderLock:
-    """Locks the data folder for this service; the folder is made when missing.
+    """Locks the data folder for this service and creates the folder if missing.
 
     Raises:
-        RuntimeError: another service is at work in it.
+        RuntimeError: another service is using the folder.
     """
     data.mkdir(parents=True, exist_ok=True)
     try:
@@ -82,11 +85,11 @@ def lock_data(data: Path) -> FolderLock:
         ) from None
 
 
-def alone(folder: SceneFolder) -> FolderLock | None:
-    """Sees to it that no other worker commits to a scene: waits for its end.
+def lock_states(folder: SceneFolder) -> FolderLock | None:
+    """Waits until no other worker can commit to a scene's states, and locks them for this process.
 
-    With an epoch there is nothing to wait for and no lock: one on another machine may stop while it holds one, and
-    commits to a folder of its own (`server.storage.fencing`).
+    With an epoch, it only records this process's ID and returns None without waiting. A worker on another machine could
+    hang while holding a lock, so each epoch commits to its own folder instead (`server.storage.fencing`).
     """
     path = folder.worker_lock
     if folder.epoch is not None:
@@ -95,8 +98,8 @@ def alone(folder: SceneFolder) -> FolderLock | None:
             beside.write_text(f"{os.getpid()}\n")
             beside.replace(path)
         return None
-    # A service that was killed leaves a worker in the middle of an update: two must not commit to one history.
+    # A killed service can leave a worker in the middle of an update; two workers must not commit to one history.
     lock = FolderLock(path, wait=True)
-    with contextlib.suppress(OSError):  # a full disk is no reason not to work
+    with contextlib.suppress(OSError):  # the note is optional, so a full disk must not stop the worker
         lock.write(f"{os.getpid()}\n")
     return lock

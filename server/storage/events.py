@@ -1,6 +1,6 @@
-"""Events of a scene's journal: the only record of its frames, from which the ledger is folded in order.
+"""Journal events of a scene: the only record of its frames, from which the ledger is built in order.
 
-The tag of each event, `fact`, and its fields are written in `journal.log`: a change of them is another format
+Each event's `type` tag and fields are stored in `journal.log`, so changing them changes the format version
 (`server.storage.definition.FORMAT`).
 """
 
@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from client.wire import Budget, FileKind, IngestSettings, ReconstructionRequest, Retention
 
 Hashes = dict[str, dict[FileKind, str]]
-"""BLAKE3 of each file, by camera and kind."""
+"""BLAKE3 digest of each file, by camera and kind."""
 
 
 class _Event(BaseModel):
@@ -22,28 +22,31 @@ class _Event(BaseModel):
 
 
 class SceneCreated(_Event):
-    """The scene was created; holds its definition again, because `scene.json` may be damaged."""
+    """Creation of the scene, with a copy of its definition in case `scene.json` is damaged."""
 
-    fact: Literal["created"] = "created"
+    type: Literal["scene_created"] = "scene_created"
     definition: dict[str, Any]
 
 
 class FrameAccepted(_Event):
-    """A whole frame was acknowledged: its pictures lie in `files` of the frame log, which are all on disk."""
+    """Acknowledgement of a complete frame, whose images are on disk in `files` of the frame log."""
 
-    fact: Literal["taken"] = "taken"
+    type: Literal["frame_accepted"] = "frame_accepted"
     index: int
     time: float
     identity: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     files: tuple[str, ...]
     closed_by: Literal["whole", "complete", "request", "deadline", "found"] = "whole"
-    """`found`: the journal had lost the frame, and a start found its whole record in the frame log."""
+    """Reason why the frame was closed.
+
+    `found` means that the journal had lost the frame and recovery found its complete record in the frame log.
+    """
 
 
-class PartAccepted(_Event):
-    """One camera's files of an open frame were acknowledged. `time` is None where the camera gave none."""
+class CameraAccepted(_Event):
+    """Acknowledgement of one camera's files of an open frame; `time` is None if the camera sent none."""
 
-    fact: Literal["part"] = "part"
+    type: Literal["camera_accepted"] = "camera_accepted"
     index: int
     time: float | None
     camera: str
@@ -52,25 +55,25 @@ class PartAccepted(_Event):
 
 
 class FrameMissing(_Event):
-    """A frame was declared missing."""
+    """Declaration that a frame is missing."""
 
-    fact: Literal["missing"] = "missing"
+    type: Literal["frame_missing"] = "frame_missing"
     index: int
     reason: str
 
 
 class FramesSkipped(_Event):
-    """Frames were skipped because frame `by` arrived while the queue was full."""
+    """Frames skipped because frame `by` arrived while the queue was full."""
 
-    fact: Literal["skipped"] = "skipped"
+    type: Literal["frames_skipped"] = "frames_skipped"
     frames: tuple[int, ...]
     by: int
 
 
 class FrameFailed(_Event):
-    """A frame could not be reconstructed. `fatal`: the scene cannot go on without it."""
+    """Failure to reconstruct a frame; `fatal` if the scene cannot continue without it."""
 
-    fact: Literal["failed"] = "failed"
+    type: Literal["frame_failed"] = "frame_failed"
     index: int
     reason: str
     dropped: dict[str, str] = Field(default_factory=dict)
@@ -78,93 +81,96 @@ class FrameFailed(_Event):
 
 
 class WorkerDied(_Event):
-    """The worker died at a frame; `own`: by a fault of its own, not by a signal from outside."""
+    """Worker crash during a frame; `own` if the worker itself caused it rather than an external signal."""
 
-    fact: Literal["died"] = "died"
+    type: Literal["worker_died"] = "worker_died"
     index: int
     reason: str
     own: bool
 
 
 class PicturesDeleted(_Event):
-    """Retention deleted the pictures of frames from the frame log."""
+    """Deletion of frames' images from the frame log under the retention rules."""
 
-    fact: Literal["frames_deleted"] = "frames_deleted"
+    type: Literal["pictures_deleted"] = "pictures_deleted"
     frames: tuple[int, ...]
 
 
 class StatesDeleted(_Event):
-    """Committed states were deleted: by retention, or because they were found damaged or gone for a `reason`."""
+    """Loss of committed states: deleted under the retention rules, or found damaged or missing if `reason` is set."""
 
-    fact: Literal["states_deleted"] = "states_deleted"
+    type: Literal["states_deleted"] = "states_deleted"
     frames: tuple[int, ...]
     reason: str | None = None
 
 
 class StateFound(_Event):
-    """A committed state was found whose acknowledgement the journal has lost; `time` is that of the state."""
+    """Discovery of a committed state whose acknowledgement the journal lost; `time` is taken from the state."""
 
-    fact: Literal["state_found"] = "state_found"
+    type: Literal["state_found"] = "state_found"
     index: int
     time: float | None
 
 
 class PauseChanged(_Event):
-    """The scene was paused or resumed."""
+    """Pause or resumption of the scene."""
 
-    fact: Literal["paused"] = "paused"
+    type: Literal["pause_changed"] = "pause_changed"
     paused: bool
 
 
 class SceneEdited(_Event):
-    """Name, archive or retention of the scene was changed: all that is not None. Several are as one (`after`)."""
+    """Change of the scene's name, archive flag or retention rules; fields that are None are unchanged."""
 
-    fact: Literal["edited"] = "edited"
+    type: Literal["scene_edited"] = "scene_edited"
     name: str | None = None
     archived: bool | None = None
     keep_frames: Retention | None = None
     keep_states: Retention | None = None
     exact_states: int | None = None
 
-    def after(self, before: SceneEdited) -> SceneEdited:
-        """Both changes in one, this one later."""
+    def merged_with(self, before: SceneEdited) -> SceneEdited:
+        """Returns an earlier edit with this edit applied on top."""
         given = {name: getattr(self, name) for name in self.__class__.model_fields if getattr(self, name) is not None}
         return before.model_copy(update=given)
 
     def rules(self, ingest: IngestSettings) -> IngestSettings:
-        """The rules of a scene with those of retention that were changed."""
+        """Returns a scene's ingest rules with this edit's retention changes applied."""
         changed: dict[str, Any] = {name: getattr(self, name) for name in ("keep_frames", "keep_states", "exact_states")}
         return ingest.model_copy(update={name: rule for name, rule in changed.items() if rule is not None})
 
 
 class BudgetChanged(_Event):
-    """Another budget holds from frame `index` on; a frame that is updated again gets the budget that held for it."""
+    """New budget from frame `index` on; a frame that is updated again keeps the budget that applied to it."""
 
-    fact: Literal["budget"] = "budget"
+    type: Literal["budget_changed"] = "budget_changed"
     index: int
     budget: Budget
 
 
 class ReconstructionBegun(_Event):
-    """The reconstruction was begun anew, in place of the one before, whose states are read no more.
+    """Restart of the reconstruction, which replaces the previous one and its states.
 
     Attributes:
-        number: of the reconstruction; the one that came with the scene has 0. index: of its first frame.
-        points: number of the reconstruction whose points it begins from (`SceneFolder.points_of`); None: without.
-        settings: of the scene from now on, whole. asked: the request, to know it again.
+        number: number of the reconstruction; the original one has 0.
+        index: index of its first frame.
+        points: number of the reconstruction whose initial points it uses (`SceneFolder.points_of`), or None for no
+            points.
+        settings: the scene's complete settings from now on.
+        request: the restart request, kept to detect a repeated one.
     """
 
-    fact: Literal["begun"] = "begun"
+    type: Literal["reconstruction_begun"] = "reconstruction_begun"
     number: Annotated[int, Field(ge=1)]
     index: int
     points: int | None
     settings: dict[str, Any]
-    asked: ReconstructionRequest
+    request: ReconstructionRequest
 
 
 @dataclass
 class OpenFrame:
-    """A frame whose cameras send one by one: its `PartAccepted` events, gathered."""
+    """Frame whose cameras upload separately, accumulated from its `CameraAccepted` events."""
 
     index: int
     time: float | None = None
@@ -173,11 +179,11 @@ class OpenFrame:
 
     @property
     def cameras(self) -> list[str]:
-        """Cameras whose picture has arrived, sorted."""
+        """Cameras whose image has arrived, sorted."""
         return sorted(camera for camera, kinds in self.hashes.items() if FileKind.IMAGE in kinds)
 
-    def add(self, part: PartAccepted) -> None:
-        """Adds a camera, or another file of a camera."""
+    def add(self, part: CameraAccepted) -> None:
+        """Adds the files of a camera, or another file of a known camera."""
         self.time = part.time if self.time is None else self.time
         self.hashes.setdefault(part.camera, {}).update(part.hashes)
         if part.file not in self.files:
@@ -185,21 +191,21 @@ class OpenFrame:
 
 
 @dataclass(slots=True)
-class Note:
-    """Properties that few frames have."""
+class FrameNote:
+    """Properties that only a few frames have."""
 
     error: str | None = None
     dropped: dict[str, str] = field(default_factory=dict)
     own_deaths: int = 0
     other_deaths: int = 0
     parts: OpenFrame | None = None
-    """The parts that the frame was closed from, while its pictures are held."""
+    """The single-camera uploads that formed the frame, while its images are kept."""
 
 
 JournalEvent = Annotated[
     SceneCreated
     | FrameAccepted
-    | PartAccepted
+    | CameraAccepted
     | FrameMissing
     | FramesSkipped
     | FrameFailed
@@ -211,16 +217,16 @@ JournalEvent = Annotated[
     | SceneEdited
     | BudgetChanged
     | ReconstructionBegun,
-    Field(discriminator="fact"),
+    Field(discriminator="type"),
 ]
 _adapter: TypeAdapter[JournalEvent] = TypeAdapter(JournalEvent)
 
 
 parse_event = _adapter.validate_json
-"""Reads an event from a record's head; raises `ValidationError`."""
+"""Parses an event from the head of a record; raises `ValidationError` if it is invalid."""
 
 
-def why_no_event(error: ValidationError) -> str:
-    """Names the field of a record's head that makes it no event, and the fault."""
+def event_fault(error: ValidationError) -> str:
+    """Returns the first field that makes a record's head an invalid event, and its error."""
     first = error.errors()[0]
     return f"{'.'.join(map(str, first['loc'])) or 'event'}: {first['msg']}"

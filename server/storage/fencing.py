@@ -1,12 +1,14 @@
-"""Folders of states by epoch: what a worker still writes after it was given up is never read.
+"""Fencing of workers with one state folder per epoch, so that writes of an abandoned worker are never read.
 
-A worker on another machine may stop, be taken for dead, and go on once another has its scene. File locks do not reach
-over machines, and a look before each write leaves a gap. So every worker commits to a folder of its own,
-`states.EPOCH`: it begins with links to the files that the one before has committed, and `states` is a symbolic link to
-that of the worker that has the scene. The service makes the folder and moves the link before it starts the worker, so
-whatever the one before writes from then on is in a folder that nobody reads. Readers read through the link. No file is
-changed in place but the compact file that is being written, which is copied. Epochs rise with each worker; HBase fences
-writers of its logs by their folder, too. Blocking.
+A worker on another machine may hang, be presumed dead, and resume after another worker has taken over its scene. File
+locks do not work across machines, and a check before each write leaves a race. Every worker therefore commits to its
+own folder, `states.EPOCH`. The folder starts with hard links to the files that the previous worker committed. The
+symbolic link `states` points to the folder of the current worker, and all readers follow it.
+
+The service creates the folder and moves the link before it starts the worker. Anything that the previous worker writes
+afterwards lands in a folder that nobody reads. Only the compact file that is still being written changes in place, so
+it is copied instead of linked. Epochs increase with each worker. HBase fences the writers of its logs per folder in the
+same way. All functions block.
 """
 
 from __future__ import annotations
@@ -23,73 +25,75 @@ from server.storage.disk import FolderLock
 from server.storage.layout import epoch_folder
 
 PART = ".part"
-"""Ends the name of a folder that is not whole."""
-MARK = ".epoch"
-"""A file in each folder of an epoch: a folder that has it cannot be replaced by another of the same epoch."""
-PASSES = 20
-"""Times that a folder is linked which changes meanwhile: its writer is still at work."""
-MOST_KEPT = 5
-"""Folders of epochs that are kept while worker after worker ends before it works."""
-LOCAL_S = 10.0
-"""A worker of this machine whose service was killed ends within so long."""
+"""Suffix of a folder that is still being filled."""
+MARKER_NAME = ".epoch"
+"""Name of a file in each epoch folder; a non-empty folder cannot be replaced by a rename of the same epoch."""
+MAX_PASSES = 20
+"""Attempts to link a folder that keeps changing because its writer is still running."""
+MAX_REMAINING = 5
+"""Epoch folders that are kept if one worker after another exits before it starts its work."""
+LOCK_WAIT_S = 10.0
+"""Seconds within which a local worker exits after its service was killed."""
 
 
 class FencingError(RuntimeError):
-    """The states of a scene cannot be taken over."""
+    """Error for a scene whose states cannot be taken over."""
 
 
 def epochs(states: Path) -> dict[int, Path]:
-    """Folders of epochs that are whole, in rising order."""
+    """Returns the complete epoch folders by epoch, in ascending order."""
     by_epoch = {epoch: path for path, epoch in _folders(states) if path.suffix != PART}
     return dict(sorted(by_epoch.items()))
 
 
-def epoch_read(states: Path) -> int | None:
-    """The epoch whose states are read; None: the folder has none, or there is no folder."""
+def current_epoch(states: Path) -> int | None:
+    """Returns the epoch whose states are read, or None if the folder has no epochs or does not exist."""
     return _epoch_of(states, states.readlink()) if states.is_symlink() else None
 
 
-def heal(states: Path) -> None:
-    """Has the newest epoch read where a stop came between a renaming and its link."""
+def repair_link(states: Path) -> None:
+    """Points the link to the newest epoch if an interruption between the rename and the link left it missing."""
     if not states.exists() and (known := epochs(states)):
-        _point(states, max(known))
+        _point_link(states, max(known))
 
 
 def begin_epoch(states: Path, lock: Path) -> int:
-    """Begins the next epoch: its folder has all that is committed, and is what is read from now on; returns it.
+    """Begins the next epoch and returns it; readers now use its folder, which contains all committed states.
 
-    A folder without epochs becomes that of epoch 0 first, once the worker that holds `lock` has ended.
+    A folder without epochs first becomes epoch 0, after the worker that holds `lock` has exited.
 
     Args:
-        states: of the scene. lock: of a worker without an epoch.
+        states: path of the scene's states.
+        lock: lock file of a worker without an epoch.
 
     Raises:
-        FencingError: that worker does not end, the folder before keeps changing or is gone, or another service began
-            the same epoch. OSError: the disk does not do. Nothing is changed then.
+        FencingError: that worker does not exit, the previous folder keeps changing or is missing, or another service
+            began the same epoch. The previous epoch stays current.
+        OSError: the disk operation failed. The previous epoch stays current unless the link had already moved.
     """
-    heal(states)
-    for link in states.parent.glob(f".{states.name}.*.link"):  # that were never moved
+    repair_link(states)
+    for link in states.parent.glob(f".{states.name}.*.link"):  # left over from interrupted calls
         link.unlink(missing_ok=True)
     if states.is_dir() and not states.is_symlink():
         _wait_for(lock)
         states.rename(epoch_folder(states, 0))
-        _point(states, 0)
-    before = epoch_read(states)
+        _point_link(states, 0)
+    before = current_epoch(states)
     epoch = 1 + max((epoch for _, epoch in _folders(states)), default=-1)
-    _take_over(states, epoch, before)
+    _fill_folder(states, epoch, before)
     try:
-        _point(states, epoch)
+        _point_link(states, epoch)
     except OSError:
-        if epoch_read(states) != epoch:  # the link may have moved, and the disk not say so
+        if current_epoch(states) != epoch:  # the link may have moved despite the error
             shutil.rmtree(epoch_folder(states, epoch), ignore_errors=True)
         raise
-    for early in sorted(epochs(states))[:-MOST_KEPT]:  # `sweep` waits for a worker that works
+    for early in sorted(epochs(states))[:-MAX_REMAINING]:  # `remove_earlier_epochs` waits for a running worker
         shutil.rmtree(epoch_folder(states, early), ignore_errors=True)
     return epoch
 
 
-def sweep(states: Path, epoch: int) -> list[str]:
-    """Removes the folders of earlier epochs, whole or not; returns their names."""
+def remove_earlier_epochs(states: Path, epoch: int) -> list[str]:
+    """Removes the folders of earlier epochs, complete or not, and returns their names."""
     gone = [path for path, number in _folders(states) if number < epoch]
     for path in gone:
         shutil.rmtree(path, ignore_errors=True)
@@ -97,7 +101,7 @@ def sweep(states: Path, epoch: int) -> list[str]:
 
 
 def _wait_for(lock: Path) -> None:
-    until = time.monotonic() + LOCAL_S
+    until = time.monotonic() + LOCK_WAIT_S
     while True:
         try:
             FolderLock(lock, wait=False).release()
@@ -111,16 +115,16 @@ def _wait_for(lock: Path) -> None:
             time.sleep(0.05)
 
 
-def _take_over(states: Path, epoch: int, before: int | None) -> None:
-    """Makes the folder of an epoch, with all that is committed in that of the epoch before; None: with nothing."""
+def _fill_folder(states: Path, epoch: int, before: int | None) -> None:
+    """Creates the folder of an epoch with all committed files of the epoch `before`, or empty if that is None."""
     folder = epoch_folder(states, epoch)
     beside = folder.with_name(f"{folder.name}.{secrets.token_hex(4)}{PART}")
     try:
-        for _ in range(PASSES):
+        for _ in range(MAX_PASSES):
             shutil.rmtree(beside, ignore_errors=True)
-            beside.mkdir()  # without parents: a scene that is deleted meanwhile does not come back
-            (beside / MARK).touch()
-            if before is None or _linked(epoch_folder(states, before), beside):
+            beside.mkdir()  # no parents: a scene that is deleted concurrently must not reappear
+            (beside / MARKER_NAME).touch()
+            if before is None or _link_all(epoch_folder(states, before), beside):
                 break
         else:
             raise FencingError(f"{states.name}.{before} kept changing while it was taken over")
@@ -136,7 +140,7 @@ def _take_over(states: Path, epoch: int, before: int | None) -> None:
     sync_folder(folder.parent)
 
 
-def _point(states: Path, epoch: int) -> None:
+def _point_link(states: Path, epoch: int) -> None:
     beside = states.with_name(f".{states.name}.{secrets.token_hex(4)}.link")
     try:
         beside.symlink_to(epoch_folder(states, epoch).name)
@@ -147,21 +151,21 @@ def _point(states: Path, epoch: int) -> None:
 
 
 def _folders(states: Path) -> list[tuple[Path, int]]:
-    """Folders of epochs, whole or not, with their epochs."""
+    """Returns the epoch folders, complete or not, with their epochs."""
     folders = [(path, _epoch_of(states, path)) for path in states.parent.glob(f"{states.name}.*") if path.is_dir()]
     return [(path, epoch) for path, epoch in folders if epoch is not None]
 
 
 def _epoch_of(states: Path, path: Path) -> int | None:
-    """The epoch of a folder, whole or not; None for another name."""
+    """Returns the epoch of a folder, complete or not, or None if the name is not that of an epoch folder."""
     number = path.name.removeprefix(f"{states.name}.").partition(".")[0]
     return int(number) if number.isdecimal() else None
 
 
-def _linked(source: Path, target: Path) -> bool:
-    """Links all files of a folder into another; False where the folder has changed meanwhile.
+def _link_all(source: Path, target: Path) -> bool:
+    """Links all files of a folder into another; returns False if the folder changed during the operation.
 
-    Its worker may be at work: a frame that it moves to a compact file, or commits, must be seen whole.
+    Its worker may still be running, so a frame that it commits or moves to a compact file must be seen completely.
     """
     try:
         names = _names(source)
@@ -171,7 +175,7 @@ def _linked(source: Path, target: Path) -> bool:
         ) from None
     for name in names:
         try:
-            if name.endswith(".s4d") and not _closed(source / name):
+            if name.endswith(".s4d") and not _is_closed(source / name):
                 _copy(source / name, target / name)
             else:
                 _link(source / name, target / name)
@@ -181,7 +185,10 @@ def _linked(source: Path, target: Path) -> bool:
 
 
 def _names(folder: Path) -> list[str]:
-    """Files but those that are being written; compact files last: a frame is in one before its own file goes."""
+    """Returns the names of finished files, compact files last.
+
+    A frame is added to a compact file before its own file is removed.
+    """
     names = [name for name in os.listdir(folder) if not name.startswith(".")]
     return sorted(names, key=lambda name: (name.endswith(".s4d"), name))
 
@@ -202,8 +209,8 @@ def _copy(source: Path, target: Path) -> None:
         os.fsync(made.fileno())
 
 
-def _closed(chunk: Path) -> bool:
-    """True for a compact file that has its index: nothing is written to it any more."""
+def _is_closed(chunk: Path) -> bool:
+    """Returns whether a compact file already has its index, after which nothing is written to it."""
     with chunk.open("rb") as file:
         file.seek(max(0, file.seek(0, os.SEEK_END) - len(FOOTER_MAGIC)))
         return file.read() == FOOTER_MAGIC

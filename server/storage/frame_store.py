@@ -1,7 +1,7 @@
-"""Frame log of a scene: the pictures as they were sent, one record a file, written while they are received.
+"""Frame log of a scene: images as they were uploaded, one record per file, written while they are received.
 
-A file gets its final name at once and is debris until the journal names it: no frame's bytes are copied or renamed, a
-cut can damage one record only, and retention deletes files.
+A file gets its final name immediately and counts as debris until the journal references it. No frame is copied or
+renamed, an interrupted write damages at most one record, and retention deletes whole files.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from server.storage.record_log import (
     CHECKSUM,
     LogRecord,
     LogRecordKind,
+    check_record,
     checksum,
-    opening,
+    encode_opening,
     read_at,
-    streamed_record,
 )
 
 FILE = re.compile(r"(\d{10})-[0-9a-f]{12}\.frame")
 DIRECT = getattr(os, "O_DIRECT", 0)
 BLOCK = 4096
-"""Bytes: a multiple of what disks write at once."""
+"""Alignment of direct writes in bytes, a multiple of the sector size of common disks."""
 
 
 class FrameDamage(ValueError):
-    """A record of the frame log cannot be used: the message names it and the reason."""
+    """Error for an unusable record of the frame log; the message names the record and the reason."""
 
 
 @dataclass(frozen=True, eq=False)
 class StoredPictures:
-    """The encoded files of a record, by camera (views, not copies), and the BLAKE3 of each.
+    """Encoded image and mask files of a record, by camera, with the BLAKE3 digest of each; the files are views.
 
-    `time` in seconds, None where the upload did not know it; `part`: the record holds one camera only.
+    `time` is in seconds, or None if the upload did not include it. `part` is True for a record of a single camera.
     """
 
     index: int
@@ -57,15 +57,15 @@ class StoredPictures:
 
 
 class Upload:
-    """Writes one record while its bytes arrive. All methods block: call them in a thread.
+    """Writer of one record while its bytes arrive. All methods block, so call them in a thread.
 
-    Writes bypass the page cache where the file system can (O_DIRECT): through it a frame costs ten times the processor
-    time. Such writes are of whole blocks, from memory that begins at a page; the remainder waits for the next write.
+    Writes bypass the page cache (O_DIRECT) if the file system supports it, because cached writes cost ten times the CPU
+    time per frame. Direct writes need whole blocks from page-aligned memory; the remainder is kept for the next write.
 
     Args:
-        folder: of the frame log.
-        head: names the files that follow, and their sizes.
-        seconds: time of the frame; None where it is not known yet.
+        folder: folder of the frame log.
+        head: names and sizes of the files that follow.
+        seconds: time of the frame, or None if it is not known yet.
     """
 
     def __init__(self, folder: Path, head: FrameHead, seconds: float | None) -> None:
@@ -73,49 +73,49 @@ class Upload:
         self._folder = folder
         self._file: int | None = None
         files = [file.model_dump(mode="json") for file in head.files]
-        fields = {"time": seconds, "part": head.part, "files": files}
+        fields = {"time": seconds, "single_camera": head.single_camera, "files": files}
         length = sum(file.size for file in head.files)
-        self._opening = opening(LogRecordKind.PICTURES, head.index, fields, length, BY_FILE)
+        self._opening = encode_opening(LogRecordKind.PICTURES, head.index, fields, length, BY_FILE)
         self._over = self._opening
         self.begin = len(self._opening)
-        """Offset in the file at which the pictures begin."""
+        """Offset of the first image in the file, in bytes."""
         self.size = self.begin + length + CHECKSUM
-        """Bytes of the whole record."""
+        """Size of the complete record in bytes."""
 
     def write(self, block: memoryview, lead: int) -> None:
         """Writes the next bytes of the files.
 
         Args:
-            block: memory that begins at a page; the bytes are those from `lead` on, and before them is room for the
-                remainder of the write before.
-            lead: their place in the file, modulo `BLOCK`.
+            block: page-aligned memory. The new bytes start at `lead`; the space before them receives the remainder of
+                the previous write.
+            lead: file offset of the new bytes, modulo `BLOCK`.
         """
         if self._file is None:
             self._open()
         assert lead == len(self._over)
         block[:lead] = self._over
         whole = len(block) // BLOCK * BLOCK
-        self._put(block[:whole])
+        self._write_all(block[:whole])
         self._over = bytes(block[whole:])
 
     def finish(self, digests: Iterable[bytes]) -> None:
-        """Ends and syncs the record, whose files have these BLAKE3s: it is on disk when this returns.
+        """Completes the record with the BLAKE3 digests of its files and syncs it to disk.
 
         Raises:
-            OSError: it is not on disk; `abort` removes the file.
+            OSError: the record is not on disk; call `abort` to remove the file.
         """
         if self._file is None:
             self._open()
         assert self._file is not None
         self._direct(False)
-        self._put(memoryview(self._over + checksum(self._opening, *digests)))
+        self._write_all(memoryview(self._over + checksum(self._opening, *digests)))
         os.fsync(self._file)
         os.close(self._file)
         self._file = None
         sync_folder(self._folder)
 
     def abort(self) -> None:
-        """Removes the file."""
+        """Closes and removes the file."""
         if self._file is not None:
             os.close(self._file)
             self._file = None
@@ -125,33 +125,33 @@ class Upload:
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
         self._file = os.open(self._folder / self.name, flags, 0o644)
         whole = len(self._over) // BLOCK * BLOCK
-        self._put(memoryview(self._over[:whole]))  # of many cameras
+        self._write_all(memoryview(self._over[:whole]))  # a long head, as with many cameras
         self._over = self._over[whole:]
         self._direct(True)
 
     def _direct(self, on: bool) -> None:
         assert self._file is not None
         flags = fcntl.fcntl(self._file, fcntl.F_GETFL)
-        with contextlib.suppress(OSError):  # not on this file system: through the cache, then
+        with contextlib.suppress(OSError):  # this file system lacks O_DIRECT: use the page cache
             fcntl.fcntl(self._file, fcntl.F_SETFL, flags | DIRECT if on else flags & ~DIRECT)
 
-    def _put(self, data: memoryview) -> None:
+    def _write_all(self, data: memoryview) -> None:
         assert self._file is not None
         while data:
             try:
                 data = data[os.write(self._file, data) :]
             except OSError as error:
-                # Blocks are larger here, or the write before ended within one, as at the end of the disk.
+                # The file system has larger blocks, or a short write (as on a full disk) ended within a block.
                 if error.errno != errno.EINVAL or not fcntl.fcntl(self._file, fcntl.F_GETFL) & DIRECT:
                     raise
                 self._direct(False)
 
 
 def read_pictures(folder: Path, name: str) -> StoredPictures:
-    """Reads the files of a record and checks them.
+    """Reads and verifies the files of a record.
 
     Raises:
-        FrameDamage: the record is gone, cut, or not as it was written.
+        FrameDamage: the record is missing, truncated or corrupt.
     """
     if not FILE.fullmatch(name):
         raise FrameDamage(f"{name!r} is no name of a record")
@@ -170,53 +170,58 @@ def read_pictures(folder: Path, name: str) -> StoredPictures:
             kind, camera = FileKind(file["kind"]), file["camera"]
             (images if kind == FileKind.IMAGE else masks)[camera] = piece
             hashes.setdefault(camera, {})[kind] = digest.hex()
-        return StoredPictures(record.index, record.head["time"], bool(record.head["part"]), images, masks, hashes)
+        return StoredPictures(
+            record.index, record.head["time"], bool(record.head["single_camera"]), images, masks, hashes
+        )
     except (KeyError, TypeError, ValueError) as error:
         raise FrameDamage(f"{name}: its head is not one of pictures ({error!r})") from None
 
 
-def checked(folder: Path, name: str) -> Iterator[int]:
-    """Reads a record again; yields the number of bytes of each piece. At its end all of it has been checked.
+def verify_record(folder: Path, name: str) -> Iterator[int]:
+    """Verifies a record piece by piece and yields the size of each piece in bytes.
+
+    The record is verified only after the iterator is exhausted.
 
     Raises:
-        FrameDamage: the record is gone, cut, or not as it was written.
+        FrameDamage: the record is missing, truncated or corrupt.
     """
     try:
         with (folder / name).open("rb") as file:
-            yield from streamed_record(file)
+            yield from check_record(file)
     except OSError as error:
         raise FrameDamage(f"{name}: {error.strerror}") from None
     except ValueError as error:
         raise FrameDamage(f"{name}: {error}") from None
 
 
-def stored(folder: Path) -> dict[str, int]:
-    """Lists the records of the frame log: bytes by name."""
+def list_records(folder: Path) -> dict[str, int]:
+    """Returns the size in bytes of each record of the frame log, by name."""
     return {entry.name: entry.stat().st_size for entry in os.scandir(folder) if FILE.fullmatch(entry.name)}
 
 
 def remove(folder: Path, names: Iterable[str]) -> None:
-    """Deletes records; they are gone for good when this returns."""
+    """Deletes records and syncs the folder, so that the deletion is durable."""
     for name in names:
         (folder / name).unlink(missing_ok=True)
     sync_folder(folder)
 
 
 def frame_of(name: str) -> int:
-    """Index of the frame that a record belongs to, from its name."""
+    """Returns the index of the frame that a record belongs to, parsed from its name."""
     return int(name.partition("-")[0])
 
 
-def holds(folder: Path, index: int) -> bool:
-    """True where the frame log has a record of the frame."""
+def has_record(folder: Path, index: int) -> bool:
+    """Returns whether the frame log has a record of the frame."""
     return any(folder.glob(f"{index:010d}-*.frame"))
 
 
 class FrameLogIndex:
-    """Index of a scene's frame log in memory: bytes of each record by name, and their sums.
+    """In-memory index of a scene's frame log: the size of each record by name, and the total.
 
     Args:
-        folder: of the frame log. sizes: bytes of the records in it, by name.
+        folder: folder of the frame log.
+        sizes: size in bytes of each record in the folder, by name.
     """
 
     def __init__(self, folder: Path, sizes: Mapping[str, int]) -> None:
@@ -229,21 +234,21 @@ class FrameLogIndex:
 
     @property
     def frames(self) -> list[int]:
-        """Indices of frames with records, rising."""
+        """Indices of frames with records, in ascending order."""
         return sorted(self._records)
 
     def __len__(self) -> int:
-        """Number of frames with records."""
+        """Returns the number of frames with records."""
         return len(self._records)
 
     def add(self, name: str, size: int) -> None:
-        """Adds a record that is on disk."""
+        """Adds a record that is already on disk."""
         self._sizes[name] = size
         self._records[frame_of(name)] += 1
         self.bytes += size
 
     def discard(self, names: Iterable[str]) -> None:
-        """Removes records from the index; their files are deleted by `remove`."""
+        """Removes records from the index; call `remove` to delete their files."""
         for name in names:
             if (size := self._sizes.pop(name, None)) is not None:
                 index = frame_of(name)
@@ -253,5 +258,5 @@ class FrameLogIndex:
                 self.bytes -= size
 
     def size(self, names: Iterable[str]) -> int:
-        """Sums the bytes of records."""
+        """Returns the total size of the given records in bytes."""
         return sum(self._sizes.get(name, 0) for name in names)

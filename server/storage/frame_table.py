@@ -1,7 +1,7 @@
-"""Frames of one scene in columns: a day at 30 frames a second is 2.6 million frames. No disk, no clock.
+"""Columnar table of a scene's frames, without disk or clock access; a day at 30 fps is 2.6 million frames.
 
-A frame takes 46 bytes for ever. Properties of few frames (an error, records in the frame log, deaths of the worker) lie
-in dictionaries. Records of commits stay in memory for the newest frames; those of older ones are read from disk.
+Each frame permanently takes 46 bytes. Rare properties (errors, frame log records, worker crashes) are kept in
+dictionaries. Commit records of the newest frames stay in memory; older ones are read from disk.
 """
 
 from __future__ import annotations
@@ -17,29 +17,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.wire import FINISHED, FrameReceipt, FrameReportModel, FrameState
-from server.storage.events import Note, OpenFrame
+from server.storage.events import FrameNote, OpenFrame
 from server.storage.report_fields import committed_fields
 
 RECORDS_KEPT = 512
-"""Records of so many newest commits stay in memory."""
-LOST = "the journal's record of this frame is damaged, and so it is not known what was sent"
-BARE = "the reconstruction was begun anew, and the pictures of this frame were deleted before"
+"""Number of newest commit records kept in memory."""
+RECORD_LOST = "the journal's record of this frame is damaged, and so it is not known what was sent"
+PICTURES_GONE = "the reconstruction was begun anew, and the pictures of this frame were deleted before"
 STATES = tuple(FrameState)
 CODES = {state: code for code, state in enumerate(STATES)}
 TIME, RECEIPT, DELETED, UNREADABLE = 1, 2, 4, 8
-"""Flags of a frame: it has a time; it was acknowledged and has an identity; its committed state is gone; its state is
-damaged and is being made again."""
+"""Frame flags.
+
+TIME: the frame has a time. RECEIPT: it was acknowledged and has an identity. DELETED: its committed state no longer
+exists. UNREADABLE: its state is damaged and is being recomputed.
+"""
 IDENTITY = 32  # bytes
-FEW = 32
-"""Up to so many states are removed from the list of committed ones one by one."""
+FEW_STATES = 32
+"""Number of deleted states from which the list of committed frames is rebuilt instead of edited one by one."""
 
 
 class FrameTable:
     """Frames of one scene by index, without gaps.
 
     Attributes:
-        counts: frames in each state. committed: rising indices whose state can be read.
-        first: the reconstruction begins with this frame; an earlier one fails, unless it never came.
+        counts: number of frames in each state.
+        committed: indices of frames with a readable committed state, in ascending order.
+        first: first frame of the reconstruction. Earlier frames fail, except missing and skipped ones.
     """
 
     def __init__(self, scene: str) -> None:
@@ -53,7 +57,7 @@ class FrameTable:
         self._identities = bytearray()
         self._skipped_by = array("i")
         self._files: dict[int, tuple[str, ...]] = {}
-        self._notes: dict[int, Note] = {}
+        self._notes: dict[int, FrameNote] = {}
         self._records: OrderedDict[int, Mapping[str, Any]] = OrderedDict()
 
     def __len__(self) -> int:
@@ -68,11 +72,11 @@ class FrameTable:
         return FrameEntry(self, index)
 
     def get(self, index: int) -> FrameEntry | None:
-        """The frame, or None where it is not closed yet."""
+        """Returns the frame, or None if it is not closed yet."""
         return FrameEntry(self, index) if index in self else None
 
     def grow(self, count: int) -> None:
-        """Grows to `count` frames; nothing is known of the new ones."""
+        """Grows the table to `count` frames; new frames have no data and the state FAILED."""
         new = count - len(self)
         if new > 0:
             self._states.extend(bytes([CODES[FrameState.FAILED]]) * new)
@@ -83,20 +87,20 @@ class FrameTable:
             self.counts[FrameState.FAILED] += new
 
     def with_pictures(self) -> Iterator[FrameEntry]:
-        """Yields the frames that have records in the frame log, rising."""
+        """Yields the frames that have records in the frame log, in ascending order."""
         return (FrameEntry(self, index) for index in sorted(self._files))
 
     def states(self) -> NDArray[np.uint8]:
-        """[N] places in `STATES`; a copy."""
+        """Returns the state of each frame as an index into `STATES` [N]; a copy."""
         return np.frombuffer(bytearray(self._states), np.uint8)
 
     def flagged(self, flag: int) -> NDArray[np.bool_]:
-        """[N] true for frames with the flag; a copy."""
+        """Returns a mask [N] of the frames with the flag; a copy."""
         flags: NDArray[np.bool_] = (np.frombuffer(bytes(self._flags), np.uint8) & flag) != 0
         return flags
 
     def copy(self) -> FrameTable:
-        """Copies the table without records of commits, for a thread to read."""
+        """Returns a copy without commit records, for reading in another thread."""
         new = FrameTable(self.scene)
         for name, column in vars(self).items():
             if name != "_records":
@@ -104,7 +108,7 @@ class FrameTable:
         new._notes = copy.deepcopy(self._notes)
         return new
 
-    def take(self, index: int, time: float, identity: str, files: tuple[str, ...], parts: OpenFrame | None) -> None:
+    def enqueue(self, index: int, time: float, identity: str, files: tuple[str, ...], parts: OpenFrame | None) -> None:
         """Queues an acknowledged frame."""
         self._times[index] = time
         self._flags[index] |= TIME | RECEIPT
@@ -114,10 +118,10 @@ class FrameTable:
             self._notes[index].error = None
         if parts is not None:
             self.note(index).parts = parts
-        self.move(index, FrameState.QUEUED)
+        self.set_state(index, FrameState.QUEUED)
 
-    def move(self, index: int, state: FrameState) -> None:
-        """Puts the frame in another state."""
+    def set_state(self, index: int, state: FrameState) -> None:
+        """Sets the state of a frame."""
         if index < self.first and state in (FrameState.QUEUED, FrameState.COMMITTED):
             state = FrameState.FAILED
         before = STATES[self._states[index]]
@@ -127,10 +131,11 @@ class FrameTable:
         if FrameState.COMMITTED in (before, state):
             self._list(index, state == FrameState.COMMITTED and not self._flags[index] & (DELETED | UNREADABLE))
 
-    def begin_again(self, first: int) -> None:
-        """Queues all frames again whose pictures are held, from `first` on; what happened to frames is forgotten.
+    def restart(self, first: int) -> None:
+        """Resets the table for a reconstruction that starts at frame `first`.
 
-        Frames that are missing or skipped stay so; all others fail.
+        Frames from `first` on are queued again if their images are still stored. Missing and skipped frames keep their
+        state, and all others fail.
         """
         states = self.states()
         stay = (states == CODES[FrameState.MISSING]) | (states == CODES[FrameState.SKIPPED])
@@ -144,37 +149,37 @@ class FrameTable:
         notes, self._notes = self._notes, {}
         for index, note in notes.items():
             if stay[index] or note.parts is not None:
-                self._notes[index] = Note(note.error if stay[index] else None, parts=note.parts)
+                self._notes[index] = FrameNote(note.error if stay[index] else None, parts=note.parts)
         bare = (states == CODES[FrameState.FAILED]) & self.flagged(RECEIPT)
         for index in (np.flatnonzero(bare[first:]) + first).tolist():
-            self.note(index).error = BARE
+            self.note(index).error = PICTURES_GONE
 
-    def found(self, index: int, time: float | None) -> None:
-        """Notes a committed state of which nothing else is known."""
+    def add_committed(self, index: int, time: float | None) -> None:
+        """Records a committed state for which no journal event exists."""
         if time is not None:
             self._times[index] = time
             self._flags[index] |= TIME
         if index in self._notes:
             self._notes[index].error = None
-        self.move(index, FrameState.COMMITTED)
+        self.set_state(index, FrameState.COMMITTED)
 
     def set_unreadable(self, index: int, unreadable: bool) -> None:
-        """Marks a committed state that is damaged and being made again, or clears the mark."""
+        """Sets or clears the mark of a damaged committed state that is being recomputed."""
         self._flags[index] = self._flags[index] | UNREADABLE if unreadable else self._flags[index] & ~UNREADABLE
-        self.move(index, STATES[self._states[index]])
+        self.set_state(index, STATES[self._states[index]])
 
     def skip(self, index: int, by: int) -> None:
-        """Marks the frame as skipped for frame `by`."""
+        """Marks the frame as skipped in favour of frame `by`."""
         self._skipped_by[index] = by
-        self.move(index, FrameState.SKIPPED)
+        self.set_state(index, FrameState.SKIPPED)
 
     def delete_states(self, indices: Sequence[int]) -> int:
-        """Marks committed states as gone; returns how many were not marked before."""
+        """Marks committed states as deleted and returns the number of newly marked ones."""
         new = 0
         for index in indices:
             new += not self._flags[index] & DELETED
             self._flags[index] |= DELETED
-        if len(indices) < FEW:
+        if len(indices) < FEW_STATES:
             for index in indices:
                 self._list(index, False)
         else:
@@ -182,7 +187,7 @@ class FrameTable:
         return new
 
     def restore_state(self, index: int) -> bool:
-        """Clears the marks of a frame that will be updated again; returns whether its state was gone."""
+        """Clears the marks of a frame that will be updated again and returns whether its state was deleted."""
         gone = bool(self._flags[index] & DELETED)
         self._flags[index] &= ~(DELETED | UNREADABLE)
         if index in self._notes:
@@ -190,50 +195,50 @@ class FrameTable:
         return gone
 
     def commit_up_to(self, last: int) -> None:
-        """Commits all queued and updating frames up to `last`: many at once, after a start."""
+        """Marks all queued and updating frames up to `last` as committed, in bulk after startup."""
         states = np.frombuffer(self._states, np.uint8)
         for state in (FrameState.QUEUED, FrameState.UPDATING):
             rows = np.flatnonzero(states[: last + 1] == CODES[state])
             states[rows] = CODES[FrameState.COMMITTED]
             self.counts[state] -= len(rows)
             self.counts[FrameState.COMMITTED] += len(rows)
-        del states  # the column cannot grow while it is looked at
+        del states  # a bytearray cannot grow while a view of it exists
         self._list_all()
 
     def set_files(self, index: int, files: tuple[str, ...]) -> None:
-        """Sets the frame's records in the frame log; without any, its parts are forgotten too."""
+        """Sets the names of the frame's records in the frame log; an empty tuple also drops its parts."""
         if files:
             self._files[index] = files
             return
         self._files.pop(index, None)
         if (note := self._notes.get(index)) is not None:
             note.parts = None
-            if note == Note():
+            if note == FrameNote():
                 del self._notes[index]
 
-    def note(self, index: int) -> Note:
-        """Returns the frame's note, to be changed."""
-        return self._notes.setdefault(index, Note())
+    def note(self, index: int) -> FrameNote:
+        """Returns the frame's note for modification and creates it if missing."""
+        return self._notes.setdefault(index, FrameNote())
 
     def set_record(self, index: int, record: Mapping[str, Any]) -> None:
-        """Keeps the record of a commit (`History.report`)."""
+        """Stores a commit record (`History.report`) and evicts the oldest one if the limit is exceeded."""
         self._records[index] = record
         self._records.move_to_end(index)
         while len(self._records) > RECORDS_KEPT:
             self._records.popitem(last=False)
 
-    def remember(self, index: int, record: Mapping[str, Any]) -> None:
-        """Keeps the record of an older commit where there is room: the newest stay."""
+    def cache_record(self, index: int, record: Mapping[str, Any]) -> None:
+        """Stores the record of an older commit if there is space, without evicting newer ones."""
         if record and index not in self._records and len(self._records) < RECORDS_KEPT:
             self._records[index] = record
             self._records.move_to_end(index, last=False)
 
-    def amend(self, index: int, record: Mapping[str, Any]) -> None:
-        """Replaces the record of a commit whose state was made again."""
+    def replace_record(self, index: int, record: Mapping[str, Any]) -> None:
+        """Replaces the commit record of a frame whose state was recomputed."""
         if index in self._records:
             self._records[index] = record
         else:
-            self.remember(index, record)
+            self.cache_record(index, record)
 
     def _list_all(self) -> None:
         readable = (self.states() == CODES[FrameState.COMMITTED]) & ~self.flagged(DELETED | UNREADABLE)
@@ -249,7 +254,7 @@ class FrameTable:
 
 
 class FrameEntry:
-    """One closed frame: a view into the table."""
+    """View of one closed frame in the table."""
 
     __slots__ = ("_table", "index")
 
@@ -264,34 +269,34 @@ class FrameEntry:
 
     @property
     def finished(self) -> bool:
-        """Nothing more happens to it."""
+        """Whether the frame is in a final state."""
         return self.state in FINISHED
 
     @property
     def deleted(self) -> bool:
-        """It was committed, and its state cannot be read any more."""
+        """Whether the frame was committed and its state no longer exists."""
         return bool(self._table._flags[self.index] & DELETED)
 
     @property
     def unreadable(self) -> bool:
-        """It was committed, its state is damaged, and it is being made again."""
+        """Whether the frame was committed and its damaged state is being recomputed."""
         return bool(self._table._flags[self.index] & UNREADABLE)
 
     @property
     def time(self) -> float | None:
-        """Seconds; None where it never came."""
+        """Time of the frame in seconds, or None if it never arrived."""
         return self._table._times[self.index] if self._table._flags[self.index] & TIME else None
 
     @property
     def identity(self) -> str | None:
-        """Identity as in the receipt; None where the frame never came or its receipt is lost."""
+        """Identity from the receipt, or None if the frame never arrived or its receipt is lost."""
         if not self._table._flags[self.index] & RECEIPT:
             return None
         return self._table._identities[IDENTITY * self.index : IDENTITY * (self.index + 1)].hex()
 
     @property
     def receipt(self) -> FrameReceipt | None:
-        """Receipt that its sender got; None where the frame never came, or the receipt is lost."""
+        """Receipt that the sender got, or None if the frame never arrived or the receipt is lost."""
         identity, time = self.identity, self.time
         if identity is None or time is None:
             return None
@@ -299,42 +304,42 @@ class FrameEntry:
 
     @property
     def skipped_by(self) -> int:
-        """The frame that it was skipped for, where it was skipped."""
+        """Index of the frame that caused the skip; meaningful only for a skipped frame."""
         return self._table._skipped_by[self.index]
 
     @property
     def files(self) -> tuple[str, ...]:
-        """Names of its records in the frame log; none once they are deleted."""
+        """Names of the frame's records in the frame log; empty after they are deleted."""
         return self._table._files.get(self.index, ())
 
     @property
-    def note(self) -> Note:
-        """Rare properties, to be read only: changes may be lost."""
-        return self._table._notes.get(self.index) or Note()
+    def note(self) -> FrameNote:
+        """Rare properties of the frame; treat them as read-only, because changes may be lost."""
+        return self._table._notes.get(self.index) or FrameNote()
 
     @property
     def error(self) -> str | None:
-        """Reason why it failed, was skipped, or is missing."""
+        """Reason why the frame failed, was skipped or is missing, or None."""
         if (error := self.note.error) is not None:
             return error
         if self.state == FrameState.SKIPPED:
             return f"skipped: frame {self.skipped_by} came and the queue was full"
         if self.state == FrameState.FAILED and self.index < self._table.first:
             return f"the reconstruction begins with frame {self._table.first}"
-        return LOST if self.state == FrameState.FAILED else None
+        return RECORD_LOST if self.state == FrameState.FAILED else None
 
     @property
     def record(self) -> Mapping[str, Any] | None:
-        """LogRecord of its commit, where that is in memory."""
+        """Commit record of the frame, or None if it is not in memory."""
         return self._table._records.get(self.index)
 
     @property
     def report(self) -> FrameReportModel:
-        """Report on the wire, with the record of its commit where that is in memory."""
+        """API report of the frame, including its commit record if that is in memory."""
         return self.report_with(self.record)
 
     def report_with(self, record: Mapping[str, Any] | None) -> FrameReportModel:
-        """Report on the wire, with the record of its commit; None: of a frame that is not committed, or not read."""
+        """Returns the API report of the frame with a commit record, or without one if `record` is None."""
         note = self.note
         return FrameReportModel(
             scene=self._table.scene,
@@ -343,7 +348,7 @@ class FrameEntry:
             state=self.state,
             error=self.error,
             identity=self.identity,
-            attempts=note.own_deaths + note.other_deaths,
+            worker_deaths=note.own_deaths + note.other_deaths,
             pictures_kept=bool(self.files),
             deleted=self.deleted,
             **({"dropped_cameras": dict(note.dropped)} if record is None else committed_fields(record)),

@@ -1,8 +1,8 @@
-"""Journal of a scene: one append-only file of events. An event is acknowledged when it is on disk.
+"""Journal of a scene: one append-only file of events. An event is acknowledged once it is on disk.
 
-A file that is deleted or replaced while the service runs would receive events that nobody finds again: each write
-checks that the file still has its name. If it has not, or if a scrub finds it damaged, the journal is written anew from
-the ledger (`snapshot`), beside its place, and renamed.
+If the file is deleted or replaced while the service runs, events appended to the open descriptor would be lost. Each
+write therefore checks that the path still refers to the open file. If it does not, or if a scrub finds damage, the
+journal is rewritten from the ledger (`snapshot`): it is written to a temporary file and renamed.
 """
 
 from __future__ import annotations
@@ -19,21 +19,27 @@ from pydantic import ValidationError
 from scas4d_core.storage.npz import open_atomically, sync_folder
 from server.problems import Problem
 from server.storage.disk import no_room
-from server.storage.events import JournalEvent, SceneCreated, WorkerDied, parse_event, why_no_event
-from server.storage.record_log import Damage, LogRecordKind, encoded, streamed
+from server.storage.events import JournalEvent, SceneCreated, WorkerDied, event_fault, parse_event
+from server.storage.record_log import Damage, LogRecordKind, encode_record, stream_records
 
 PIECE = 1 << 16
-"""Bytes that are compared at a time."""
-TOGETHER = 1000
-"""Events that are encoded at a time where a whole journal is written."""
+"""Number of bytes verified per step."""
+EVENTS_AT_ONCE = 1000
+"""Number of events encoded per write when a complete journal is written."""
 
 Snapshot = Callable[[], Iterator[JournalEvent]]
-"""Called on the event loop; the events may be read in another thread."""
+"""Function that returns all known events. It is called on the event loop; another thread may consume the iterator."""
 
 
 @dataclass(frozen=True)
 class JournalContent:
-    """Content of a journal: its events in order, the bytes that are whole, and a sentence for each damage."""
+    """Content of a journal.
+
+    Attributes:
+        events: all intact events, in order.
+        good: number of intact bytes.
+        damage: one sentence per damaged region.
+    """
 
     events: list[JournalEvent]
     good: int
@@ -41,7 +47,7 @@ class JournalContent:
 
 
 def read_journal(path: Path) -> JournalContent:
-    """Reads a whole journal that is not large; see `replay`."""
+    """Reads a complete journal into memory; use `replay` for a large one."""
     events: list[JournalEvent] = []
     reading = replay(path, events.append)
     return JournalContent(events, reading.good, reading.damage)
@@ -49,9 +55,13 @@ def read_journal(path: Path) -> JournalContent:
 
 @dataclass(frozen=True)
 class JournalReading:
-    """Result of reading a journal: the bytes that are whole, and a sentence for each damage.
+    """Result of reading a journal.
 
-    `broken`: more than a torn tail is damaged; events may be lost. `begun`: its first event is `SceneCreated`.
+    Attributes:
+        good: number of intact bytes.
+        damage: one sentence per damaged region.
+        broken: whether there is damage other than a torn tail, so that events may be lost.
+        begun: whether the first event is `SceneCreated`.
     """
 
     good: int
@@ -61,9 +71,10 @@ class JournalReading:
 
 
 def replay(path: Path, take: Callable[[JournalEvent], object]) -> JournalReading:
-    """Calls `take` with every whole event, in order, reading piece by piece; never raises for the file's content.
+    """Calls `take` with every intact event, in order.
 
-    An append that was cut short leaves a torn tail: it was never acknowledged, and it is dropped.
+    The file is read in pieces, and damaged content never raises. An interrupted append leaves a torn tail, which is
+    dropped because it was never acknowledged.
     """
     damage: list[str] = []
     broken = False
@@ -74,7 +85,7 @@ def replay(path: Path, take: Callable[[JournalEvent], object]) -> JournalReading
         return JournalReading(0, damage)
     with opened as file:
         good = os.fstat(file.fileno()).st_size
-        for record in streamed(file):
+        for record in stream_records(file):
             if isinstance(record, Damage):
                 if record.torn:
                     good = record.start
@@ -84,7 +95,7 @@ def replay(path: Path, take: Callable[[JournalEvent], object]) -> JournalReading
             try:
                 event = parse_event(record.text)
             except ValidationError as error:
-                fault = why_no_event(error)
+                fault = event_fault(error)
                 broken = True
                 damage.append(
                     f"{path.name}: a record of kind {record.kind}, frame {record.frame}, is no event: {fault}"
@@ -95,34 +106,36 @@ def replay(path: Path, take: Callable[[JournalEvent], object]) -> JournalReading
     return JournalReading(good, damage, broken, bool(begun))
 
 
-def bytes_of(events: Iterable[JournalEvent]) -> bytes:
-    """Encodes events as records, one after the other."""
-    return b"".join(encoded(LogRecordKind.EVENT, _index(event), event.model_dump(mode="json")) for event in events)
+def encode_events(events: Iterable[JournalEvent]) -> bytes:
+    """Encodes events as consecutive records."""
+    return b"".join(
+        encode_record(LogRecordKind.EVENT, _index(event), event.model_dump(mode="json")) for event in events
+    )
 
 
 def write_journal(path: Path, events: Iterator[JournalEvent]) -> int:
-    """Writes a whole journal at `path`, in place of the file there; blocking.
+    """Writes a complete journal to `path` and atomically replaces an existing file. Blocks.
 
     Returns:
-        Its size in bytes.
+        The size of the journal in bytes.
 
     Raises:
-        OSError: it could not be written; the file that was there stays.
+        OSError: the journal could not be written; the existing file is unchanged.
     """
     beside = path.with_name(f".{path.name}.part")
     size, batch = 0, []
     with open_atomically(path, beside) as file:
         for event in events:
             batch.append(event)
-            if len(batch) == TOGETHER:
-                size += file.write(bytes_of(batch))
+            if len(batch) == EVENTS_AT_ONCE:
+                size += file.write(encode_events(batch))
                 batch = []
-        size += file.write(bytes_of(batch))
+        size += file.write(encode_events(batch))
     return size
 
 
-class _Beginning:
-    """The first bytes of a file, as a file."""
+class _FirstBytes:
+    """Readable view of the first bytes of a file."""
 
     def __init__(self, file: BinaryIO, left: int) -> None:
         self._file = file
@@ -134,15 +147,16 @@ class _Beginning:
         return piece
 
 
-def checked_journal(path: Path, good: int) -> Iterator[int]:
-    """Reads the first bytes of a journal again; yields the number of bytes of each piece.
+def verify_journal(path: Path, good: int) -> Iterator[int]:
+    """Verifies the first `good` bytes of a journal and yields the number of bytes verified in each step.
 
     Raises:
-        FileNotFoundError: the journal is gone. ValueError: not all of the bytes are whole records.
+        FileNotFoundError: the journal is missing.
+        ValueError: the bytes are not a sequence of intact records.
     """
     read = since = 0
     with path.open("rb") as file:
-        for record in streamed(_Beginning(file, good)):
+        for record in stream_records(_FirstBytes(file, good)):
             if isinstance(record, Damage):
                 raise ValueError(f"bytes {record.start} to {record.end}: {record.reason}")
             read += record.size
@@ -156,13 +170,13 @@ def checked_journal(path: Path, good: int) -> Iterator[int]:
 
 
 class Journal:
-    """Appends events. Those that arrive while one write is under way share the next one.
+    """Append-only event journal. Events that arrive during a write share the next write.
 
     Args:
-        path: of the file; made when missing.
-        good: bytes of it that are whole; the rest is cut off.
-        snapshot: returns all events that are known now, to write the journal anew; None: it is never written anew.
-        renewed: called with the fault each time that it was written anew.
+        path: path of the journal, which is created if missing.
+        good: number of intact bytes; the rest of the file is truncated.
+        snapshot: returns all events known now, to rewrite the journal. If None, the journal is never rewritten.
+        on_rewritten: called with the fault each time the journal was rewritten.
     """
 
     def __init__(
@@ -170,11 +184,11 @@ class Journal:
         path: Path,
         good: int = 0,
         snapshot: Snapshot | None = None,
-        renewed: Callable[[str], None] = lambda fault: None,
+        on_rewritten: Callable[[str], None] = lambda fault: None,
     ) -> None:
         self.path = path
         self._snapshot = snapshot
-        self._renewed = renewed
+        self._on_rewritten = on_rewritten
         self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         self._good = good
         self._closed = False
@@ -183,42 +197,42 @@ class Journal:
         sync_folder(path.parent)
         self._waiting: list[tuple[Sequence[JournalEvent], asyncio.Future[None]]] = []
         self._last: list[JournalEvent] = []
-        """Events that were written last: the ledger may not have applied them yet."""
+        """Events of the last write, which the ledger may not have applied yet."""
         self._fault: str | None = None
         self._flushing: asyncio.Task[None] | None = None
 
     @property
-    def place(self) -> tuple[int, int]:
-        """Inode of the file, which changes when it is written anew, and the bytes of it that are whole."""
+    def file_position(self) -> tuple[int, int]:
+        """Inode of the file, which changes with a rewrite, and the number of intact bytes."""
         return os.fstat(self._file).st_ino, self._good
 
     async def append(self, *events: JournalEvent) -> None:
-        """Returns when the events are on disk, all of them.
+        """Appends events and returns once all of them are on disk.
 
         Raises:
-            OSError: none of them is on disk; the file is as it was.
+            OSError: none of the events is on disk; the file is unchanged.
             Problem: 503, the journal is closed.
         """
         if self._closed:
-            raise Problem(503, "the scene has ended", remedy="ask again: a scene that was deleted is not found then")
+            raise Problem(503, "the scene was closed", remedy="ask again: a scene that was deleted is not found then")
         done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._waiting.append((events, done))
         self._begin()
         await asyncio.shield(done)
 
-    def renew(self, fault: str) -> None:
-        """Writes the journal anew because it was found damaged, in turn with appends. `fault`: a sentence."""
+    def rewrite(self, fault: str) -> None:
+        """Schedules a rewrite of a damaged journal, serialised with appends; `fault` is a sentence."""
         if not self._closed and self._snapshot is not None:
             self._fault = fault
             self._begin()
 
-    def look(self) -> None:
-        """Writes the journal anew where its file has lost its name; does nothing during a write."""
-        if self._flushing is None and not self._closed and (fault := self.misplaced()) is not None:
-            self.renew(fault)
+    def rewrite_if_moved(self) -> None:
+        """Schedules a rewrite if the file was moved, replaced or truncated; does nothing during a write."""
+        if self._flushing is None and not self._closed and (fault := self.file_fault()) is not None:
+            self.rewrite(fault)
 
-    def misplaced(self) -> str | None:
-        """Checks that the open file still has its name and its bytes; returns the fault, or None."""
+    def file_fault(self) -> str | None:
+        """Returns how the file at the path differs from the open one, or None if it is the same and not truncated."""
         try:
             there, own = os.stat(self.path), os.fstat(self._file)
         except FileNotFoundError:
@@ -243,8 +257,8 @@ class Journal:
                     if self._fault is None:
                         self._fault = await asyncio.to_thread(self._write, events)
                     if self._fault is not None:
-                        await self._renew_or_append(events)
-                except Exception as error:  # of any kind: the callers that wait must get it
+                        await self._rewrite_or_append(events)
+                except Exception as error:  # any error must reach the waiting callers
                     fault = error
                 else:
                     self._last = events or self._last
@@ -255,54 +269,56 @@ class Journal:
                         done.set_result(None)
                     else:
                         done.set_exception(fault)
-                        done.exception()  # the caller may be gone: not a fault of the event loop
+                        done.exception()  # marks it as retrieved: the caller may have been cancelled
                 if fault is not None and not batch and not self._waiting:
-                    break  # the next event tries again
+                    break  # the next event retries
         finally:
             self._flushing = None
 
     def _write(self, events: Sequence[JournalEvent]) -> str | None:
-        """Appends; returns a fault where the file has lost its name: then the events are not in the journal."""
+        """Appends events and returns None, or a fault if they are not in the file at the journal's path."""
         watched = self._snapshot is not None
-        if watched and (fault := self.misplaced()) is not None:
+        if watched and (fault := self.file_fault()) is not None:
             return fault
-        data = bytes_of(events)
+        data = encode_events(events)
         view = memoryview(data)
         try:
             while view:
                 view = view[os.pwrite(self._file, view, self._good + len(data) - len(view)) :]
             os.fsync(self._file)
         except OSError:
-            os.ftruncate(self._file, self._good)  # half a record must not stand before a whole one
+            os.ftruncate(self._file, self._good)  # a partial record must not precede a complete one
             raise
         self._good += len(data)
-        return self.misplaced() if watched else None
+        return self.file_fault() if watched else None
 
-    async def _renew_or_append(self, events: Sequence[JournalEvent]) -> None:
-        """Writes the journal anew; where there is no room for that and the file has its name, appends to it.
+    async def _rewrite_or_append(self, events: Sequence[JournalEvent]) -> None:
+        """Rewrites the journal, or only appends if the disk is too full for that and the open file is in place.
 
-        A damaged record costs its event, a refused frame costs the frame; the next scrub finds the damage again.
+        A damaged record loses one event, while a refused frame is lost completely. The next scrub finds the damage
+        again.
         """
         try:
-            await self._renew(events)
+            await self._rewrite(events)
         except OSError as error:
-            if not no_room(error) or self.misplaced() is not None:
+            if not no_room(error) or self.file_fault() is not None:
                 raise
             self._fault = None
             if events and (fault := await asyncio.to_thread(self._write, events)) is not None:
                 self._fault = fault
                 raise
 
-    async def _renew(self, events: Sequence[JournalEvent]) -> None:
-        """Writes the journal anew: the snapshot, and behind it the events that the snapshot may lack."""
+    async def _rewrite(self, events: Sequence[JournalEvent]) -> None:
+        """Rewrites the journal with the snapshot, followed by the events that the snapshot may lack."""
         assert self._snapshot is not None
         assert self._fault is not None
         snapshot = self._snapshot()
-        # Events may come twice, except a death, which would be counted twice: its caller applies it afterwards.
+        # Replaying an event twice is harmless, except for `WorkerDied`, which would be counted twice. Its caller
+        # applies it right after the write, so the snapshot already has it.
         last = [event for event in self._last if not isinstance(event, WorkerDied)]
         self._good = await asyncio.to_thread(self._replace, snapshot, [*last, *events])
         fault, self._fault = self._fault, None
-        self._renewed(fault)
+        self._on_rewritten(fault)
 
     def _replace(self, snapshot: Iterator[JournalEvent], behind: Sequence[JournalEvent]) -> int:
         def all_events() -> Iterator[JournalEvent]:
@@ -316,7 +332,10 @@ class Journal:
         return size
 
     async def close(self) -> None:
-        """Waits for the write under way; nothing is written later: the descriptor may be another file's by then."""
+        """Waits for the current write and closes the file.
+
+        Later writes are refused, because another file may reuse the descriptor.
+        """
         self._closed = True
         while self._flushing is not None:
             await asyncio.wait([self._flushing])

@@ -1,6 +1,6 @@
-"""Layout of the data folder and of a scene's folder: names of files on disk, written here only.
+"""Layout of the data folder and of the scene folders; all file names on disk are defined here.
 
-The committed states inside `states/` are laid out by `scas4d_core.storage.frame_files`.
+The layout of the committed states inside `states/` is defined in `scas4d_core.storage.frame_files`.
 """
 
 from __future__ import annotations
@@ -17,44 +17,44 @@ from server.storage.events import ReconstructionBegun
 
 @dataclass(frozen=True)
 class DataFolder:
-    """The folder of the service, `SCAS4D_DATA`."""
+    """Data folder of the service, `SCAS4D_DATA`."""
 
     path: Path
 
     @property
     def lock(self) -> Path:
-        """Locked by the service that works in the folder."""
+        """Lock file held by the service that uses the folder."""
         return self.path / "service.lock"
 
     @property
     def scenes(self) -> Path:
-        """One folder a scene, by id."""
+        """Folder that contains one folder per scene, named by scene ID."""
         return self.path / "scenes"
 
     @property
     def deleted(self) -> Path:
-        """Folders of deleted scenes until they are removed."""
+        """Folder that holds deleted scenes until they are removed from disk."""
         return self.path / "deleted"
 
     @property
     def exports(self) -> Path:
-        """One folder a scene, by id, with a folder an export; emptied when the service starts."""
+        """Folder of exports, with one folder per scene ID and in it one per export; emptied at startup."""
         return self.path / "exports"
 
     def scene(self, id: str) -> SceneFolder:
-        """Folder of a scene."""
+        """Returns the folder of a scene."""
         return SceneFolder(self.scenes / id)
 
-    def bury(self, path: Path, name: str) -> Path:
-        """Moves a file or a folder to the deleted ones; returns its new path. Blocking."""
+    def move_to_deleted(self, path: Path, name: str) -> Path:
+        """Moves a file or folder into the `deleted` folder and returns its new path. Blocks."""
         grave = self.deleted / f"{name}-{secrets.token_hex(4)}"
         path.rename(grave)
         sync_folder(self.deleted)
         sync_folder(path.parent)
         return grave
 
-    def sweep(self) -> None:
-        """Removes what was moved to the deleted ones. Blocking."""
+    def remove_deleted(self) -> None:
+        """Removes everything in the `deleted` folder from disk. Blocks."""
         for path in self.deleted.iterdir():
             if path.is_dir():
                 shutil.rmtree(path, ignore_errors=True)
@@ -64,16 +64,18 @@ class DataFolder:
 
 
 EXPORT = "export"
-"""Begins the names of exports while they are being answered."""
+"""Name prefix of temporary files for exports that are streamed to a client."""
 
 
 @dataclass(frozen=True)
 class SceneFolder:
-    """The folder of one scene. Whatever a reconstruction makes has its number in its name, but for the first, 0.
+    """Folder of one scene. Files of a reconstruction have its number in their names, except those of number 0.
 
     Attributes:
-        reconstruction: its number. cloud: number of the reconstruction whose points it begins from.
-        epoch: of the worker that commits to the states (`server.storage.fencing`); None: of the scene's process.
+        reconstruction: number of the reconstruction.
+        cloud: number of the reconstruction whose initial points it uses.
+        epoch: epoch of the worker that commits to the states (`server.storage.fencing`), or None to access the states
+            through the `states` path.
     """
 
     path: Path
@@ -81,17 +83,17 @@ class SceneFolder:
     cloud: int = 0
     epoch: int | None = None
 
-    def begun(self, event: ReconstructionBegun | None) -> SceneFolder:
-        """The folder with the names of the reconstruction that was begun last; None: the one that came with the scene.
+    def of_reconstruction(self, event: ReconstructionBegun | None) -> SceneFolder:
+        """Returns this folder with the file names of a restarted reconstruction, or unchanged if `event` is None.
 
-        Without points it is as if they were its own, and there are none (`leftovers`).
+        If the reconstruction has no initial points, `points` is the path of its own points, which does not exist.
         """
         if event is None:
             return self
         return replace(self, reconstruction=event.number, cloud=event.number if event.points is None else event.points)
 
     def leftovers(self, event: ReconstructionBegun | None) -> list[Path]:
-        """Lists what reconstructions before the one that was begun last left, and points that it does not use."""
+        """Returns existing paths of earlier reconstructions, including points that the current one does not use."""
         if event is None:
             return []
         made = [replace(self, reconstruction=number) for number in range(event.number)]
@@ -102,59 +104,62 @@ class SceneFolder:
 
     @property
     def name(self) -> str:
-        """Name of the folder: the scene's id."""
+        """Name of the folder, which is the scene ID."""
         return self.path.name
 
     @property
     def definition(self) -> Path:
-        """Rig and settings (`server.storage.definition`): the scene exists once this file does."""
+        """File with the rig and settings (`server.storage.definition`); the scene exists once this file does."""
         return self.path / "scene.json"
 
     @property
     def journal(self) -> Path:
-        """Events of the scene (`server.storage.journal`)."""
+        """File with the scene's events (`server.storage.journal`)."""
         return self.path / "journal.log"
 
     @property
     def frames(self) -> Path:
-        """The frame log: pictures as they were sent (`server.storage.frame_store`)."""
+        """Frame log with the images as they were uploaded (`server.storage.frame_store`)."""
         return self.path / "frames"
 
     @property
     def states(self) -> Path:
-        """Committed states (`scas4d_core.storage.history`); a folder, or a link to that of an epoch."""
+        """Committed states (`scas4d_core.storage.history`): a folder, or a link to the folder of an epoch."""
         states = self._of("states")
         return states if self.epoch is None else epoch_folder(states, self.epoch)
 
     @property
     def points(self) -> Path:
-        """The initial cloud, where one was given."""
+        """File with the initial point cloud, if one was given."""
         return self.points_of(self.cloud)
 
     def points_of(self, reconstruction: int) -> Path:
-        """The initial cloud that was sent for a reconstruction."""
+        """Returns the path of the initial point cloud that was uploaded for a reconstruction."""
         return self.path / f"points{_suffix(reconstruction)}.npz"
 
     @property
     def parts(self) -> Path:
-        """Part labels, one file a number of parts (`server.processes.part_labels`)."""
+        """Folder of part labels, one file per number of parts (`server.processes.part_labels`)."""
         return self._of("parts")
 
     def _of(self, name: str) -> Path:
         return self.path / f"{name}{_suffix(self.reconstruction)}"
 
     @property
-    def card(self) -> Path:
-        """Status of a scene that is asleep (`server.scene.status_cache`); nothing is lost with it."""
+    def status_cache(self) -> Path:
+        """Cached status of a sleeping scene (`server.scene.status_cache`), which can always be rebuilt."""
         return self.path / "asleep.json"
 
     @property
     def worker_lock(self) -> Path:
-        """Locked by the worker process that may commit to the states."""
+        """Lock file held by the worker process that may commit to the states."""
         return self.path / "worker.lock"
 
     def export(self, word: str) -> Path:
-        """An export while it is being answered; `word`: of the reader, as one that was given up may go on."""
+        """Returns the temporary file of an export in progress.
+
+        `word` is unique per reader, because an abandoned reader may still be writing.
+        """
         return self.path / f"{EXPORT}.{word}.part"
 
 
@@ -163,7 +168,7 @@ def _suffix(reconstruction: int) -> str:
 
 
 def epoch_folder(states: Path, epoch: int) -> Path:
-    """Folder of the states of an epoch.
+    """Returns the folder with the states of an epoch.
 
     >>> epoch_folder(Path("a/states"), 3).name
     'states.3'

@@ -1,6 +1,6 @@
-"""Ledger of a scene's frames, folded from the events of its journal; and the log that journals what changes it.
+"""Ledger of a scene's frames, built from its journal events, and the log that journals every change.
 
-The running scene and the one that is found again after a restart go through the same `Ledger.apply`.
+A running scene and one recovered after a service restart both use the same `Ledger.apply`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from scas4d_core.storage.history import NEWEST_KEPT
 from server.storage.disk import full_disk, no_room
 from server.storage.events import (
     BudgetChanged,
+    CameraAccepted,
     FrameAccepted,
     FrameFailed,
     FrameMissing,
@@ -26,7 +27,6 @@ from server.storage.events import (
     Hashes,
     JournalEvent,
     OpenFrame,
-    PartAccepted,
     PauseChanged,
     PicturesDeleted,
     ReconstructionBegun,
@@ -36,29 +36,31 @@ from server.storage.events import (
     WorkerDied,
 )
 from server.storage.frame_store import FrameLogIndex, remove
-from server.storage.frame_table import CODES, DELETED, FEW, RECEIPT, FrameTable
+from server.storage.frame_table import CODES, DELETED, FEW_STATES, RECEIPT, FrameTable
 from server.storage.journal import Journal
 
-AGAIN_S = 1.0
-"""An event that the disk has no room for is written again after so long."""
-HOPELESS = "the scene has failed at a frame before"
+RETRY_S = 1.0
+"""Seconds before the write of an event is retried when the disk is full."""
+NO_FIRST_FRAME = "the scene has failed at a frame before"
 
 
 def frame_identity(hashes: Hashes, time: float) -> str:
-    """BLAKE3 over the sorted (camera, kind, BLAKE3 of the file) and the time in seconds."""
+    """Returns the BLAKE3 digest of the sorted (camera, kind, file digest) tuples and the time in seconds."""
     parts = sorted((camera, str(kind), value) for camera, files in hashes.items() for kind, value in files.items())
     return blake3(json.dumps([parts, time]).encode()).hexdigest()
 
 
 class Ledger:
-    """Frames of one scene by index. No disk, no processes, no clock.
+    """In-memory state of a scene's frames, without disk, process or clock access.
 
     Attributes:
-        frames: every index below `next_frame`. open: frames that cameras send one by one.
-        fatal: reason why the scene cannot go on, or None. failed_at: the frame that it failed at, or None.
-        budgets: the first frame that each holds for, rising.
-        edited: the changes of its name, archive and retention since it was created.
-        begun: the event that the present reconstruction was begun by; None: it came with the scene.
+        frames: table of all frames with an index below `next_frame`.
+        open: frames whose cameras upload separately and that are not closed yet.
+        fatal: reason why the scene cannot continue, or None.
+        failed_at: frame at which the scene failed, or None.
+        budgets: pairs of a budget's first frame and the budget, in ascending order.
+        edited: accumulated changes of name, archive flag and retention since creation.
+        begun: event that started the current reconstruction, or None for the original one.
     """
 
     def __init__(self, scene: str) -> None:
@@ -75,12 +77,12 @@ class Ledger:
 
     @property
     def reconstruction(self) -> int:
-        """Number of the reconstruction."""
+        """Number of the current reconstruction."""
         return 0 if self.begun is None else self.begun.number
 
     @property
     def committed(self) -> Sequence[int]:
-        """Rising indices whose state can be read."""
+        """Indices of frames with a readable committed state, in ascending order."""
         return self.frames.committed
 
     @property
@@ -90,110 +92,111 @@ class Ledger:
 
     @property
     def next_frame(self) -> int:
-        """Index of the frame that is accepted next."""
+        """Index of the next frame to be accepted."""
         return len(self.frames)
 
     @property
     def unfinished(self) -> int:
-        """Frames acknowledged and not finished."""
+        """Number of acknowledged frames that are not finished."""
         return self.counts[FrameState.QUEUED] + self.counts[FrameState.UPDATING]
 
     @property
     def updating(self) -> bool:
-        """True while the worker has a frame."""
+        """Whether the worker is processing a frame."""
         return self.counts[FrameState.UPDATING] > 0
 
     def apply(self, event: JournalEvent) -> None:
-        """Applies one event. Events may come twice, and those before them may be lost."""
+        """Applies one event; events may be repeated, and earlier ones may be lost."""
         match event:
             case FrameAccepted():
                 parts = self.open.pop(event.index, None)
-                self._have(event.index)
-                self.frames.take(event.index, event.time, event.identity, event.files, parts)
-            case PartAccepted() if event.index >= self.next_frame:
+                self._grow_to(event.index)
+                self.frames.enqueue(event.index, event.time, event.identity, event.files, parts)
+            case CameraAccepted() if event.index >= self.next_frame:
                 self.open.setdefault(event.index, OpenFrame(event.index)).add(event)
             case FrameMissing():
-                self._have(event.index)
+                self._grow_to(event.index)
                 self.frames.note(event.index).error = event.reason
-                self.move(event.index, FrameState.MISSING)
+                self.set_state(event.index, FrameState.MISSING)
             case FramesSkipped():
                 for index in event.frames:
-                    self._have(index)
+                    self._grow_to(index)
                     self.frames.skip(index, event.by)
             case FrameFailed():
-                self._have(event.index)
+                self._grow_to(event.index)
                 note = self.frames.note(event.index)
                 note.error, note.dropped = event.reason, dict(event.dropped)
                 if event.fatal:
                     self.fatal, self.failed_at = event.reason, event.index
-                self.move(event.index, FrameState.FAILED)
+                self.set_state(event.index, FrameState.FAILED)
             case WorkerDied():
-                self._have(event.index)
+                self._grow_to(event.index)
                 note = self.frames.note(event.index)
                 note.own_deaths += event.own
                 note.other_deaths += not event.own
             case PicturesDeleted():
                 for index in event.frames:
-                    self._have(index)
+                    self._grow_to(index)
                     self.frames.set_files(index, ())
             case StatesDeleted():
-                self._have(max(event.frames, default=-1))
+                self._grow_to(max(event.frames, default=-1))
                 self.states_deleted += self.frames.delete_states(event.frames)
-                if event.reason is not None and len(event.frames) < FEW:
+                if event.reason is not None and len(event.frames) < FEW_STATES:
                     for index in event.frames:
                         self.frames.note(index).error = event.reason
             case StateFound():
-                self._have(event.index)
-                self.frames.found(event.index, event.time)
+                self._grow_to(event.index)
+                self.frames.add_committed(event.index, event.time)
             case PauseChanged():
                 self.paused = event.paused
             case SceneEdited():
-                self.edited = event.after(self.edited)
+                self.edited = event.merged_with(self.edited)
             case ReconstructionBegun() if event.number > self.reconstruction:
                 self.begun, self.states_deleted = event, 0
                 self.fatal = self.failed_at = None
-                self.frames.begin_again(event.index)
+                self.frames.restart(event.index)
             case BudgetChanged():
                 self.budgets = [one for one in self.budgets if one[0] < event.index] or [(0, Budget())]
                 self.budgets.append((event.index, event.budget))
-            case _:  # created: the scene's own; a part of a frame that is closed; a reconstruction that is known
+            case _:  # scene creation, a part of a closed frame, or a reconstruction that is already known
                 pass
 
     def budget_of(self, index: int) -> Budget:
-        """Returns the budget that holds for a frame."""
+        """Returns the budget that applies to a frame."""
         return next(budget for first, budget in reversed(self.budgets) if first <= index)
 
-    def begins_next(self) -> int:
-        """Returns the first frame that is not begun: a new budget holds from there on."""
+    def next_to_begin(self) -> int:
+        """Returns the first frame whose update has not started, from which a new budget applies."""
         return next(iter(self.waiting()), self.next_frame)
 
-    def move(self, index: int, state: FrameState) -> None:
-        """Puts a frame in another state."""
-        self.frames.move(index, state)
+    def set_state(self, index: int, state: FrameState) -> None:
+        """Sets the state of a frame."""
+        self.frames.set_state(index, state)
 
     def reconcile(
         self, indices: Sequence[int], damaged: Mapping[int, str], recompute: Collection[int] = ()
     ) -> list[JournalEvent]:
-        """Brings the frames in line with the committed states that exist, and returns what the journal lacks.
+        """Reconciles the frames with the committed states on disk and returns the events that the journal lacks.
 
         Args:
-            indices: of the states that can be read, rising. damaged: states that cannot, with the reason.
-            recompute: of those that are damaged or gone, states that will be made again: no event is made of them.
+            indices: indices of the readable states, in ascending order.
+            damaged: unreadable states, with the reason.
+            recompute: damaged or missing states that will be recomputed, for which no event is returned.
 
         Returns:
-            Events, already applied, that have to be appended: states that are gone, frames that have to be done again
-            and cannot.
+            Events that are already applied and must be appended to the journal: missing states, and frames that need an
+            update whose images are deleted.
         """
         last = indices[-1] if indices else -1
         events: list[JournalEvent] = []
         if last >= self.next_frame:  # the journal is damaged
-            self._have(last)
+            self._grow_to(last)
         frames, count = self.frames, self.next_frame
         readable = np.zeros(count, bool)
         readable[[index for index in indices if index < count]] = True
         codes = frames.states()
         for index in np.flatnonzero(codes[last + 1 :] == CODES[FrameState.COMMITTED]) + last + 1:
-            frames.move(int(index), FrameState.QUEUED)
+            frames.set_state(int(index), FrameState.QUEUED)
             self.states_deleted -= frames.restore_state(int(index))
             if not frames[int(index)].files:
                 events.append(
@@ -201,9 +204,9 @@ class Ledger:
                 )
         frames.commit_up_to(last)
         lost = readable & (codes == CODES[FrameState.FAILED]) & ~frames.flagged(RECEIPT)
-        for index in np.flatnonzero(lost):  # its event is lost, its state is not
+        for index in np.flatnonzero(lost):  # the event is lost, but the state exists
             frames.note(int(index)).error = None
-            frames.move(int(index), FrameState.COMMITTED)
+            frames.set_state(int(index), FrameState.COMMITTED)
         unreadable = (frames.states() == CODES[FrameState.COMMITTED]) & ~frames.flagged(DELETED) & ~readable
         gone = tuple(index for index in np.flatnonzero(unreadable).tolist() if index not in recompute)
         for again in recompute:
@@ -217,7 +220,7 @@ class Ledger:
         return events
 
     def copy(self) -> Ledger:
-        """Copies the ledger without records of commits, for a thread to read."""
+        """Returns a copy without commit records, for reading in another thread."""
         new = Ledger(self.scene)
         new.frames, new.open = self.frames.copy(), copy.deepcopy(self.open)
         new.paused, new.states_deleted = self.paused, self.states_deleted
@@ -226,7 +229,7 @@ class Ledger:
         return new
 
     def waiting(self) -> list[int]:
-        """Lists queued frames that the worker does not have, rising."""
+        """Returns the queued frames that the worker has not started, in ascending order."""
         indices: list[int] = []  # scans backwards: queued frames are always the newest
         for index in range(self.next_frame - 1, -1, -1):
             if len(indices) == self.counts[FrameState.QUEUED]:
@@ -235,29 +238,29 @@ class Ledger:
                 indices.append(index)
         return indices[::-1]
 
-    def hopeless(self) -> list[FrameFailed]:
-        """Returns events, not applied, that fail the frames waiting behind a failed first one."""
+    def events_without_first_frame(self) -> list[FrameFailed]:
+        """Returns events that fail all waiting frames after a fatal failure; the events are not applied."""
         if self.fatal is None:
             return []
-        return [FrameFailed(index=index, reason=f"{HOPELESS}: {self.fatal}") for index in self.waiting()]
+        return [FrameFailed(index=index, reason=f"{NO_FIRST_FRAME}: {self.fatal}") for index in self.waiting()]
 
     def last_tried(self) -> int | None:
-        """Returns the newest frame that the worker has finished, committed or failed."""
+        """Returns the newest frame that was committed or has failed, or None."""
         states = self.frames.states()
-        states[: self.frames.first] = CODES[FrameState.SKIPPED]  # not tried: the reconstruction begins behind them
+        states[: self.frames.first] = CODES[FrameState.SKIPPED]  # not attempted: the reconstruction starts after them
         tried = np.flatnonzero((states == CODES[FrameState.COMMITTED]) | (states == CODES[FrameState.FAILED]))
         return int(tried[-1]) if len(tried) else None
 
     def last_time(self) -> float | None:
-        """Returns the seconds of the newest closed frame that has a time."""
+        """Returns the time in seconds of the newest closed frame that has one, or None."""
         for index in range(self.next_frame - 1, -1, -1):
             time = self.frames[index].time
             if time is not None:
                 return time
         return None
 
-    def _have(self, index: int) -> None:
-        """Grows to the frame; unknown indices up to it fail as lost."""
+    def _grow_to(self, index: int) -> None:
+        """Grows the table up to a frame; unknown frames before it are marked as failed."""
         if index >= self.next_frame:
             for new in [new for new in self.open if new <= index]:
                 del self.open[new]
@@ -265,14 +268,16 @@ class Ledger:
 
 
 class SceneLog:
-    """Journal, ledger and frame log of one scene: an acknowledged change is journalled before the ledger has it.
+    """Journal, ledger and frame log of one scene. A change is journalled before it is applied to the ledger.
 
     Args:
-        ledger, journal, pictures: of the scene.
-        waits: called with a sentence each time that a journal write waits for room on the disk.
+        ledger: ledger of the scene.
+        journal: journal of the scene.
+        pictures: index of the scene's frame log.
+        waits: called with a sentence each time a journal write waits for disk space.
 
     Attributes:
-        lock: held while the next frame is decided.
+        lock: lock held while the next frame is being accepted.
     """
 
     def __init__(self, ledger: Ledger, journal: Journal, pictures: FrameLogIndex, waits: Callable[[str], None]) -> None:
@@ -283,7 +288,7 @@ class SceneLog:
         self._waits = waits
 
     async def append(self, *events: JournalEvent) -> None:
-        """Journals events and then applies them.
+        """Appends events to the journal and then applies them.
 
         Raises:
             Problem: 507, the disk is full; nothing has changed.
@@ -298,7 +303,7 @@ class SceneLog:
             self.ledger.apply(event)
 
     async def write(self, *events: JournalEvent) -> None:
-        """Journals events that cannot be refused, again and again until there is room; the caller applies them."""
+        """Appends mandatory events to the journal and retries until there is disk space; the caller applies them."""
         while True:
             try:
                 await self.journal.append(*events)
@@ -307,18 +312,18 @@ class SceneLog:
                 if not no_room(error):
                     raise
                 self._waits(f"the journal waits for room on the disk: {message_of(error)}")
-                await asyncio.sleep(AGAIN_S)
+                await asyncio.sleep(RETRY_S)
 
     async def delete_pictures(self, names: Collection[str]) -> None:
-        """Deletes records of the frame log."""
+        """Deletes records from the frame log and its index."""
         self.pictures.discard(names)
         await asyncio.to_thread(remove, self.pictures.folder, names)
 
     def deletable(self, rule: Retention) -> list[int]:
-        """Lists the frames whose pictures the rule deletes now, rising.
+        """Returns the frames whose images the retention rule deletes now, in ascending order.
 
-        Pictures are kept of frames that are not finished, and of those newer than the commit that an interrupted scene
-        may have to go back to: they would be needed again.
+        Images are kept for unfinished frames. They are also kept for all frames after the commit to which an
+        interrupted scene may have to roll back, because those frames would be updated again.
         """
         ledger, pictures = self.ledger, self.pictures
         if len(ledger.committed) < NEWEST_KEPT or (rule.last is None and rule.bytes is None):

@@ -1,4 +1,4 @@
-"""Reads the initial cloud of a scene."""
+"""Readers for the initial point cloud of a scene."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from scas4d_core.storage.npz import read_npz
 
 
 def points_sha256(path: Path) -> str | None:
-    """Returns the SHA-256 of the request body that a scene's points arrived in, or None where it has no points."""
+    """Returns the SHA-256 of the request body that contained a scene's points.
+
+    Returns None if the scene has no points, and an empty string if the file cannot be read.
+    """
     try:
         return bytes(read_npz(path, ("sha256",))["sha256"]).hex()
     except FileNotFoundError:
@@ -21,7 +24,7 @@ def points_sha256(path: Path) -> str | None:
 
 
 def points_positions(path: Path) -> NDArray[np.float64] | None:
-    """Returns the positions [P, 3] of a scene's points, or None where it has none that can be read."""
+    """Returns the positions [P, 3] of a scene's points, or None if the points are missing or unreadable."""
     try:
         return np.asarray(read_npz(path, ("positions",))["positions"], np.float64)
     except (FileNotFoundError, ValueError):

@@ -1,25 +1,25 @@
-"""Records on disk: checksummed, appended, and found again after a cut at any byte or flipped bits.
+"""Format of checksummed, append-only records that readers can locate again after truncation or bit flips.
 
-A record is a header, a head (JSON) and a body (raw bytes), and a checksum behind them:
+A record consists of a header, a head (JSON), a body (raw bytes) and a checksum:
 
-    bytes  what
+    bytes  content
     4      magic S4DR
-    1      version of the format, 1 or 2: which checksum is behind the body
+    1      format version, 1 or 2, which selects the checksum
     1      kind, `LogRecordKind`
-    2      nought
+    2      zero
     4      length of the head
-    8      index of the frame that it belongs to
+    8      index of the frame that the record belongs to
     8      length of the body
-    4      CRC-32 of the 28 bytes before and of the head
+    4      CRC-32 of the preceding 28 bytes and the head
     …      head, UTF-8 JSON
     …      body
-    16     BLAKE3, cut to 128 bits; version 1: of all before, version 2: of header and head and then of the BLAKE3
-           (32 bytes) of each file
+    16     BLAKE3 digest truncated to 128 bits. Version 1: over everything before it. Version 2: over header, CRC and
+           head, followed by the BLAKE3 digest (32 bytes) of each file
 
-All numbers are unsigned little-endian. A header inside damage can be believed if its CRC agrees, so that a reader can
-look for the next record; the BLAKE3 proves that the record is as it was written. The body may be written before its
-checksum is known: a frame goes to disk while it is received. The head of version 2 has `files`, whose `size` gives the
-place of each in the body: the BLAKE3 of a file is used for the frame's identity too, and so no byte is hashed twice.
+All numbers are unsigned little-endian integers. A header with a matching CRC can be trusted even within damaged data,
+so a reader can search for the next record. The BLAKE3 digest proves that the record is unchanged. The checksum follows
+the body because a frame is written to disk while it is being received. In version 2, the head contains `files`, and
+each `size` locates a file in the body. The frame's identity uses the same file digests, so no byte is hashed twice.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from blake3 import blake3
 
 MAGIC = b"S4DR"
 WHOLE, BY_FILE = 1, 2
-"""Versions of the format."""
+"""Format versions: one checksum over the whole record, or one built from the digest of each file."""
 HEADER = struct.Struct("<4sBBHIQQ")
 CRC = struct.Struct("<I")
 PREFIX = HEADER.size + CRC.size
@@ -45,17 +45,20 @@ MAX_HEAD = 1 << 22
 
 
 class LogRecordKind(IntEnum):
-    """Kinds of record."""
+    """Record kinds."""
 
     EVENT = 1
-    """An event of a frame or of the scene; all in the head."""
+    """Event of a frame or of the scene, stored completely in the head."""
     PICTURES = 2
-    """The encoded files of a frame, or of one camera of it."""
+    """Encoded image files of a frame, or of one of its cameras."""
 
 
 @dataclass(frozen=True, eq=False)
 class LogRecord:
-    """One record as read; views into the bytes read. `files` and `digests`, the BLAKE3 of each, only of version 2."""
+    """Record as read from disk; `body` and `files` are views into the input.
+
+    `files` and `digests`, the BLAKE3 digest of each file, are set only for version 2.
+    """
 
     kind: int
     index: int
@@ -66,7 +69,7 @@ class LogRecord:
 
 
 class RecordHeader(NamedTuple):
-    """RecordHeader of a record without a body: its JSON, not parsed, and the size of the whole record in bytes."""
+    """Header of a small record with its unparsed JSON head and the total record size in bytes."""
 
     kind: int
     frame: int
@@ -76,9 +79,9 @@ class RecordHeader(NamedTuple):
 
 @dataclass(frozen=True)
 class Damage:
-    """Bytes [start, end) that hold no whole record, and the reason.
+    """Byte range [start, end) without an intact record, and the reason.
 
-    `index` and `kind` are those of the record that was there, where its header can still be believed.
+    `index` and `kind` belong to the damaged record and are set only if its header can still be trusted.
     """
 
     start: int
@@ -87,36 +90,39 @@ class Damage:
     index: int | None = None
     kind: int | None = None
     torn: bool = False
-    """The damage reaches the end of the log, as after an append that was cut short."""
+    """Whether the damage reaches the end of the log, as after an interrupted append."""
 
 
-def opening(kind: int, index: int, head: Any, body_length: int, version: int = WHOLE) -> bytes:
-    """Encodes header and head of a record; the body and its checksum follow."""
+def encode_opening(kind: int, index: int, head: Any, body_length: int, version: int = WHOLE) -> bytes:
+    """Encodes the header and head of a record, after which the body and the checksum are written."""
     text = json.dumps(head, separators=(",", ":"), allow_nan=False).encode()
     header = HEADER.pack(MAGIC, version, kind, 0, len(text), index, body_length)
     return header + CRC.pack(zlib.crc32(text, zlib.crc32(header))) + text
 
 
 def checksum(*pieces: bytes | bytearray | memoryview) -> bytes:
-    """Hashes consecutive pieces: all of a record, or its opening and the BLAKE3 of each of its files."""
+    """Returns the truncated BLAKE3 digest of consecutive pieces.
+
+    The pieces are those of a whole record, or its opening and the digest of each of its files.
+    """
     digest = blake3()
     for piece in pieces:
         digest.update(piece)
     return digest.digest(CHECKSUM)
 
 
-def encoded(kind: int, index: int, head: Any, body: bytes = b"") -> bytes:
-    """Encodes a whole record of version 1."""
-    start = opening(kind, index, head, len(body))
+def encode_record(kind: int, index: int, head: Any, body: bytes = b"") -> bytes:
+    """Encodes a complete record of version 1."""
+    start = encode_opening(kind, index, head, len(body))
     return start + body + checksum(start, body)
 
 
 def read_at(data: memoryview, at: int) -> tuple[LogRecord | Damage, int]:
-    """Reads the record that begins at a byte.
+    """Reads the record that starts at a byte offset.
 
     Returns:
-        The record, or the damage, and its end; where the header cannot be believed, the damage ends at the next that
-        can.
+        The record or the damage, and its end. If the header cannot be trusted, the damage ends at the next trusted
+        header.
     """
     header = data[at : at + HEADER.size]
     if len(header) < HEADER.size or header[:4] != MAGIC:
@@ -138,7 +144,7 @@ def read_at(data: memoryview, at: int) -> tuple[LogRecord | Damage, int]:
     try:
         head = json.loads(bytes(head_bytes))
         files = () if version == WHOLE else _files(head, body)
-    except (KeyError, TypeError, ValueError) as error:  # whole, but written by something else
+    except (KeyError, TypeError, ValueError) as error:  # intact, but written by another program
         return Damage(at, end, f"the head is not one of a record ({error!r})", index, kind), end
     digests = tuple(blake3(file).digest() for file in files)
     if version == BY_FILE and checksum(start, *digests) != found:
@@ -150,7 +156,7 @@ def _files(head: Any, body: memoryview) -> tuple[memoryview, ...]:
     """Splits a body into its files.
 
     Raises:
-        KeyError, TypeError, ValueError: the head does not give their sizes.
+        KeyError, TypeError, ValueError: the head does not contain valid file sizes.
     """
     files, at = [], 0
     for file in head["files"]:
@@ -161,8 +167,8 @@ def _files(head: Any, body: memoryview) -> tuple[memoryview, ...]:
     return tuple(files)
 
 
-def records(data: bytes | memoryview) -> Iterator[LogRecord | Damage]:
-    """Yields every whole record of a log, and the damage between them, in order."""
+def read_records(data: bytes | memoryview) -> Iterator[LogRecord | Damage]:
+    """Yields every intact record of a log and the damage between them, in order."""
     view = memoryview(data)
     at = 0
     while at < len(view):
@@ -171,20 +177,23 @@ def records(data: bytes | memoryview) -> Iterator[LogRecord | Damage]:
 
 
 PIECE = 1 << 22
-"""Bytes that are read at a time."""
-ENOUGH = 2 * (MAX_HEAD + PREFIX + CHECKSUM)
-"""Bytes of a log that are enough to decide whether a record without a body, such as an event, is whole."""
+"""Number of bytes read at a time."""
+DECIDABLE_BYTES = 2 * (MAX_HEAD + PREFIX + CHECKSUM)
+"""Number of bytes that suffice to decide whether a record without a body, such as an event, is intact."""
 
 
 class Readable(Protocol):
-    """A file that is read piece by piece."""
+    """Protocol of a file that is read in pieces."""
 
     def read(self, size: int, /) -> bytes:
-        """Reads at most so many bytes; none at the end."""
+        """Reads at most `size` bytes, and none at the end of the file."""
 
 
-def streamed(file: Readable) -> Iterator[RecordHeader | Damage]:
-    """Yields the heads of a log of small records, and the damage between them; the log need not fit in memory."""
+def stream_records(file: Readable) -> Iterator[RecordHeader | Damage]:
+    """Yields the header of each record in a log of small records, and the damage between them.
+
+    The log need not fit in memory.
+    """
     data, start, at, ended = b"", 0, 0, False
     while True:
         head = _whole(data, at)
@@ -193,7 +202,7 @@ def streamed(file: Readable) -> Iterator[RecordHeader | Damage]:
             at += head.size
             continue
         damage, after = _damage(data, at)
-        unsure = damage is None or len(data) - at < ENOUGH or after == len(data)
+        unsure = damage is None or len(data) - at < DECIDABLE_BYTES or after == len(data)
         if unsure and not ended:
             piece = file.read(PIECE)
             ended = not piece
@@ -206,7 +215,7 @@ def streamed(file: Readable) -> Iterator[RecordHeader | Damage]:
 
 
 def _whole(data: bytes, at: int) -> RecordHeader | None:
-    """Returns the record that begins at a byte, if it is whole and of version 1."""
+    """Returns the header of the record at a byte offset, or None if it is not an intact record of version 1."""
     if len(data) - at < PREFIX:
         return None
     magic, version, kind, nought, head_length, index, body_length = HEADER.unpack_from(data, at)
@@ -223,7 +232,7 @@ def _whole(data: bytes, at: int) -> RecordHeader | None:
 
 
 def _damage(data: bytes, at: int) -> tuple[Damage | None, int]:
-    """Returns why no such record begins at a byte, and where to go on; None at the end of the data."""
+    """Returns the damage at a byte offset and where to continue, or None at the end of the data."""
     if at == len(data):
         return None, at
     record, after = read_at(memoryview(data), at)
@@ -231,7 +240,7 @@ def _damage(data: bytes, at: int) -> tuple[Damage | None, int]:
 
 
 def _skip(data: memoryview, at: int, reason: str) -> tuple[Damage, int]:
-    """Returns the damage up to the next header that can be believed, or to the end."""
+    """Returns the damage up to the next trusted header or the end of the data."""
     text = data.obj if isinstance(data.obj, bytes) and len(data.obj) == len(data) else bytes(data)
     following = at
     while (following := text.find(MAGIC, following + 1)) >= 0:
@@ -248,15 +257,17 @@ def _skip(data: memoryview, at: int, reason: str) -> tuple[Damage, int]:
     return Damage(at, len(data), reason, torn=True), len(data)
 
 
-COMPARED = 1 << 20
-"""Bytes of a record that `streamed_record` reads at a time."""
+READ_BYTES = 1 << 20
+"""Number of bytes that `check_record` reads at a time."""
 
 
-def streamed_record(file: Readable) -> Iterator[int]:
-    """Reads a file that is one record; yields the number of bytes of each piece. It need not fit in memory.
+def check_record(file: Readable) -> Iterator[int]:
+    """Verifies a file that contains one record and yields the size of each piece in bytes.
+
+    The record need not fit in memory.
 
     Raises:
-        ValueError: the record is not whole.
+        ValueError: the record is not intact.
     """
     header = file.read(PREFIX)
     if len(header) < PREFIX or header[:4] != MAGIC:
@@ -269,13 +280,13 @@ def streamed_record(file: Readable) -> Iterator[int]:
         raise ValueError("the header or head fails its checksum")
     try:
         sizes = [body_length] if version == WHOLE else [int(entry["size"]) for entry in json.loads(head)["files"]]
-    except (KeyError, TypeError) as error:  # whole, but written by something else
+    except (KeyError, TypeError) as error:  # intact, but written by another program
         raise ValueError(f"the head is not one of a record ({error!r})") from None
     whole = blake3(header + head)
     for size in sizes:
         digest = whole if version == WHOLE else blake3()
         while size:
-            piece = file.read(min(size, COMPARED))
+            piece = file.read(min(size, READ_BYTES))
             if not piece:
                 raise ValueError("it is cut")
             digest.update(piece)

@@ -1,4 +1,4 @@
-"""Recovers a scene from its folder: brings journal, frame log and states together, and names what does not fit."""
+"""Recovery of a scene from its folder: reconciles journal, frame log and states, and reports inconsistencies."""
 
 from __future__ import annotations
 
@@ -13,41 +13,44 @@ from client.wire import FileKind, FrameState
 from scas4d_core.storage.faults import OtherFormatError
 from scas4d_core.storage.frame_files import FrameFiles
 from scas4d_core.storage.history import History, HistoryError
-from server.storage.definition import DefinitionError, begun_of
+from server.storage.definition import DefinitionError, reconstruction_of
 from server.storage.disk import no_room
 from server.storage.events import (
+    CameraAccepted,
     FrameAccepted,
     FrameFailed,
     Hashes,
     JournalEvent,
-    PartAccepted,
     SceneCreated,
     StateFound,
     StatesDeleted,
     WorkerDied,
 )
-from server.storage.fencing import heal
-from server.storage.frame_store import FrameDamage, StoredPictures, frame_of, read_pictures, remove, stored
+from server.storage.fencing import repair_link
+from server.storage.frame_store import FrameDamage, StoredPictures, frame_of, list_records, read_pictures, remove
 from server.storage.journal import replay, write_journal
 from server.storage.layout import SceneFolder
 from server.storage.ledger import Ledger, frame_identity
 from server.storage.snapshot import events_of
 
-OF_STATES = (FrameFailed, StateFound, StatesDeleted, WorkerDied)
-"""Events of one reconstruction: another one tries the frame again, and has other states."""
+RECONSTRUCTION_EVENTS = (FrameFailed, StateFound, StatesDeleted, WorkerDied)
+"""Event types that belong to one reconstruction only; a restarted one retries the frames and has new states."""
 NO_STATE = "the journal was lost, and there is no committed state of this frame"
 
 
 @dataclass(frozen=True)
 class Recovered:
-    """A scene as found in its folder.
+    """Scene as recovered from its folder.
 
     Attributes:
-        folder: with the names of the reconstruction that was begun last.
-        good: bytes of the journal that are whole. events: those that the journal lacks, applied already.
-        sizes: bytes of each record of the frame log. damage: a sentence for each thing that was dropped.
-        recompute: frames whose states are damaged or gone, with the reason, and whose pictures are held.
-        first_report: of the first committed frame that can be read; empty where there is none.
+        folder: scene folder with the file names of the latest reconstruction.
+        ledger: ledger of the scene with all `events` applied.
+        good: number of intact bytes in the journal.
+        events: events that the journal lacks and that are already applied to the ledger.
+        sizes: size of each frame log record in bytes, by name.
+        damage: one sentence per fault that was found.
+        recompute: frames with a damaged or missing state and stored images, with the reason.
+        first_report: report of the first readable committed frame, or empty if there is none.
     """
 
     folder: SceneFolder
@@ -62,7 +65,7 @@ class Recovered:
 
 @dataclass(frozen=True)
 class _States:
-    """Committed states: times of those that can be read, faults of the others, reports of the newest and the first."""
+    """Committed states: times of readable ones, faults of damaged ones, and the newest and first reports."""
 
     times: dict[int, float] = field(default_factory=dict)
     damaged: dict[int, str] = field(default_factory=dict)
@@ -79,55 +82,61 @@ class _States:
 
 
 def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | None = None) -> Recovered:
-    """Reads a scene's folder and removes what interrupted uploads left. Blocking.
+    """Reads a scene's folder and removes leftovers of interrupted uploads. Blocks.
 
-    A journal that is damaged or gone loses its own content and nothing else: committed states and whole records of
-    pictures are found again, nothing is removed, and a new journal is written with all that is known.
+    If the journal is damaged or missing, only its own content is lost. Committed states and complete image records are
+    found again, nothing is removed, and the journal is rewritten from the recovered ledger.
 
     Args:
-        folder: of the scene. scene: its id. definition: as in `SceneCreated`; without it no new journal is written.
+        folder: folder of the scene.
+        scene: scene ID.
+        definition: definition as in `SceneCreated`; without it, the journal is not rewritten.
     """
     frames, journal = folder.frames, folder.journal
     frames.mkdir(exist_ok=True)
     ledger = Ledger(scene)
     reading = replay(journal, ledger.apply)
     damage = list(reading.damage)
-    if not reading.begun:  # a scene is made with its journal, which begins with that
+    if not reading.begun:  # the journal is created with the scene and starts with `SceneCreated`
         damage.append(f"{journal.name} {'lacks its beginning' if journal.exists() else 'is gone'}")
     broken = reading.broken or not reading.begun
-    begun = begun_of(definition or {})
+    begun = reconstruction_of(definition or {})
     if begun is not None and begun.number > ledger.reconstruction:
-        # It is not known which events came before it: those of states may be of other states.
+        # The order relative to the restart is unknown, so events of states may belong to an earlier reconstruction.
         damage.append(f"{journal.name} does not have the beginning of reconstruction {begun.number} any more")
         broken, ledger = True, Ledger(scene)
         ledger.apply(begun)
-        replay(journal, lambda event: None if isinstance(event, OF_STATES) else ledger.apply(event))
-    folder = folder.begun(ledger.begun)
-    sizes = stored(frames)
+        replay(journal, lambda event: None if isinstance(event, RECONSTRUCTION_EVENTS) else ledger.apply(event))
+    folder = folder.of_reconstruction(ledger.begun)
+    sizes = list_records(frames)
     in_states: list[str] = []
-    heal(folder.states)
+    repair_link(folder.states)
     states = _states(folder.states, in_states)
     events: list[JournalEvent] = []
     if broken:
-        events.extend(_found_states(states, ledger))
+        events.extend(_events_of_states(states, ledger))
     if damage:
-        events.extend(_found(frames, sorted(_unnamed(ledger, sizes)), ledger, states, broken))
-    if recovered_frames := sorted({event.index for event in events if isinstance(event, FrameAccepted | PartAccepted)}):
+        events.extend(_events_of_records(frames, sorted(_unreferenced(ledger, sizes)), ledger, states, broken))
+    if recovered_frames := sorted(
+        {event.index for event in events if isinstance(event, FrameAccepted | CameraAccepted)}
+    ):
         listed = ", ".join(map(str, recovered_frames))
         damage.append(f"the journal does not name the records of frames {listed} any more; used as they were found")
     damage += in_states
-    debris = _unnamed(ledger, sizes)
+    debris = _unreferenced(ledger, sizes)
     if broken and debris:
         damage.append(f"{len(debris)} records of pictures belong to nothing that is known; left until the next start")
     elif debris:
         remove(frames, debris)
     sizes = {name: size for name, size in sizes.items() if name not in debris}
-    recompute = _remade(ledger, states, broken, _deletes_states(definition or {}, ledger))
+    recompute = _recomputable(ledger, states, broken, _deletes_states(definition or {}, ledger))
     damage.extend(f"frame {index}: {reason}" for index, reason in recompute.items() if index not in states.damaged)
     events += ledger.reconcile(states.indices, states.damaged, recompute)
     if states.newest:
         ledger.frames.set_record(states.last, states.newest)
-    for event in ledger.hopeless():  # its scene failed, and the service ended before it could say so of this one
+    for event in (
+        ledger.events_without_first_frame()
+    ):  # the service stopped after the scene failed, before it could fail this frame
         ledger.apply(event)
         events.append(event)
     for entry in list(ledger.frames.with_pictures()):
@@ -136,7 +145,7 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
             ledger.frames.set_files(entry.index, tuple(name for name in entry.files if name in sizes))
             if entry.state == FrameState.COMMITTED:
                 damage.append(f"frame {entry.index}: its record is gone from the frame log: {', '.join(lost)}")
-        if entry.state == FrameState.QUEUED and (reason := _unusable(frames, entry.files, lost)):
+        if entry.state == FrameState.QUEUED and (reason := _fault_of(frames, entry.files, lost)):
             damage.append(f"frame {entry.index}: {reason}")
             gone = FrameFailed(index=entry.index, reason=reason)
             ledger.apply(gone)
@@ -154,27 +163,28 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
     return Recovered(folder, ledger, good, events, sizes, damage, recompute, states.first)
 
 
-def _unnamed(ledger: Ledger, sizes: dict[str, int]) -> set[str]:
-    """Returns the records that no event names."""
+def _unreferenced(ledger: Ledger, sizes: dict[str, int]) -> set[str]:
+    """Returns the records that no event references."""
     named = {name for entry in ledger.frames.with_pictures() for name in entry.files}
     named |= {name for frame in ledger.open.values() for name in frame.files}
     return set(sizes) - named
 
 
 def _deletes_states(definition: Mapping[str, Any], ledger: Ledger) -> bool:
-    """True for a scene with a rule that deletes old states."""
+    """Returns whether the scene has a retention rule that deletes old states."""
     if ledger.edited.keep_states is not None:
         return any(value is not None for _, value in ledger.edited.keep_states)
-    if not definition:  # of a new scene
+    if not definition:  # a new scene
         return False
     return any(value is not None for value in definition["request"]["ingest"]["keep_states"].values())
 
 
-def _remade(ledger: Ledger, states: _States, broken: bool, deletes: bool) -> dict[int, str]:
-    """Finds frames whose committed states cannot be read and can be made again, because their pictures are held.
+def _recomputable(ledger: Ledger, states: _States, broken: bool, deletes: bool) -> dict[int, str]:
+    """Returns frames whose committed states are unreadable but can be recomputed from their stored images.
 
-    Where events are lost, a frame without a state may never have been committed. Where a rule deletes old states,
-    those before the oldest (but the first, which stays) are not missed: the journal may not have heard of it.
+    If events are lost, a frame without a state may never have been committed, so it is not included. If a rule deletes
+    old states, missing states before the oldest one are ignored, because the journal may lack their deletion. The first
+    state is exempt from deletion and does not count as the oldest.
     """
     oldest = min(sorted(states.times)[1:], default=0) if deletes else 0
     return {
@@ -188,8 +198,8 @@ def _remade(ledger: Ledger, states: _States, broken: bool, deletes: bool) -> dic
     }
 
 
-def _found_states(states: _States, ledger: Ledger) -> Iterator[StateFound]:
-    """Yields committed states whose events the damaged journal has lost, as events, applied."""
+def _events_of_states(states: _States, ledger: Ledger) -> Iterator[StateFound]:
+    """Yields and applies events for committed states whose events the damaged journal has lost."""
     for index, time in states.times.items():
         entry = ledger.frames.get(index)
         if entry is None or (entry.receipt is None and entry.time is None):
@@ -198,10 +208,12 @@ def _found_states(states: _States, ledger: Ledger) -> Iterator[StateFound]:
             yield event
 
 
-def _found(folder: Path, names: list[str], ledger: Ledger, states: _States, broken: bool) -> Iterator[JournalEvent]:
-    """Yields whole records of frames whose events the damaged journal has lost, as events, applied.
+def _events_of_records(
+    folder: Path, names: list[str], ledger: Ledger, states: _States, broken: bool
+) -> Iterator[JournalEvent]:
+    """Yields and applies events for image records whose events the damaged journal has lost.
 
-    Only one whole record of a frame is accepted: of two it is not known which was acknowledged.
+    A frame with two or more complete records is not recovered, because it is unknown which one was acknowledged.
     """
     by_frame: defaultdict[int, list[str]] = defaultdict(list)
     for name in names:
@@ -218,7 +230,7 @@ def _found(folder: Path, names: list[str], ledger: Ledger, states: _States, brok
 
 
 def _events_of(folder: Path, index: int, names: list[str], ledger: Ledger, states: _States) -> list[JournalEvent]:
-    """Makes the events of one frame from its records."""
+    """Returns the events of one frame, reconstructed from its records."""
     pictures: dict[str, StoredPictures] = {}
     for name in names:
         with contextlib.suppress(FrameDamage):
@@ -226,11 +238,11 @@ def _events_of(folder: Path, index: int, names: list[str], ledger: Ledger, state
     whole = [name for name, events in pictures.items() if not events.part]
     parts = {name: events for name, events in pictures.items() if events.part}
     if len(names) == len(whole) == 1:
-        accepted = _whole(index, whole[0], pictures[whole[0]], ledger)
+        accepted = _frame_event(index, whole[0], pictures[whole[0]], ledger)
     elif index < ledger.next_frame:
-        accepted = _closed(index, parts, states.times.get(index))
+        accepted = _close_event(index, parts, states.times.get(index))
     else:
-        events = [_part(index, name, pictures) for name, pictures in parts.items()]
+        events = [_camera_event(index, name, pictures) for name, pictures in parts.items()]
         return [event for event in events if event is not None]
     if accepted is None:
         return []
@@ -240,8 +252,11 @@ def _events_of(folder: Path, index: int, names: list[str], ledger: Ledger, state
     return [accepted]
 
 
-def _unusable(folder: Path, files: tuple[str, ...], lost: list[str]) -> str | None:
-    """Says why a queued frame cannot be reconstructed, or None. The worker drops damaged ones of several records."""
+def _fault_of(folder: Path, files: tuple[str, ...], lost: list[str]) -> str | None:
+    """Returns the reason why a queued frame cannot be reconstructed, or None.
+
+    If the frame has several records, the worker itself drops damaged ones.
+    """
     if lost:
         return f"its record is gone from the frame log: {', '.join(lost)}"
     if len(files) == 1:
@@ -252,7 +267,7 @@ def _unusable(folder: Path, files: tuple[str, ...], lost: list[str]) -> str | No
     return None
 
 
-def _whole(index: int, name: str, pictures: StoredPictures, ledger: Ledger) -> FrameAccepted | None:
+def _frame_event(index: int, name: str, pictures: StoredPictures, ledger: Ledger) -> FrameAccepted | None:
     before = max(
         (time for i in range(min(index, ledger.next_frame)) if (time := ledger.frames[i].time) is not None),
         default=None,
@@ -263,8 +278,8 @@ def _whole(index: int, name: str, pictures: StoredPictures, ledger: Ledger) -> F
     return FrameAccepted(index=index, time=pictures.time, identity=identity, files=(name,), closed_by="found")
 
 
-def _closed(index: int, parts: Mapping[str, StoredPictures], time: float | None) -> FrameAccepted | None:
-    """Makes the event of a committed frame that its cameras sent one by one."""
+def _close_event(index: int, parts: Mapping[str, StoredPictures], time: float | None) -> FrameAccepted | None:
+    """Returns the event of a committed frame whose cameras uploaded separately."""
     hashes: Hashes = {}
     for pictures in parts.values():
         for camera, kinds in pictures.hashes.items():
@@ -276,18 +291,18 @@ def _closed(index: int, parts: Mapping[str, StoredPictures], time: float | None)
     return FrameAccepted(index=index, time=time, identity=frame_identity(hashes, time), files=files, closed_by="found")
 
 
-def _part(index: int, name: str, pictures: StoredPictures) -> PartAccepted | None:
+def _camera_event(index: int, name: str, pictures: StoredPictures) -> CameraAccepted | None:
     if len(pictures.hashes) != 1:
         return None
     ((camera, kinds),) = pictures.hashes.items()
-    return PartAccepted(index=index, time=pictures.time, camera=camera, file=name, hashes=kinds)
+    return CameraAccepted(index=index, time=pictures.time, camera=camera, file=name, hashes=kinds)
 
 
 def _states(folder: Path, damage: list[str]) -> _States:
-    """Reads the committed states of the folder; what is wrong with them is added to `damage`."""
+    """Reads the committed states of the folder and appends their faults to `damage`."""
     try:
         history = History.load(folder)
-    except OtherFormatError as error:  # not damage: the folder stays as it is
+    except OtherFormatError as error:  # not damage: leave the folder unchanged
         raise DefinitionError(str(error)) from None
     except HistoryError as error:
         if folder.exists() and FrameFiles(folder).list_stamps():
@@ -297,7 +312,7 @@ def _states(folder: Path, damage: list[str]) -> _States:
     damage.extend(history.damaged_chunks)
     newest: dict[str, Any] = {}
     if history.indices:
-        with contextlib.suppress(HistoryError):  # the worker loads the state, or says why it cannot
+        with contextlib.suppress(HistoryError):  # the worker loads the state or reports why it cannot
             newest = history.report(history.indices[-1])
     times = dict(zip(history.indices, history.times.tolist(), strict=True))
     return _States(times, dict(history.damaged), newest, history.first_report)

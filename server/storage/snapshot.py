@@ -1,4 +1,4 @@
-"""Makes events from a ledger: a damaged or deleted journal is written anew with them."""
+"""Conversion of a ledger to events, from which a damaged or deleted journal is rewritten."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from collections.abc import Iterator
 from client.wire import Budget, FrameState
 from server.storage.events import (
     BudgetChanged,
+    CameraAccepted,
     FrameAccepted,
     FrameFailed,
     FrameMissing,
     FramesSkipped,
     JournalEvent,
     OpenFrame,
-    PartAccepted,
     PauseChanged,
     PicturesDeleted,
     SceneEdited,
@@ -24,18 +24,20 @@ from server.storage.events import (
 from server.storage.frame_table import FrameEntry
 from server.storage.ledger import Ledger
 
-TOGETHER = 10_000
-"""An event names at most so many frames: the head of a record is bounded."""
+FRAMES_PER_EVENT = 10_000
+"""Maximum number of frames per event, because the head of a record has a limited size."""
 OWN_ERROR = (FrameState.FAILED, FrameState.MISSING)
-"""The error noted of a frame in such a state explains the state; of another frame, why its committed state is gone."""
-BEFORE = "before the journal was written anew"
+"""States for which a frame's error explains the state itself.
+
+In other states, the error explains why the committed state no longer exists.
+"""
+BEFORE_FIRST = "before the journal was written anew"
 
 
 def events_of(ledger: Ledger) -> Iterator[JournalEvent]:
-    """Yields events in an order that gives an equal ledger, but for the states on disk (`Ledger.reconcile`).
+    """Yields events that reproduce the ledger, except for the committed states on disk (`Ledger.reconcile`).
 
-    A frame that is committed or at work is queued in it. The ways that frames were closed, and the reasons of deaths,
-    are not kept.
+    Committed and updating frames become queued ones. The reasons why frames were closed and why workers died are lost.
     """
     if ledger.begun is not None:
         yield ledger.begun
@@ -51,13 +53,13 @@ def events_of(ledger: Ledger) -> Iterator[JournalEvent]:
             else:
                 deleted.append(index)
         if not entry.files and (entry.identity is not None or index == count - 1):
-            bare.append(index)  # of the last one, that it is there
-    for first in range(0, len(deleted), TOGETHER):
-        yield StatesDeleted(frames=tuple(deleted[first : first + TOGETHER]))
-    for first in range(0, len(bare), TOGETHER):
-        yield PicturesDeleted(frames=tuple(bare[first : first + TOGETHER]))
+            bare.append(index)  # the last frame always needs an event, so that it exists
+    for first in range(0, len(deleted), FRAMES_PER_EVENT):
+        yield StatesDeleted(frames=tuple(deleted[first : first + FRAMES_PER_EVENT]))
+    for first in range(0, len(bare), FRAMES_PER_EVENT):
+        yield PicturesDeleted(frames=tuple(bare[first : first + FRAMES_PER_EVENT]))
     for frame in ledger.open.values():
-        yield from _parts(frame)
+        yield from _camera_events(frame)
     for first, budget in ledger.budgets:
         if (first, budget) != (0, Budget()):
             yield BudgetChanged(index=first, budget=budget)
@@ -71,12 +73,12 @@ def _of_frame(entry: FrameEntry, *, fatal: bool) -> Iterator[JournalEvent]:
     index, note, receipt = entry.index, entry.note, entry.receipt
     if receipt is not None:
         if note.parts is not None:
-            yield from _parts(note.parts)
+            yield from _camera_events(note.parts)
         yield FrameAccepted(index=index, time=receipt.time, identity=receipt.identity, files=entry.files)
     elif entry.state == FrameState.COMMITTED or entry.time is not None:
         yield StateFound(index=index, time=entry.time)
     for own in [True] * note.own_deaths + [False] * note.other_deaths:
-        yield WorkerDied(index=index, reason=BEFORE, own=own)
+        yield WorkerDied(index=index, reason=BEFORE_FIRST, own=own)
     match entry.state:
         case FrameState.FAILED if note.error is not None:
             yield FrameFailed(index=index, reason=note.error, dropped=note.dropped, fatal=fatal)
@@ -88,10 +90,10 @@ def _of_frame(entry: FrameEntry, *, fatal: bool) -> Iterator[JournalEvent]:
             pass
 
 
-def _parts(frame: OpenFrame) -> Iterator[PartAccepted]:
-    """Yields an event a file; a camera may have sent several, and their order is not kept."""
+def _camera_events(frame: OpenFrame) -> Iterator[CameraAccepted]:
+    """Yields one event per file; the assignment of files to a camera with several files may change."""
     cameras = list(frame.hashes)
     for place, file in enumerate(frame.files):
         camera = cameras[min(place, len(cameras) - 1)]
         hashes = frame.hashes[camera] if place < len(cameras) else {}
-        yield PartAccepted(index=frame.index, time=frame.time, camera=camera, file=file, hashes=hashes)
+        yield CameraAccepted(index=frame.index, time=frame.time, camera=camera, file=file, hashes=hashes)

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from client.wire import RenderRequest, TracksRequest
 from client.wire.base import Model
-from client.wire.stream import BulkHead, PartsSubscription, StreamProblem, pack
+from client.wire.stream import BinaryHead, PartsSubscription, StreamProblem, pack
 from server.problems import SERVICE_FAULT, Problem
 from server.processes.queries import PartsQuery, Query, RenderQuery, TracksQuery
 from server.processes.shared_queries import SharedQueries, fingerprint
@@ -28,7 +28,7 @@ log = logging.getLogger("scas4d.server")
 
 
 @dataclass(frozen=True)
-class LiveQuestion:
+class LiveSharedQuery:
     """A query of a subscription at one moment.
 
     Attributes:
@@ -39,7 +39,7 @@ class LiveQuestion:
 
     key: Hashable
     query: Query
-    head: BulkHead
+    head: BinaryHead
     changes: int
 
 
@@ -62,7 +62,7 @@ class LiveQuery(ABC):
         self._changed = asyncio.Event()
         self._sent: Hashable = None
 
-    def ask_for(self, request: Model, tag: int | None) -> None:
+    def set_request(self, request: Model, tag: int | None) -> None:
         """Changes the request from now on."""
         self.request = request
         self.tag = tag
@@ -104,25 +104,25 @@ class LiveQuery(ABC):
                 missed=asked.changes - 1,
             )
             self._sent = (asked.key, head.tag)
-            self.answered(head)
+            self.on_sent(head)
         self._changes -= asked.changes
 
-    def _ask(self) -> LiveQuestion:
+    def _ask(self) -> LiveSharedQuery:
         query = self.query()
         # Parts are found from the whole history: the same query has another answer after a commit.
-        newest = self.scene.committed[-1] if self.of_all_history(query) else None
+        newest = self.scene.committed[-1] if self.needs_all_frames(query) else None
         head = self.head(query).model_copy(update={"id": self.id, "tag": self.tag})
-        return LiveQuestion((fingerprint(query), newest), query, head, self._changes)
+        return LiveSharedQuery((fingerprint(query), newest), query, head, self._changes)
 
     def due(self) -> bool:
         """Returns True if there is something to ask for now."""
         return True
 
-    def of_all_history(self, query: Query) -> bool:
+    def needs_all_frames(self, query: Query) -> bool:
         """Returns True if the answer depends on every committed frame."""
         return False
 
-    def answered(self, head: BulkHead) -> None:
+    def on_sent(self, head: BinaryHead) -> None:
         """Notes that the message with this head is on its way."""
         return
 
@@ -131,7 +131,7 @@ class LiveQuery(ABC):
         """Returns the query to ask now; raises `Problem` if the request cannot be asked."""
 
     @abstractmethod
-    def head(self, query: Query) -> BulkHead:
+    def head(self, query: Query) -> BinaryHead:
         """Returns the head of the message that answers the query."""
 
 
@@ -144,12 +144,12 @@ class LiveRender(LiveQuery):
         """Returns the view as the reader takes it."""
         return render_query(self.scene, self.request)
 
-    def head(self, query: Query) -> BulkHead:
+    def head(self, query: Query) -> BinaryHead:
         """Names the frame."""
         assert isinstance(query, RenderQuery)
         return _head("render", query.frame)
 
-    def of_all_history(self, query: Query) -> bool:
+    def needs_all_frames(self, query: Query) -> bool:
         """Returns True for parts."""
         return isinstance(query, RenderQuery) and "parts" in query.kinds
 
@@ -161,10 +161,10 @@ class LiveTracks(LiveQuery):
     _from: int | None = None
     _at: int | None = None
 
-    def ask_for(self, request: Model, tag: int | None) -> None:
+    def set_request(self, request: Model, tag: int | None) -> None:
         """Changes the request; its trajectories are sent from their beginning."""
         self._from = self._at = None
-        super().ask_for(request, tag)
+        super().set_request(request, tag)
 
     def due(self) -> bool:
         """Returns True if frames within those asked for were not sent."""
@@ -178,12 +178,12 @@ class LiveTracks(LiveQuery):
             self._at = self.scene.committed[0] if self.request.at is None else self.request.at
         return tracks_query(self.scene, self.request.model_copy(update={"first": first, "at": self._at}))
 
-    def head(self, query: Query) -> BulkHead:
+    def head(self, query: Query) -> BinaryHead:
         """Names the frames."""
         assert isinstance(query, TracksQuery)
         return _head("tracks", query.frames[-1]).model_copy(update={"first": query.frames[0]})
 
-    def answered(self, head: BulkHead) -> None:
+    def on_sent(self, head: BinaryHead) -> None:
         """Goes on after the last frame sent."""
         self._from = head.frame + 1
 
@@ -194,10 +194,10 @@ class LiveParts(LiveQuery):
     request: PartsSubscription
     _next: int | None = None
 
-    def ask_for(self, request: Model, tag: int | None) -> None:
+    def set_request(self, request: Model, tag: int | None) -> None:
         """Changes the request, which is answered at once."""
         self._next = None
-        super().ask_for(request, tag)
+        super().set_request(request, tag)
 
     def due(self) -> bool:
         """Returns True if enough frames came since the last message."""
@@ -207,18 +207,18 @@ class LiveParts(LiveQuery):
         """Returns the number of parts as the reader takes it."""
         return PartsQuery(self.request.count)
 
-    def head(self, query: Query) -> BulkHead:
+    def head(self, query: Query) -> BinaryHead:
         """Names the newest frame."""
         return _head("parts", self.scene.committed[-1])
 
-    def of_all_history(self, query: Query) -> bool:
+    def needs_all_frames(self, query: Query) -> bool:
         """Returns True: parts are found from all frames."""
         return True
 
-    def answered(self, head: BulkHead) -> None:
+    def on_sent(self, head: BinaryHead) -> None:
         """Waits for more frames before the next message."""
         self._next = head.frame + self.request.every
 
 
-def _head(kind: Literal["render", "tracks", "parts"], frame: int) -> BulkHead:
-    return BulkHead(type=kind, id="-", missed=0, frame=frame, media_type="")
+def _head(kind: Literal["render", "tracks", "parts"], frame: int) -> BinaryHead:
+    return BinaryHead(type=kind, id="-", missed=0, frame=frame, media_type="")

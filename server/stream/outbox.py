@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from client.wire.base import Model
 from server.counters import STREAM_MISSED
 
-UNSENT_REPLIES = 64
+MAX_UNSENT_REPLIES = 64
 """A client that sends without reading is not listened to until it has read down to so many replies."""
 
 Make = Callable[[int], str | bytes]
@@ -38,7 +38,7 @@ class Outbox:
     async def reply(self, message: Model) -> None:
         """Adds what must arrive; waits while too much of that is unsent."""
         async with self._news:
-            await self._news.wait_for(lambda: len(self._replies) < UNSENT_REPLIES)
+            await self._news.wait_for(lambda: len(self._replies) < MAX_UNSENT_REPLIES)
         self._reply(message)
 
     def close_with(self, message: Model | None) -> None:
@@ -76,7 +76,7 @@ class Outbox:
         async with self._news:
             await self._news.wait_for(lambda: id not in self._slots and self._sending != id)
 
-    async def empty_into(self, send: Callable[[str | bytes], Awaitable[None]]) -> None:
+    async def send_all(self, send: Callable[[str | bytes], Awaitable[None]]) -> None:
         """Sends until the last message is out, one after the other, replies first.
 
         Args:

@@ -30,7 +30,7 @@ from client.wire.stream import (
 )
 from server.http import validation
 from server.hub import Channel, Event, FrameFinished
-from server.problems import Problem, counted
+from server.problems import Problem, count_noun
 from server.queries.render import MOST_PIXELS
 from server.queries.tracks import MOST_POINTS
 from server.scene.scene import Scene
@@ -39,12 +39,12 @@ from server.stream.outbox import Outbox
 
 T = TypeVar("T")
 
-MOST_SUBSCRIPTIONS = 16
+MAX_SUBSCRIPTIONS = 16
 """Subscriptions of one subscriber: enough for a page with views of some cameras. A second stream takes more."""
 MESSAGE_KB = 256
 """Largest message of a subscriber: some 8000 pixels to track."""
 
-WHERE = "docs/stream.md lists the messages"
+FIELD_PREFIX = "docs/stream.md lists the messages"
 
 LIVE: dict[Topic, type[LiveQuery]] = {Topic.RENDER: LiveRender, Topic.TRACKS: LiveTracks, Topic.PARTS: LiveParts}
 
@@ -67,7 +67,7 @@ class Subscriber:
     def limits(self) -> StreamLimits:
         """Returns the limits that the client is sent."""
         return StreamLimits(
-            subscriptions=MOST_SUBSCRIPTIONS,
+            subscriptions=MAX_SUBSCRIPTIONS,
             message_bytes=MESSAGE_KB * 1000,
             render_pixels=MOST_PIXELS,
             track_points=MOST_POINTS,
@@ -77,14 +77,14 @@ class Subscriber:
         """Sends the first message."""
         await self.outbox.reply(Hello(protocol=STREAM_PROTOCOL, scene=self.scene.id, limits=self.limits()))
 
-    async def take(self, text: str | None) -> None:
+    async def handle_message(self, text: str | None) -> None:
         """Takes a message of the client, None for a binary one; a wrong one is answered and changes nothing."""
         id: str | None = None
         tag: int | None = None
         try:
             if text is None:
                 raise Problem(422, "a binary message", field="message", remedy="send JSON in text messages")
-            message = _valid(CLIENT_MESSAGE.validate_json, text)
+            message = _validate(CLIENT_MESSAGE.validate_json, text)
             id = message.id
             if isinstance(message, Unsubscribe):
                 self._known(id)
@@ -139,13 +139,13 @@ class Subscriber:
 
     def _begin(self, message: Subscribe) -> Model:
         wanted = REQUESTS[message.topic]
-        request = _valid(wanted.model_validate, message.request, "request", wanted)
-        if message.id not in self._topics and len(self._topics) >= MOST_SUBSCRIPTIONS:
+        request = _validate(wanted.model_validate, message.request, "request", wanted)
+        if message.id not in self._topics and len(self._topics) >= MAX_SUBSCRIPTIONS:
             raise Problem(
                 429,
-                f"{counted(len(self._topics), 'subscription')} open already, and no more are taken",
+                f"{count_noun(len(self._topics), 'subscription')} open already, and no more are taken",
                 field="subscriptions",
-                value=MOST_SUBSCRIPTIONS,
+                value=MAX_SUBSCRIPTIONS,
                 remedy="unsubscribe from another one, or open a second stream",
             )
         return request
@@ -161,7 +161,7 @@ class Subscriber:
                 self._put_report(message.id, FrameFinished(newest))
         else:
             live = LIVE[message.topic](message.id, self.scene, self._channel.queries, self.outbox)
-            live.ask_for(request, message.tag)
+            live.set_request(request, message.tag)
             self._live[message.id] = (live, asyncio.create_task(live.run()))
 
     def _update(self, message: Update) -> None:
@@ -176,7 +176,7 @@ class Subscriber:
             )
         live, _ = self._live[message.id]
         changed = live.request.model_dump() | message.request
-        live.ask_for(_valid(REQUESTS[topic].model_validate, changed, "request", REQUESTS[topic]), message.tag)
+        live.set_request(_validate(REQUESTS[topic].model_validate, changed, "request", REQUESTS[topic]), message.tag)
 
     def _end(self, id: str) -> None:
         self._topics.pop(id, None)
@@ -200,10 +200,14 @@ def _text(kind: str, id: str, missed: int, name: str, value: str) -> str:
     return f'{{"type":"{kind}","id":{json.dumps(id)},"missed":{missed},"{name}":{value}}}'
 
 
-def _valid(validate: Callable[[Any], T], given: Any, within: str = "", model: object = None) -> T:
+def _validate(validate: Callable[[Any], T], given: Any, within: str = "", model: object = None) -> T:
     try:
         return validate(given)
     except ValidationError as error:
-        raise validation.invalid(
-            error.errors()[0], model=model, prefix=within, text=given if isinstance(given, str) else None, schema=WHERE
+        raise validation.validation_problem(
+            error.errors()[0],
+            model=model,
+            prefix=within,
+            text=given if isinstance(given, str) else None,
+            schema=FIELD_PREFIX,
         ) from None

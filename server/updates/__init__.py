@@ -1,1 +1,1 @@
-"""The updates of a scene: gives frames to the worker process and records their outcome."""
+"""Scene updates: sends frames to the worker process and records their outcome."""

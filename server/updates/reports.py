@@ -1,4 +1,4 @@
-"""Reports of a scene's frames; those that are not in memory are read from disk."""
+"""Frame reports of a scene; commit records that are not in memory are read from disk."""
 
 from __future__ import annotations
 
@@ -13,19 +13,23 @@ from scas4d_core.storage.history import History, HistoryError
 from server.storage.ledger import Ledger
 
 
-def of_first_report(record: Mapping[str, Any]) -> dict[str, Any]:
-    """Returns what of the first frame's report matters later: its cloud and calibration; empty of another frame's."""
+def first_frame_facts(record: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the parts of the first frame's commit record that later status reports need.
+
+    These are mainly its cloud and calibration. The result is empty for the record of any other frame.
+    """
     if not (record.get("cloud") or record.get("calibration")):
         return {}
     return {name: record.get(name) for name in ("cloud", "calibration", "shortened", "grey")}
 
 
 class FrameReports:
-    """Reports of a scene's frames; records of commits that are not in memory are read from disk.
+    """Frame reports of one scene; commit records that are not in memory are read from disk.
 
     Args:
-        ledger: of the scene. states: folder of its committed states.
-        damaged: called with files that could not be read, by name with the reason.
+        ledger: ledger of the scene.
+        states: folder of its committed states.
+        damaged: called with unreadable files, as a mapping from name to reason.
     """
 
     def __init__(self, ledger: Ledger, states: Path, damaged: Callable[[Mapping[str, str]], None]) -> None:
@@ -36,7 +40,7 @@ class FrameReports:
         self._turn = threading.Lock()
 
     async def of(self, index: int) -> FrameReportModel | None:
-        """Returns the report of a frame; None where the frame is not known."""
+        """Returns the report of a frame, or None if the frame is unknown."""
         entry = self._ledger.frames.get(index)
         if entry is None:
             parts = self._ledger.open.get(index)
@@ -55,19 +59,19 @@ class FrameReports:
         record = await asyncio.to_thread(self._read, index)
         if damaged := await asyncio.to_thread(self._take_faults):
             self._damaged(damaged)
-        self._ledger.frames.remember(index, record)
+        self._ledger.frames.cache_record(index, record)
         return entry.report_with(record)
 
     async def is_committed(self, index: int) -> bool:
-        """Returns whether a readable state of the frame is on disk, whatever the ledger says."""
+        """Returns whether a readable state of the frame is on disk, regardless of the ledger."""
         return bool(await self.record(index))
 
     async def record(self, index: int) -> Mapping[str, Any]:
-        """Reads the record of a commit from disk; empty where its state is deleted or damaged."""
+        """Reads a commit record from disk; returns an empty mapping if the state is deleted or damaged."""
         return await asyncio.to_thread(self._read, index)
 
     def _read(self, index: int) -> dict[str, Any]:
-        """Reads the record of a commit; empty where its state is deleted or damaged."""
+        """Reads a commit record in the current thread; see `record`."""
         with self._turn:
             try:
                 if self._history is None:

@@ -1,4 +1,4 @@
-"""Why a scene is degraded: a sentence about its last frame, its worker or the disk."""
+"""Reason why a scene is degraded: a message about its last frame, its worker or the disk."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from server.storage.ledger import Ledger
 
 
 class Trouble:
-    """Keeps the sentence that says why a scene is degraded.
+    """Holder of the message that explains why a scene is degraded.
 
     Attributes:
-        sentence: None where the scene is not degraded. Who sets it publishes the change.
+        sentence: the message, or None if the scene is not degraded. Code that sets it must publish the change.
     """
 
     def __init__(self, publisher: Publisher, sentence: str | None) -> None:
@@ -19,13 +19,13 @@ class Trouble:
         self.sentence = sentence
 
     def report(self, sentence: str) -> None:
-        """Sets the sentence and publishes the change."""
+        """Sets the message and publishes the change."""
         self.sentence = sentence
-        self._publisher.changed()
+        self._publisher.publish_status()
 
 
-def trouble_of(report: FrameReportModel) -> str | None:
-    """Says why a scene is degraded whose newest finished frame has this report; None: it is not."""
+def trouble_in_report(report: FrameReportModel) -> str | None:
+    """Returns why a scene is degraded, given the report of its newest finished frame, or None if it is not."""
     if report.state == FrameState.FAILED:
         return f"frame {report.index} failed: {report.error}"
     if report.outcome is not None and report.outcome.degraded:
@@ -38,6 +38,6 @@ def trouble_of(report: FrameReportModel) -> str | None:
 
 
 def last_trouble(ledger: Ledger) -> str | None:
-    """Says what went wrong with the newest frame that was tried, or None."""
+    """Returns the problem with the newest committed or failed frame, or None."""
     last = ledger.last_tried()
-    return None if last is None else trouble_of(ledger.frames[last].report)
+    return None if last is None else trouble_in_report(ledger.frames[last].report)

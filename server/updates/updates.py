@@ -1,4 +1,4 @@
-"""Gives queued frames to the scene's worker, one at a time, and records what becomes of each. On the event loop."""
+"""Scheduling of a scene's updates: sends queued frames to the worker one at a time and records each outcome."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from server import counters
 from server.background import Background
 from server.hub import Publisher
 from server.messages import (
-    Broken,
+    ChangeRetention,
     FrameCommitted,
+    FrameFailedInWorker,
     FrameReady,
-    KeepStates,
     Progressed,
     Ready,
     RepairResult,
-    Stalled,
+    ResumeFailed,
     StatesRetained,
-    UpdateFailed,
+    WaitingForDisk,
     WaitsForNode,
 )
 from server.processes.kernels import STAGE
@@ -32,30 +32,39 @@ from server.processes.readers import Readers
 from server.repair.repair_queue import DamageKind, DamageLog, RepairQueue
 from server.storage.events import FrameFailed, PicturesDeleted, StatesDeleted, WorkerDied
 from server.storage.ledger import SceneLog
-from server.updates.reports import FrameReports, of_first_report
-from server.updates.trouble import Trouble, last_trouble, trouble_of
+from server.updates.reports import FrameReports, first_frame_facts
+from server.updates.trouble import Trouble, last_trouble, trouble_in_report
 from server.updates.work_clock import WorkClock
-from server.updates.worker_process import WorkerProcess, given_up
+from server.updates.worker_process import WorkerProcess, give_up_event
 
 log = logging.getLogger("scas4d.server")
 
 
 class Updates:
-    """The updates of one scene, and the worker that runs them.
+    """Updates of one scene and the worker that runs them. All methods run on the event loop.
 
-    A frame that was acknowledged waits in the ledger. `begin` sends it to the worker as `FrameReady`. The worker
-    answers with `FrameCommitted` or `UpdateFailed`, or it dies.
-    `_commit`, `_record_failure` and `_after_death` record that.
+    An acknowledged frame waits in the ledger until `begin` sends it to the worker as `FrameReady`. The worker answers
+    with `FrameCommitted` or `FrameFailedInWorker`, or it dies. `_commit`, `_record_failure` and `_retry_or_fail` record
+    the outcome.
 
     Args:
-        scene_log, damage, worker, mending, readers, reports, trouble, publisher, background: of the scene.
-        keep_frames: rule of retention for pictures.
-        first: see below.
+        scene_log: journal, ledger and frame log of the scene.
+        damage: damage messages of the scene.
+        worker: supervisor of the worker process.
+        mending: repair queue of the scene.
+        readers: reader processes of the scene.
+        reports: frame reports of the scene.
+        trouble: reason why the scene is degraded.
+        publisher: publisher of the scene's events.
+        background: background tasks of the scene.
+        keep_frames: retention rule for images.
+        first: initial value of the attribute.
 
     Attributes:
-        clock: predicts the end of the frame at work. worker: its process.
-        progress: of frame 0, while it is at work.
-        first: what of the first frame's report matters later: its cloud and its calibration.
+        clock: predictor for the end of the current update.
+        worker: supervisor of the worker process.
+        progress: progress of frame 0 during its reconstruction, otherwise None.
+        first: parts of the first frame's report needed later, such as its cloud and calibration.
     """
 
     def __init__(
@@ -89,29 +98,29 @@ class Updates:
         self.progress: ProgressModel | None = None
         self.first = first
         self._index: int | None = None
-        self._holding = 0
+        self._pauses = 0
         self._stopped = False
         self._rule: IngestSettings | None = None
-        """The retention rule of states that the worker has not confirmed yet."""
+        """Retention rule for states that the worker has not confirmed yet."""
         self._rule_sent = False
         self._repair_timer: asyncio.TimerHandle | None = None
-        """Begins again where mending waits for room on the disk."""
-        worker.listen(self._from_worker, self._worker_ended)
+        """Timer that calls `begin` again when a repair is waiting for disk space."""
+        worker.listen(self._on_message, self._on_worker_end)
 
-    def when_room_is_made(self, call: Callable[[], Awaitable[None]]) -> None:
-        """Sets the coroutine function that closes open frames once a frame is over and the queue has room."""
+    def on_queue_room(self, call: Callable[[], Awaitable[None]]) -> None:
+        """Sets the coroutine function that closes open frames after an update has freed space in the queue."""
         self._room_made = call
 
     @property
     def at_work(self) -> bool:
-        """True while the worker has a frame."""
+        """Whether the worker is processing a frame."""
         return self._index is not None and self.worker.ready
 
     @property
     def has_work(self) -> bool:
-        """True while a frame is at work or waits, or something is mended or will be."""
-        mending = self._repair_queue.at_work is not None or self._repair_queue.trouble is not None
-        waits = bool(self._holding or self._waiting()) or self._rule is not None or self.worker.starts_again
+        """Whether a frame is being updated or waiting, or a repair is running or pending."""
+        mending = self._repair_queue.at_work is not None or self._repair_queue.current_repair is not None
+        waits = bool(self._pauses or self._waiting()) or self._rule is not None or self.worker.starts_again
         return self._index is not None or waits or mending
 
     def _waiting(self) -> list[int]:
@@ -119,20 +128,20 @@ class Updates:
         return [] if ledger.paused or ledger.fatal is not None else ledger.waiting()
 
     def begin(self) -> None:
-        """Gives the worker its next frame, if it is idle and one waits; to be called whenever that may have changed."""
+        """Sends the next waiting frame to an idle worker; call this whenever either condition may have changed."""
         if self._stopped:
             return
-        self._publisher.changed()
+        self._publisher.publish_status()
         ledger = self._ledger
-        if self._index is not None or self._holding or self._repair_queue.at_work is not None:
+        if self._index is not None or self._pauses or self._repair_queue.at_work is not None:
             return
         waiting = self._waiting()
         if not self.worker.ready:
-            if waiting or self._repair_queue.trouble is not None or self._rule is not None:
+            if waiting or self._repair_queue.current_repair is not None or self._rule is not None:
                 self.worker.start()
             return
         if self._rule is not None and not self._rule_sent:
-            self._rule_sent = self.worker.send(KeepStates(self._rule))
+            self._rule_sent = self.worker.send(ChangeRetention(self._rule))
         if not waiting:
             if self._repair_queue.waiting and (seconds := self._repair_queue.begin()) > 0:
                 self._begin_in(seconds)
@@ -141,11 +150,11 @@ class Updates:
         entry = ledger.frames[index]
         receipt = entry.receipt
         assert receipt is not None
-        ledger.move(index, FrameState.UPDATING)
+        ledger.set_state(index, FrameState.UPDATING)
         self._index = index
         self.clock.begin(first=not ledger.committed)
         self.worker.send(FrameReady(index, receipt.time, entry.files, receipt.identity, ledger.budget_of(index)))
-        self._publisher.changed()
+        self._publisher.publish_status()
 
     def _begin_in(self, seconds: float) -> None:
         if self._repair_timer is not None:
@@ -154,31 +163,31 @@ class Updates:
 
     @contextmanager
     def paused(self) -> Iterator[None]:
-        """Gives the worker no frame inside; the one at work goes on."""
-        self._holding += 1
+        """Context manager that sends no new frame to the worker; the current update continues."""
+        self._pauses += 1
         try:
             yield
         finally:
-            self._holding -= 1
+            self._pauses -= 1
             self.begin()
 
-    # Messages of the worker.
+    # Messages from the worker.
 
-    def _from_worker(self, message: Any) -> None:
+    def _on_message(self, message: Any) -> None:
         match message:
             case Ready():
                 self._background.run(self._resume(message, self.worker.life))
             case Progressed():
-                over = message.stage == STAGE and message.done == message.total  # an update reports no other stage
+                over = message.stage == STAGE and message.done == message.total  # an update reports only this stage
                 self.progress = None if over else ProgressModel(**vars(message))
                 self.clock.progress(message.stage, message.done, message.total, message.detail.get("seconds_left"))
-                self._publisher.changed()
+                self._publisher.publish_status()
             case FrameCommitted():
                 self._background.run(self._commit(message))
             case StatesRetained():
                 self._rule = None
-                self._background.run(self._states_deleted(message.deleted))
-            case UpdateFailed():
+                self._background.run(self._on_states_deleted(message.deleted))
+            case FrameFailedInWorker():
                 event = FrameFailed(
                     index=message.index, reason=message.reason, dropped=message.dropped, fatal=message.fatal
                 )
@@ -188,54 +197,54 @@ class Updates:
                 if frames:
                     self._readers.refresh(frames)
                 self.begin()
-                if not self.first:  # it could not be read before
-                    self._background.run(self._recall())
-            case Stalled():
+                if not self.first:  # the first report may be readable now
+                    self._background.run(self._reread_first_report())
+            case WaitingForDisk():
                 self.clock.stall(message.seconds)
                 self._trouble.report(f"frame {message.index} waits for room on the disk: {message.reason}")
             case WaitsForNode():
                 self._trouble.report(message.reason)
-            case Broken():
+            case ResumeFailed():
                 self._ledger.fatal = f"what is committed cannot be gone on from: {message.reason}"
                 log.error("scene %s: %s", self._ledger.scene, self._ledger.fatal)
-                self._publisher.changed()
+                self._publisher.publish_status()
 
     async def _resume(self, ready: Ready, life: object) -> None:
-        """Brings the ledger in line with the committed states that a new worker has loaded, and goes on."""
+        """Reconciles the ledger with the committed states that a new worker has loaded, and continues."""
         ledger = self._ledger
         newest = ledger.committed[-1] if ledger.committed else -1
         again = self._repair_queue.waiting.keys() | {i for i in ready.damaged if i < max(ready.indices, default=-1)}
         events = ledger.reconcile(ready.indices, ready.damaged, again)
         for fault in ready.faults:
             log.warning("scene %s: %s", ledger.scene, fault)
-            self._damage.say(DamageKind.STATE, fault)
+            self._damage.add(DamageKind.STATE, fault)
         if events:
             await self._log.write(*events)
         if ready.indices and ready.report:
             self._record(ready.indices[-1], ready.report)
             self._readers.refresh()
-            if ready.indices[-1] > newest:  # committed by a worker that died before it could say so
-                self._publisher.finished(ledger.frames[ready.indices[-1]].report)
-        if life is None or life is not self.worker.life:  # it died meanwhile
+            if ready.indices[-1] > newest:  # committed by a worker that died before it could report it
+                self._publisher.publish_frame(ledger.frames[ready.indices[-1]].report)
+        if life is None or life is not self.worker.life:  # the worker died in the meantime
             return
         self._trouble.sentence = last_trouble(self._ledger)
         self.worker.ready = True
-        self._repair_queue.taken_up(ready.damaged)
+        self._repair_queue.resume(ready.damaged)
         self.begin()
-        self._background.run(self.worker.sweep(), endless=True)
+        self._background.run(self.worker.remove_earlier_epochs(), endless=True)
 
     async def _commit(self, message: FrameCommitted) -> None:
-        self.worker.deaths.committed()
+        self.worker.deaths.note_commit()
         self.clock.end(committed=True)
         self._index, self.progress = None, None
-        self._ledger.move(message.index, FrameState.COMMITTED)
+        self._ledger.set_state(message.index, FrameState.COMMITTED)
         self._record(message.index, message.report)
         report = self._ledger.frames[message.index].report
-        self._trouble.sentence = trouble_of(report)
+        self._trouble.sentence = trouble_in_report(report)
         self._readers.refresh((message.index,))
-        self._publisher.finished(report)
+        self._publisher.publish_frame(report)
         self.begin()
-        await self._states_deleted(message.deleted)
+        await self._on_states_deleted(message.deleted)
         await self.retain()
         await self._make_room()
 
@@ -243,13 +252,13 @@ class Updates:
         if self._ledger.open and self._room_made is not None:
             await self._room_made()
 
-    async def _states_deleted(self, frames: tuple[int, ...]) -> None:
+    async def _on_states_deleted(self, frames: tuple[int, ...]) -> None:
         if frames:
-            self._repair_queue.retired(frames)
+            self._repair_queue.forget_states(frames)
             self._readers.refresh(frames)
             deleted = StatesDeleted(frames=frames)
             self._ledger.apply(deleted)
-            self._publisher.changed()
+            self._publisher.publish_status()
             await self._log.write(deleted)
 
     async def _record_failure(self, event: FrameFailed) -> None:
@@ -257,85 +266,85 @@ class Updates:
         self._ledger.apply(event)
         self.clock.end(committed=False)
         self._index, self.progress = None, None
-        self._trouble.sentence = trouble_of(self._ledger.frames[event.index].report)
+        self._trouble.sentence = trouble_in_report(self._ledger.frames[event.index].report)
         if event.fatal:
-            async with self._log.lock:  # a frame that is just being acknowledged waits like the others
+            async with self._log.lock:  # include a frame that is just being acknowledged
                 pass
             await self._fail_waiting()
         log.warning("scene %s: %s", self._ledger.scene, self._trouble.sentence)
-        self._publisher.finished(self._ledger.frames[event.index].report)
+        self._publisher.publish_frame(self._ledger.frames[event.index].report)
         self.begin()
         await self._make_room()
 
     async def _fail_waiting(self) -> None:
-        events = self._ledger.hopeless()
+        events = self._ledger.events_without_first_frame()
         if events:
             await self._log.write(*events)
         for event in events:
             self._ledger.apply(event)
-            self._publisher.finished(self._ledger.frames[event.index].report)
+            self._publisher.publish_frame(self._ledger.frames[event.index].report)
 
     def _record(self, index: int, record: Mapping[str, Any]) -> None:
         self._ledger.frames.set_record(index, record)
-        self.first = of_first_report(record) or self.first
+        self.first = first_frame_facts(record) or self.first
 
-    async def _recall(self) -> None:
-        """Reads the report of the first frame, which could not be read before."""
+    async def _reread_first_report(self) -> None:
+        """Rereads the first frame's report, which was unreadable before."""
         if self._ledger.committed:
-            self.first = of_first_report(await self._reports.record(self._ledger.committed[0])) or self.first
+            self.first = first_frame_facts(await self._reports.record(self._ledger.committed[0])) or self.first
 
     async def retain(self) -> None:
-        """Deletes pictures from the frame log by the scene's rule, except those needed to make states again."""
+        """Deletes images under the scene's retention rule, except those needed to recompute states."""
         gone = [i for i in self._log.deletable(self._keep_frames) if i not in self._repair_queue.waiting]
         if not gone:
             return
         names = [name for index in gone for name in self._ledger.frames[index].files]
         event = PicturesDeleted(frames=tuple(gone))
         self._ledger.apply(event)
-        self._publisher.changed()
+        self._publisher.publish_status()
         await self._log.delete_pictures(names)
         await self._log.write(event)
 
-    async def keep(self, rules: IngestSettings) -> None:
-        """Keeps so much from now on, and deletes what is beyond it."""
-        before = self.worker.spec.kept
+    async def set_retention(self, rules: IngestSettings) -> None:
+        """Applies new retention rules and deletes everything beyond them."""
+        before = self.worker.spec.retention
         if (rules.keep_states, rules.exact_states) != (before.keep_states, before.exact_states):
-            self.worker.spec = replace(self.worker.spec, kept=rules)
+            self.worker.spec = replace(self.worker.spec, retention=rules)
             self._rule, self._rule_sent = rules, False
             self.begin()
         self._keep_frames = rules.keep_frames
         await self.retain()
 
-    # The worker's life.
+    # Lifetime of the worker.
 
-    def _worker_ended(self, reason: ProcessExit) -> None:
+    def _on_worker_end(self, reason: ProcessExit) -> None:
         self.progress, self._rule_sent = None, False
         self.clock.end(committed=False)
         if self._ledger.fatal is not None:
             return
         counters.RESTARTS.labels("worker").inc()
-        own, delay = self.worker.deaths.died(reason)
+        own, delay = self.worker.deaths.note_death(reason)
         self._trouble.sentence = f"the worker is gone: {reason}; it is started again in {delay:g} s"
         log.error("scene %s: %s", self._ledger.scene, self._trouble.sentence)
-        self._background.run(self._after_death(reason, own, delay))
+        self._background.run(self._retry_or_fail(reason, own, delay))
 
-    async def _after_death(self, reason: ProcessExit, own: bool, delay: float) -> None:
+    async def _retry_or_fail(self, reason: ProcessExit, own: bool, delay: float) -> None:
         index, self._index = self._index, None
         if index is not None and self._ledger.frames[index].state == FrameState.UPDATING:
-            self._ledger.move(index, FrameState.QUEUED)
-            if not reason.lost:  # a machine that is lost is no fault of the frame
+            self._ledger.set_state(index, FrameState.QUEUED)
+            if not reason.lost:  # the loss of a machine is not the frame's fault
                 death = WorkerDied(index=index, reason=str(reason), own=own)
                 await self._log.write(death)
                 self._ledger.apply(death)
-                # The worker may have died after its commit and before its message: then the next worker reports it.
-                event = given_up(self._ledger.frames[index], death)
+                # If the worker died after its commit but before its message, the next worker reports the commit.
+                event = give_up_event(self._ledger.frames[index], death)
                 if event is not None and not await self._reports.is_committed(index):
                     await self._record_failure(event)
-        self._publisher.changed()
+        self._publisher.publish_status()
         self.worker.start_in(delay)
 
     def stop(self) -> None:
-        """Starts no worker, gives no frame and tries no mending any more."""
+        """Stops starting workers, sending frames and repairing damage."""
         self._stopped = True
         self.worker.close()
         self._repair_queue.stop()

@@ -1,4 +1,4 @@
-"""Predicts when the frame at work ends, so that a sender learns how long to wait."""
+"""Prediction of the end of the current update, from which clients learn how long to wait."""
 
 from __future__ import annotations
 
@@ -8,22 +8,25 @@ from collections.abc import Callable
 from statistics import median
 
 UPDATES_KEPT = 8
-"""The prediction is the median of so many updates: a changed budget shows after a few frames."""
+"""Number of recent updates in the median; small enough to follow a budget change within a few frames."""
 FIRST_GUESS_S = 1.0
-"""Seconds of an update, before one has been timed."""
+"""Predicted seconds per update before any update has been timed."""
 SHORTEST_S = 0.1
-"""The shortest prediction in seconds."""
+"""Shortest prediction in seconds."""
 OVERDUE = 0.25
-"""A frame that takes longer than predicted is predicted to take this share of its time so far again."""
+"""Predicted remaining time of an overdue update, as a fraction of the time by which it exceeds its prediction.
+
+Between two stages of frame 0, it is the fraction of the elapsed time.
+"""
 
 
 class WorkClock:
-    """Predicts the end of the frame at work, from the frames before it and from its progress.
+    """Predictor for the end of the current update, based on earlier updates and its progress.
 
-    Frame 0 is not counted as an update: it takes minutes where an update takes a second.
+    Frame 0 is not counted as an update, because it takes minutes while an update takes about a second.
 
     Args:
-        now: seconds of a clock that never goes back.
+        now: monotonic clock that returns seconds.
 
     Example:
         >>> seconds = iter([0.0, 2.0, 2.0, 2.5])
@@ -48,33 +51,36 @@ class WorkClock:
 
     @property
     def update_seconds(self) -> float:
-        """Predicted seconds of an update."""
+        """Predicted duration of an update in seconds."""
         return median(self._updates) if self._updates else FIRST_GUESS_S
 
     def begin(self, *, first: bool) -> None:
-        """Notes that the worker has a frame; ``first``: there is no committed state before it."""
+        """Records the start of a frame; ``first`` means that no committed state precedes it."""
         self._began, self._first, self._stalled_until = self._now(), first, None
         self._stage, self._done, self._first_end = "", 0.0, None
 
     def progress(self, stage: str, done: int, total: int, seconds: float | None = None) -> None:
-        """Notes how far frame 0 is in one of its stages; `seconds`: predicted until its end."""
+        """Records the progress of frame 0 within a stage.
+
+        `seconds` is the predicted time until the end of the frame, or None.
+        """
         if stage != self._stage:
             self._stage, self._stage_began = stage, self._now()
         self._done = done / total if total > 0 else 0.0
         self._first_end = None if seconds is None else self._now() + seconds
 
     def stall(self, seconds: float) -> None:
-        """Notes that the frame at work waits for room on the disk and is tried again after so long."""
+        """Records that the current frame waits for disk space and is retried after the given seconds."""
         self._stalled_until = self._now() + seconds
 
     def end(self, *, committed: bool) -> None:
-        """Notes that the worker has no frame; one that was not committed, or stalled, is not counted as an update."""
+        """Records the end of a frame; frames that stalled or were not committed do not count as updates."""
         if committed and self._began is not None and not self._first and self._stalled_until is None:
             self._updates.append(self._now() - self._began)
         self._began = self._stalled_until = None
 
     def remaining(self) -> float:
-        """Returns the seconds until the frame at work ends; an update where there is none."""
+        """Returns the predicted seconds until the current frame ends, or those of one update if there is none."""
         if self._began is None:
             return max(SHORTEST_S, self.update_seconds)
         now = self._now()
@@ -87,5 +93,5 @@ class WorkClock:
             in_stage = now - self._stage_began
             if 0 < self._done < 1:
                 return max(SHORTEST_S, in_stage * (1 - self._done) / self._done)
-            return max(SHORTEST_S, OVERDUE * elapsed)  # between two stages nothing better is known
+            return max(SHORTEST_S, OVERDUE * elapsed)  # no better estimate between two stages
         return max(SHORTEST_S, self.update_seconds - elapsed, OVERDUE * (elapsed - self.update_seconds))

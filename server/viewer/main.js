@@ -135,7 +135,7 @@ async function letGo() {
     }
   }
   await list.look();
-  curtain({ title: `${name} is asleep`, words: "It has no processes, and wakes when it is asked or sent something.",
+  curtain({ title: `${name} is asleep`, words: "It has no processes and wakes at the next request.",
     actions: [["Wake it", () => list.choose(id)], ...list.others(id)] });
 }
 

@@ -116,7 +116,7 @@ export class SceneList {
   askForToken(again) {
     const door = $("door");
     if (door.open) return;
-    if (again) $("door-words").textContent = `The ${token.reads() ? "link has ended" : "token is wrong"}. Enter the token that the service was started with (SCAS4D_TOKEN).`;
+    if (again) $("door-words").textContent = `The ${token.reads() ? "link has expired" : "token is wrong"}. Enter the token that the service was started with (SCAS4D_TOKEN).`;
     token.forget();
     door.showModal();
     door.addEventListener("close", () => {

@@ -38,13 +38,13 @@ export function beforeFirstFrame(status, { resume, restore } = {}) {
   if (status.progress) return progressWords(status.progress);
   if (status.state === "initialising") return { title: "Reconstructing the first frame", words: "The pictures are being read.", share: null };
   if (status.paused && status.queued) {
-    return { title: `${counted(status.queued, "frame")} waiting`, words: "The scene is paused: it takes frames and reconstructs none.",
+    return { title: `${counted(status.queued, "frame")} waiting`, words: "The scene is paused: it accepts frames and reconstructs none.",
       actions: resume ? [["Resume", resume]] : [] };
   }
   if (status.queued) {
     return { title: "The first frame is queued", words: `${counted(status.queued, "frame")} came; the worker of the scene is starting.`, share: null };
   }
-  if (status.archived) return { title: "The scene is archived", words: "It takes no frames, and has none to show.", actions: restore ? [["Restore", restore]] : [] };
+  if (status.archived) return { title: "The scene is archived", words: "It accepts no frames, and has none to show.", actions: restore ? [["Restore", restore]] : [] };
   return { title: "Waiting for the first frame",
     words: `The scene accepts frames of ${counted(status.cameras.length, "camera")}. Send frame ${status.next_frame}:`,
     detail: `PUT ${path(status)}/frames/${status.next_frame}` };

@@ -77,7 +77,7 @@ export class Stream {
     } catch (error) {
       if (this.closed) return;
       if (error instanceof ServiceError && [401, 403, 404].includes(error.status)) {
-        this.end(error.status === 404 ? "The scene is not there any more." : error.message, error.status);
+        this.end(error.status === 404 ? "The scene no longer exists." : error.message, error.status);
         return;
       }
     }

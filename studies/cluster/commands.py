@@ -16,7 +16,7 @@ def cluster(
     scenes: Annotated[int, typer.Option(min=1, help="Scenes at a time, on three nodes.")] = 6,
     turns: Annotated[int, typer.Option(min=1, help="Turns of each placement.")] = 3,
     views: Annotated[int, typer.Option(min=1, help="Views a turn, of a scene at rest.")] = 60,
-    work: Annotated[Path, typer.Option(help="Folder for the services' data; what is there goes.")] = Path(
+    work: Annotated[Path, typer.Option(help="Folder for the services' data; its contents are deleted.")] = Path(
         "out/cluster"
     ),
     out: Page = None,

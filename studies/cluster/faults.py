@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 
 from client.wire import Cluster
-from server.storage.fencing import epoch_read, epochs
+from server.storage.fencing import current_epoch, epochs
 from server.storage.layout import DataFolder, epoch_folder
 from studies.cluster.nodes import Nodes
 from studies.options import Echo
@@ -73,7 +73,7 @@ def stopped_node(
         _send(sender, _second_half(study, service, scene, sender))
         time.sleep(0.5 * update_s)
         node, _ = _node_of(service, nodes, scene)
-        stale = epoch_read(states)
+        stale = current_epoch(states)
         assert stale is not None
         nodes.stop(node)
         began, committed = time.monotonic(), service.status(scene).committed

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from client.importers.open_source import open_source
-from client.rig.sequence import there_and_back
+from client.rig.sequence import ping_pong
 from scas4d_core import metrics
 from scas4d_core.cameras import WorldFrame
 from scas4d_core.captures import Capture
@@ -73,7 +73,7 @@ def back_and_forth(indices: Sequence[int], count: int) -> list[int]:
     >>> back_and_forth([0, 1, 2], 7)
     [0, 1, 2, 1, 0, 1, 2]
     """
-    return [indices[there_and_back(place, len(indices))] for place in range(count)]
+    return [indices[ping_pong(place, len(indices))] for place in range(count)]
 
 
 def measure(

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from client.rig.sequence import there_and_back
+from client.rig.sequence import ping_pong
 from scas4d_core.captures import Capture, Frame
 from scas4d_core.gaussians import Gaussians
 from studies.quality.first_frame import started
@@ -31,7 +31,7 @@ def back_and_forth(capture: Capture, frames: int) -> Iterator[Frame]:
     first, second = capture.frame(0), capture.frame(1)
     step = second.time - first.time
     for index in range(1, frames + 1):
-        shown = capture.frame(there_and_back(index, count))
+        shown = capture.frame(ping_pong(index, count))
         yield Frame(index, first.time + index * step, shown.images, shown.masks)
 
 

@@ -15,7 +15,7 @@ STEPS = ("rows", "times", "convergence", "page")
 
 def frontier(
     captures: Captures,
-    out: Annotated[Path, typer.Option(help="Folder of the study. Run again to go on.")] = FRONTIER,
+    out: Annotated[Path, typer.Option(help="Folder of the study. Run again to continue.")] = FRONTIER,
     axes: Annotated[
         list[str] | None, typer.Option(help="Only this axis, as iterations or layers. May be repeated.")
     ] = None,

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from client.cli.evaluate import Job, Report, recorded
+from client.cli.evaluate import Job, Report, settings_record
 from client.cli.scores import Row, Store
 from scas4d_core.presets import PRESETS
 from scas4d_core.settings import Settings
@@ -68,7 +68,7 @@ class Variant:
     @property
     def record(self) -> Row:
         """The settings and constants as a row has them."""
-        return recorded(self.settings, self.constants)
+        return settings_record(self.settings, self.constants)
 
 
 def _changed(label: str, name: str, value: object, *more: str) -> Variant:

@@ -18,10 +18,10 @@ from unittest import mock
 
 import numpy as np
 
-from client.cli.evaluate import Report, recorded
+from client.cli.evaluate import Report, settings_record
 from client.cli.scores import Column, Row, digest, kept_row, markdown
 from client.importers.open_source import open_source
-from client.rig.sequence import there_and_back
+from client.rig.sequence import ping_pong
 from scas4d_core.cameras import Rig
 from scas4d_core.captures import Capture
 from scas4d_core.captures.frame import Frame
@@ -83,7 +83,7 @@ def run(
     settings, rows = settings_of("scas4d", None, 0, changes), []
     for folder in captures:
         for case in CASES:
-            key = digest(recorded(settings, ()), updates, case, masks)
+            key = digest(settings_record(settings, ()), updates, case, masks)
             path = out / "timing" / f"{folder.resolve().name}-{case.step}-{case.shift}-{key}.json"
             row = kept_row(path, partial(_row, path.stem, folder, out, settings, updates, case, masks), again=again)
             report(
@@ -106,7 +106,7 @@ def _row(key: str, folder: Path, out: Path, settings: Settings, updates: int, ca
     row = summary(reports, {name: shift / case.step for name, shift in shifts.items()})
     whole = float(np.median([sum(report.seconds.values()) for report in reports]))
     row |= {"milliseconds": 1000 * float(np.median(spent)), "share": float(np.median(spent)) / whole}
-    identity = {"capture": capture.name, "step": case.step, "settings": recorded(settings, ()), "masks": masks}
+    identity = {"capture": capture.name, "step": case.step, "settings": settings_record(settings, ()), "masks": masks}
     return {"key": key, **identity, **row, "core": core_version(), "machine": machine()}
 
 
@@ -116,10 +116,10 @@ def played(capture: Capture, index: int, step: int, shifts: Mapping[str, int]) -
     Args:
         shifts: by camera, frames of the capture after the others'.
     """
-    frame = capture.frame(there_and_back(abs(step * index), capture.frame_count))
+    frame = capture.frame(ping_pong(abs(step * index), capture.frame_count))
     images, masks = dict(frame.images), dict(frame.masks)
     for name, shift in shifts.items():
-        other = capture.frame(there_and_back(abs(step * index + shift), capture.frame_count))
+        other = capture.frame(ping_pong(abs(step * index + shift), capture.frame_count))
         images[name] = other.images[name]
         if name in masks:
             masks[name] = other.masks[name]
@@ -159,7 +159,7 @@ def summary(reports: Sequence[FrameReport], true: Mapping[str, float]) -> Row:
         true: frames by which cameras are off; the others are in step.
     """
     last = reports[-1].timing
-    named = [{name for name, one in report.timing.items() if one["off"]} for report in reports]
+    named = [{name for name, one in report.timing.items() if one["out_of_step"]} for report in reports]
     others = [abs(one["frames"]) for report in reports for name, one in report.timing.items() if name not in true]
     since = {name: next((k + 1 for k, names in enumerate(named) if name in names), None) for name in true}
     return {

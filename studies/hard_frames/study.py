@@ -164,7 +164,7 @@ def _said(step: FrameStep) -> str:
     words = [] if report.degraded is None else [report.degraded]
     if report.dropped:
         words.append("without " + ", ".join(f"{name} ({why})" for name, why in report.dropped.items()))
-    alarms = [alarm for alarm in report.alarms if alarm.what not in FRAME_ALARMS and alarm.camera not in report.dropped]
+    alarms = [alarm for alarm in report.alarms if alarm.kind not in FRAME_ALARMS and alarm.camera not in report.dropped]
     words += [alarm.evidence if alarm.camera is None else f"{alarm.camera}: {alarm.evidence}" for alarm in alarms]
     return "; ".join(words or report.attempts)
 

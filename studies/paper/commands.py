@@ -13,7 +13,7 @@ from studies.options import FRONTIER, QUALITY, Captures
 def paper(
     captures: Captures,
     out: Annotated[
-        Path, typer.Option(help="Folder of the study, shared with frontier. Run again to go on.")
+        Path, typer.Option(help="Folder of the study, shared with frontier. Run again to continue.")
     ] = FRONTIER,
     quality: Annotated[
         Path | None, typer.Option(help="Folder of the study of quality, for captures that have rows there alone.")

@@ -62,7 +62,8 @@ a frame 0 that all its rows share{_elsewhere(captures, there)}.
 The gain is the first setting's mean less the second's, over the captures of both. It agrees in size if the two gains
 are within a factor of {FACTOR:g}; gains that are small on both sides
 ({", ".join(f"{name} {value:g}" for name, value in SMALL.items() if name in DIGITS)}) agree as well, and a small gain
-does not agree with one that is not. If the paper shows only a picture, the claim is the sign.
+does not agree with one that is not. If the paper shows only a picture, the claim is the sign. The last column
+counts the captures whose own gain has the sign of the claim.
 
 {sections}
 
@@ -96,29 +97,14 @@ def section(
         mean = _mean([own[name] for name in shared])
         paper = _mean([side.paper[name] for name in shared]) if side.paper else None
         lines.append("| " + " | ".join([side.name, *cells, _cell(mean, paper, digits)]) + " |")
-    sentences = "\n".join(f"- {sentence(outcome, digits, unit)}" for outcome in outcomes)
     note = experiment.note.format(ratio="–" if ratio is None else f"{ratio:.2f} times that")
     parts = [
         f"## {experiment.title}",
         f"Paper: {experiment.source}." + (f" In{unit}." if unit else ""),
         "\n".join(lines),
-        sentences,
         note,
     ]
     return "\n\n".join(part for part in parts if part)
-
-
-def sentence(outcome: ClaimResult, digits: int, unit: str) -> str:
-    """A claim and how it came out."""
-    what = f"{outcome.claim.what[0].upper()}{outcome.claim.what[1:]} ({outcome.claim.first} – {outcome.claim.second})"
-    if outcome.own is None:
-        return f"{what}: not measured."
-    own = f"{outcome.own:+.{digits}f}"
-    if outcome.paper is None:
-        figures = f"{own}{unit}, in the paper only shown"
-    else:
-        figures = f"{own}, in the paper {outcome.paper:+.{digits}f}{unit}"
-    return f"{what}: {figures}; {_word(outcome)}, on {outcome.same_sign} of {len(outcome.captures)} captures alone."
 
 
 def summary(outcomes: Sequence[ClaimResult], by_title: Mapping[str, Sequence[ClaimResult]]) -> str:
@@ -129,8 +115,8 @@ def summary(outcomes: Sequence[ClaimResult], by_title: Mapping[str, Sequence[Cla
         f"Of {len(outcomes)} comparisons {counts['sign and size']} agree in sign and size, {counts['sign']} in sign, "
         f"{counts['no']} do not, and {len(outcomes) - len(known)} are not measured.",
         "",
-        "| experiment | comparison | here | paper | agrees in |",
-        "|---|---|---|---|---|",
+        "| experiment | claim | comparison | here | paper | agrees in | same sign |",
+        "|---|---|---|---|---|---|---|",
     ]
     for experiment in EXPERIMENTS:
         digits = DIGITS[experiment.score]
@@ -139,7 +125,9 @@ def summary(outcomes: Sequence[ClaimResult], by_title: Mapping[str, Sequence[Cla
             paper = "–" if outcome.paper is None else f"{outcome.paper:+.{digits}f}"
             comparison = f"{outcome.claim.first} – {outcome.claim.second}"
             word = outcome.agrees if outcome.agrees != "no" else "**nothing**"
-            lines.append(f"| {experiment.title} | {comparison} | {own} | {paper} | {word} |")
+            same = "–" if outcome.own is None else f"{outcome.same_sign} of {len(outcome.captures)}"
+            cells = [experiment.title, outcome.claim.what, comparison, own, paper, word, same]
+            lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 

@@ -7,14 +7,14 @@ from typing import Annotated
 
 import typer
 
-from client.cli.capture_options import takes_capture
+from client.cli.capture_options import with_capture_options
 from client.importers.open_source import CaptureOptions
 from studies.options import QUALITY, Again, Captures, Changes, write_page
 
-Study = Annotated[Path, typer.Option(help="Folder of the study: rows, pictures, frames 0. Run again to go on.")]
+Study = Annotated[Path, typer.Option(help="Folder of the study: rows, pictures, frames 0. Run again to continue.")]
 
 
-@takes_capture
+@with_capture_options
 def quality(
     captures: Captures,
     options: CaptureOptions,
@@ -64,7 +64,7 @@ def quality(
         raise typer.Exit(1)
 
 
-@takes_capture
+@with_capture_options
 def refit(
     captures: Captures,
     options: CaptureOptions,
@@ -98,11 +98,11 @@ def refit(
     )
 
 
-@takes_capture
+@with_capture_options
 def effects(
     captures: Captures,
     options: CaptureOptions,
-    out: Annotated[Path, typer.Option(help="Folder of the study. Run again to go on.")] = Path("out/effects"),
+    out: Annotated[Path, typer.Option(help="Folder of the study. Run again to continue.")] = Path("out/effects"),
     name: Annotated[
         list[str] | None, typer.Option(help="Only this effect, by name; all when left out. May be repeated.")
     ] = None,
@@ -205,7 +205,7 @@ def table(
 
 def processors(
     captures: Captures,
-    out: Annotated[Path, typer.Option(help="Folder of the study. Run again to go on.")] = Path("out/processors"),
+    out: Annotated[Path, typer.Option(help="Folder of the study. Run again to continue.")] = Path("out/processors"),
     frames: Annotated[int, typer.Option(min=1, help="Updates of each run.")] = 5,
     seeds: Annotated[int, typer.Option(min=1, help="Seeds of the updates, on this processor.")] = 4,
     changes: Changes = None,

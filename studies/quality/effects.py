@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from client.cli.evaluate import DEFAULT_OPTIONS, Report, recorded
+from client.cli.evaluate import DEFAULT_OPTIONS, Report, settings_record
 from client.cli.scores import Column, Row, digest, kept_row, markdown
 from client.importers.open_source import CaptureOptions
 from scas4d_core import metrics
@@ -164,9 +164,9 @@ def _row(
     words = ", ".join(f"{name} {mode}" for name, mode in pins.items())
     seed = settings.update.seed
     file = "-".join([capture.name, f"s{seed}", *(f"{name}-{mode}" for name, mode in pins.items())])
-    path = out / "effects" / f"{file}-{digest(recorded(settings, ()), count, *options.changed.items())}.json"
+    path = out / "effects" / f"{file}-{digest(settings_record(settings, ()), count, *options.changed.items())}.json"
     known: Row = {"key": path.stem, "capture": capture.name, "seed": seed, "pinned": words, "frames": count}
-    of = {"settings": recorded(settings, ()), "core": core_version(), "machine": machine()}
+    of = {"settings": settings_record(settings, ()), "core": core_version(), "machine": machine()}
     return kept_row(path, lambda: known | _compared(capture, out, settings, pins, count) | of, again=again)
 
 

@@ -14,7 +14,7 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 from client.cli import evaluate
-from client.cli.evaluate import DEFAULT_OPTIONS, Job, Report, page
+from client.cli.evaluate import DEFAULT_OPTIONS, Job, Report, score_tables
 from client.cli.scores import QUALITY, Row, Store, digest
 from client.importers.open_source import CaptureOptions
 from scas4d_core.warm_up import compile_in_processes
@@ -108,7 +108,7 @@ def run_jobs(jobs: Sequence[Job], out: Path, *, again: bool = False, report: Rep
             other = "" if row.get("core") == core_version() else ", with other sources of the core"
             report(f"[{number}/{len(jobs)}] {job.key}: measured already{other}")
         rows.append(row)
-    table = page(with_means(rows), rows)
+    table = score_tables(with_means(rows), rows)
     (store.folder / "table.md").write_text(table + "\n")
     report(table)
     return rows

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from client.cli.evaluate import DEFAULT_OPTIONS, Report, recorded
+from client.cli.evaluate import DEFAULT_OPTIONS, Report, settings_record
 from client.cli.scores import Column, Row, Store, digest, kept_row, markdown
 from client.importers.open_source import CaptureOptions
 from scas4d_core.captures import Capture
@@ -51,7 +51,7 @@ def run(
     """Fits a frame of each capture from scratch; prints the table and leaves it in ``out/refit.md``.
 
     Args:
-        captures: folders. out: folder of the study of quality. Run again to go on.
+        captures: folders. out: folder of the study of quality. Run again to continue.
         frame: that is fitted; negative ones count from the end.
         preset, changes: the settings; ``changes`` as ``"effects.direction=off"``.
         seeds: of frame 0, each tried.
@@ -90,7 +90,7 @@ def _refitted(
     index = range(capture.frame_count)[frame] if -capture.frame_count <= frame < capture.frame_count else None
     if index is None:
         raise ValueError(f"{capture.name} has no frame {frame}; give one of 0 to {capture.frame_count - 1}")
-    key = f"{capture.name}-{index}-s{seed}-{digest(recorded(settings, ()), points, *options.changed.items())}"
+    key = f"{capture.name}-{index}-s{seed}-{digest(settings_record(settings, ()), points, *options.changed.items())}"
     return kept_row(
         rows / f"{key}.json", lambda: {"key": key, "seed": seed, **_measured(capture, index, settings)}, again=again
     )
@@ -110,7 +110,7 @@ def _measured(capture: Capture, index: int, settings: Settings) -> Row:
         "gaussians": len(scene.history.first),
         "seconds": sum(scene.report.seconds.values()),
         **scores,
-        "settings": recorded(settings, ()),
+        "settings": settings_record(settings, ()),
         "core": core_version(),
         "machine": machine(),
     }
@@ -118,7 +118,7 @@ def _measured(capture: Capture, index: int, settings: Settings) -> Row:
 
 def _beside(row: Row, settings: Settings, preset: str, store: Store) -> Row:
     """The updates' figure for the same frame, and how far it is below; nothing where it was not measured."""
-    wanted = recorded(settings, ())
+    wanted = settings_record(settings, ())
     for other in store.rows():
         frames = other.get("psnr_by_frame", [])
         same = other.get("capture") == row["capture"] and other.get("settings") == wanted

@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from client.cli.evaluate import Report, recorded
+from client.cli.evaluate import Report, settings_record
 from client.cli.scores import Column, Row, digest, kept_row, markdown
 from client.importers.open_source import open_source
 from scas4d_core.captures import Capture
@@ -54,7 +54,11 @@ def run(
     for folder in captures:
         for seed in seeds:
             settings = settings_of(preset, None, seed, changes)
-            path = out / "switches" / f"{folder.resolve().name}-s{seed}-{digest(recorded(settings, ()), updates)}.json"
+            path = (
+                out
+                / "switches"
+                / f"{folder.resolve().name}-s{seed}-{digest(settings_record(settings, ()), updates)}.json"
+            )
             row = kept_row(path, partial(_row, folder, out, path.stem, settings, seed, updates), again=again)
             report(f"{row['capture']}, seed {seed}: {row['switches']}")
             rows.append(row)
@@ -69,7 +73,7 @@ def _row(folder: Path, out: Path, key: str, settings: Settings, seed: int, updat
         "key": key,
         "seed": seed,
         **_played(open_source(folder), out, settings, updates),
-        "settings": recorded(settings, ()),
+        "settings": settings_record(settings, ()),
         "core": core_version(),
         "machine": machine(),
     }

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from client.cli.scores import Row, Store, markdown, stage_table
+from client.cli.scores import Row, Store, markdown
 from scas4d_core.presets import preset
 from studies.machine import in_words
 from studies.quality.quality import OBJECT_CAPTURES
@@ -182,18 +182,27 @@ def figure_of(target: Target, capture: str, rows: Rows) -> Figure | None:
 
 
 def target_table(verdicts: Sequence[Verdict]) -> str:
-    """A Markdown table of verdicts."""
+    """A Markdown table of the verdicts that are measured, and a sentence that lists the others."""
     lines = ["| figure | capture | target | measured | | updates |", "|---|---|---|---|---|---|"]
     for verdict in verdicts:
+        if verdict.value is None:
+            continue
         target = verdict.target
         must = "–"
         if target.threshold is not None:
             must = f"{target.sense} {_number(target, target.threshold)} {target.unit}".strip()
-        measured = "–" if verdict.value is None else _number(target, verdict.value)
-        if verdict.value is not None and verdict.parts is not None:
+        measured = _number(target, verdict.value)
+        if verdict.parts is not None:
             measured += f" ({_plain(target, verdict.parts[0])} against {_plain(target, verdict.parts[1])})"
         cells = [target.what, verdict.capture, must, measured, verdict.word, verdict.updates]
         lines.append("| " + " | ".join(cells) + " |")
+    missing: dict[str, list[str]] = {}
+    for verdict in verdicts:
+        if verdict.value is None:
+            missing.setdefault(verdict.target.what, []).append(verdict.capture)
+    if missing:
+        named = "; ".join(f"{what} ({', '.join(captures)})" for what, captures in missing.items())
+        lines += ["", f"Not measured: {named}."]
     return "\n".join(lines)
 
 
@@ -227,7 +236,7 @@ def page(rows: Rows) -> str:
     days = sorted({str(row["measured"])[:10] for row in known if "measured" in row})
     machines = sorted({in_words(row["machine"]) for row in known if "machine" in row})
     cores = sorted({str(row["core"]) for row in known if "core" in row})
-    runs = [(name, run) for name, run in RUNS.items() if not run.changes]
+    runs = [(name, run) for name, run in RUNS.items() if run.preset == "scas4d" and not run.changes]
     behind = [rows[name, capture] for name, run in runs for capture in run.captures if (name, capture) in rows]
     return f"""# Quality
 
@@ -256,17 +265,10 @@ of the metrics: `scas4d_core/metrics/`.
 
 ## Rows
 
-Runs with changed settings (single layers, the other cluster map) are in the table above only.
+Runs of the default preset. The store has those of the baseline and of changed settings, and seconds by stage.
 
-{_behind(behind)}
+{markdown(behind) if behind else "None yet."}
 """
-
-
-def _behind(rows: Sequence[Row]) -> str:
-    if not rows:
-        return "None yet."
-    stages = stage_table([row for row in rows if row["preset"] == "scas4d"])
-    return markdown(rows) + (f"\n\nMedian seconds of an update of `scas4d` by stage:\n\n{stages}" if stages else "")
 
 
 def _value(row: Row, metric: str, updates: int) -> float | None:

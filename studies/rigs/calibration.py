@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from client.cli.evaluate import Report, recorded
+from client.cli.evaluate import Report, settings_record
 from client.cli.scores import Column, Row, digest, kept_row, markdown
 from client.importers.open_source import open_source
 from scas4d_core.cameras import Camera, Rig
@@ -102,7 +102,7 @@ def run(
         measured_rows += _measured(capture.name, matches)
         report(f"{capture.name}, as given: {refine_rig(capture.rig, matches).text}")
         for way, pixels in RIGS if fit and capture.test_rig is not None else ():
-            settings = recorded(settings_of("scas4d", None, 0, list(changes)), ())
+            settings = settings_record(settings_of("scas4d", None, 0, list(changes)), ())
             path = (
                 out / "calibration" / f"{folder.resolve().name}-{way}-{pixels:g}-{digest(settings, way, pixels)}.json"
             )

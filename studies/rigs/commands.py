@@ -7,14 +7,14 @@ from typing import Annotated
 
 import typer
 
-from client.cli.capture_options import takes_capture
+from client.cli.capture_options import with_capture_options
 from client.importers.open_source import CaptureOptions
 from studies.options import QUALITY, Again, Captures, Changes
 
-Study = Annotated[Path, typer.Option(help="Folder of the study: rows, pictures, frames 0. Run again to go on.")]
+Study = Annotated[Path, typer.Option(help="Folder of the study: rows, pictures, frames 0. Run again to continue.")]
 
 
-@takes_capture
+@with_capture_options
 def rigs(
     captures: Captures,
     options: CaptureOptions,

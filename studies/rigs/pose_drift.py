@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from client.cli.evaluate import Report, recorded
+from client.cli.evaluate import Report, settings_record
 from client.cli.scores import Column, Row, digest, kept_row, markdown
 from client.importers.open_source import open_source
 from scas4d_core.cameras import Camera
@@ -70,7 +70,7 @@ def run(
     for folder in captures:
         for way, mode in ((way, mode) for way in WAYS for mode in MODES):
             settings = settings_of("scas4d", None, 0, [*changes, f"effects.{NAME}={mode}"])
-            key = digest(recorded(settings, ()), updates, way, pixels, most)
+            key = digest(settings_record(settings, ()), updates, way, pixels, most)
             path = out / "drift" / f"{folder.resolve().name}-{way}-{mode}-{key}.json"
             drift = (pixels, most) if way == "drift" else (0.0, 0.0)
             known = {"key": path.stem, "cameras": way, "poses": mode}
@@ -85,7 +85,7 @@ def run(
 
 def _row(known: Row, folder: Path, out: Path, settings: Settings, updates: int, drift: tuple[float, float]) -> Row:
     row = _played(folder, out, settings, updates, drift)
-    return {**known, **row, "settings": recorded(settings, ()), "core": core_version(), "machine": machine()}
+    return {**known, **row, "settings": settings_record(settings, ()), "core": core_version(), "machine": machine()}
 
 
 def _played(folder: Path, out: Path, settings: Settings, updates: int, drift: tuple[float, float]) -> Row:

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.cli.changes import parse_changes
-from client.cli.evaluate import Report, recorded, save_comparisons
+from client.cli.evaluate import Report, save_comparisons, settings_record
 from client.cli.scores import Column, Row, Store, digest, kept_row, markdown
 from client.importers.open_source import CaptureOptions
 from scas4d_core import metrics
@@ -73,7 +73,7 @@ def run(
     """Reconstructs captures; prints the table and leaves it in ``out/rigs.md``.
 
     Args:
-        captures: folders. out: folder of the study. Run again to go on.
+        captures: folders. out: folder of the study. Run again to continue.
         frames: at most so many. longer: pixels along the longer side of the largest picture, at most.
         changes: settings as ``"static.seconds=60"``. again: measure anew what ``out`` holds.
         options: how the captures are read; ``options.test`` holds these cameras out in place of the middle one.
@@ -116,7 +116,7 @@ def measured(
         report = scene.step(given.frame(index))
         seconds.append(time.perf_counter() - began)
         held += report.outcome.rejected
-        unmoved += report.kept is Candidate.PREVIOUS
+        unmoved += report.candidate is Candidate.PREVIOUS
     trained = [_psnr(scene, truth.rig, truth.frame(index)) for index in range(count)]
     row: Row = {
         "capture": given.name,
@@ -133,7 +133,7 @@ def measured(
         "unmoved": unmoved,
         "psnr_training": float(np.mean(trained)),
         "psnr_training_last": trained[-1],
-        "settings": recorded(settings, ()),
+        "settings": settings_record(settings, ()),
         "core": core_version(),
         "machine": machine(),
     }

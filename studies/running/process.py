@@ -139,7 +139,7 @@ class Service:
 
     def deaths(self, scene: str) -> int:
         """Of workers, that frames of a scene are held to blame for."""
-        return DataFolder(self.data).scene(scene).journal.read_bytes().count(b'"fact":"died"')
+        return DataFolder(self.data).scene(scene).journal.read_bytes().count(b'"type":"worker_died"')
 
     def finish(self, scene: str, frames: int, every: float = EVERY_S) -> SceneStatus:
         """Waits until so many frames are finished; looks every so many seconds."""

@@ -13,7 +13,7 @@ from typing import Any
 
 import httpx
 
-from client.rig.sequence import there_and_back
+from client.rig.sequence import ping_pong
 from client.wire import FrameState
 from scas4d_core.captures import Capture
 from scas4d_core.gaussians import Gaussians
@@ -56,7 +56,7 @@ class Study:
 
 def encoded_frames(capture: Capture, count: int) -> list[Files]:
     """So many frames of a capture; where it has fewer, it goes back and forth, so that the motion stays one."""
-    indices = [there_and_back(number, capture.frame_count) for number in range(count)]
+    indices = [ping_pong(number, capture.frame_count) for number in range(count)]
     read = {index: _files(capture, index) for index in dict.fromkeys(indices)}
     return [read[index] for index in indices]
 
@@ -110,7 +110,7 @@ class Updates:
         """Sends so many frames at once and waits until they are committed; seconds that each took."""
         first = self.next
         for index in range(first, first + count):
-            answer = self._service.put(self._scene, index, *self._frames[there_and_back(index, len(self._frames))])
+            answer = self._service.put(self._scene, index, *self._frames[ping_pong(index, len(self._frames))])
             if not answer.is_success:
                 raise StudyError(answer.text)
         self.next += count

@@ -34,7 +34,7 @@ def faults(
     ] = None,
     placement: Annotated[str, typer.Option(help="`ray`: on a Ray cluster of three nodes, on this machine.")] = "local",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random moments and places.")] = 0,
-    work: Annotated[Path, typer.Option(help="Folder for data folders and logs; what is there goes.")] = Path(
+    work: Annotated[Path, typer.Option(help="Folder for data folders and logs; its contents are deleted.")] = Path(
         "out/faults"
     ),
     out: Page = None,
@@ -127,7 +127,9 @@ def views(
     updates: Annotated[int, typer.Option(min=1, help="Updates a turn, without views and with.")] = 8,
     turns: Annotated[int, typer.Option(min=1, help="Turns of each rate.")] = 3,
     width: Annotated[int, typer.Option(min=1, help="Width of a view in pixels.")] = 256,
-    work: Annotated[Path, typer.Option(help="Folder for the service's data; what is there goes.")] = Path("out/views"),
+    work: Annotated[Path, typer.Option(help="Folder for the service's data; its contents are deleted.")] = Path(
+        "out/views"
+    ),
     out: Page = None,
     changes: Changes = None,
 ) -> None:
@@ -192,7 +194,9 @@ def sleeping(
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="Folder of a scene, DATA/scenes/ID.")],
     count: Annotated[int, typer.Option(min=1, help="Scenes that sleep.")] = 500,
     views: Annotated[int, typer.Option(min=1, help="Scenes that are woken by a view.")] = 5,
-    work: Annotated[Path, typer.Option(help="Data folder of the copies; what is there goes.")] = Path("out/sleeping"),
+    work: Annotated[Path, typer.Option(help="Data folder of the copies; its contents are deleted.")] = Path(
+        "out/sleeping"
+    ),
 ) -> None:
     """Measures memory, listing and first views of scenes that sleep: copies of one; prints JSON."""
     import json

@@ -87,7 +87,7 @@ def crossed(folder: Path, capture: Capture) -> dict[str, list[str]]:
     service = Service(folder / "data", environment)
     service.start()
     try:
-        with Client(f"http://127.0.0.1:{service.port}", patience=60) as client:
+        with Client(f"http://127.0.0.1:{service.port}", busy_timeout=60) as client:
             scene = client.create_scene(capture.rig, settings=SETTINGS).id
             assert capture.points is not None
             client.put_points(scene, capture.points)

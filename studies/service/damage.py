@@ -2,7 +2,7 @@
 
 One scene, frame after frame. Before each frame one bit of one file is flipped, under the service as it runs, or while
 it is down; then views are asked for, the next frame is sent, and all is compared with a run that nothing disturbed.
-The bit is put right again where the service could not do that: the next is to be a single one too.
+The bit is put right again where the service could not do that: the next frame is to be a single one too.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ BEFORE = 6
 NOTICED_S = 60.0
 """So long a bit may stay unnoticed: the scrub runs without pauses here."""
 KEPT = 100
-"""Frames whose pictures are held: states older than that cannot be made again, and are named."""
+"""Frames whose pictures are held: states older than that cannot be recomputed, and are named."""
 CLOSE_DB = 3.0
 """A state that was made again may show the frame so much worse than the one that was lost."""
 SCRUB = {"SCAS4D_SCRUB_MB_PER_SECOND": "1000", "SCAS4D_SCRUB_PAUSE_SECONDS": "0.2"}

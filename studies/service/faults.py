@@ -34,7 +34,7 @@ from studies.service.strangers import Attack, strangers
 TURN_S = 15.0
 """Of updates without strangers; with them, until the last connection is closed."""
 KILLS_OF_A_WORKER_AT_A_FRAME = 4
-"""The sixth fails a frame, as it should: the study stays below, and kills again when the next is at work."""
+"""The sixth fails a frame, as it should: the study stays below, and kills again when the next frame is at work."""
 
 PARTS = ("kills", "beginnings", "log", "disk", "bits", "strangers")
 """The scenarios by name."""

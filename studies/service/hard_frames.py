@@ -153,7 +153,7 @@ class Pushed:
         """Of a frame, as it was committed."""
         record = self.committed.history.report(index)
         known = {item.name: record[item.name] for item in fields(FrameReport) if item.name in record}
-        alarms = [Alarm(AlarmKind(one["what"]), one["camera"], one["evidence"]) for one in known.pop("alarms", [])]
+        alarms = [Alarm(AlarmKind(one["kind"]), one["camera"], one["evidence"]) for one in known.pop("alarms", [])]
         return FrameReport(**{**known, "outcome": FrameOutcome(record["outcome"]), "alarms": alarms})
 
     def psnr(self, footage: AnyFootage, index: int, truth: Pictures) -> float:

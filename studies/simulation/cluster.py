@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from random import Random
 
-from server.cluster.needs import Needs
+from server.cluster.resource_needs import ResourceNeeds
 from studies.simulation.delays import NOTICED_S, PLACED_PER_S, REPLACED_S, SPREAD_ABOVE, TOP_SHARE, Range
 from studies.simulation.nodes import Capacity, Node, NodeState, Placed
 
@@ -22,7 +22,7 @@ class SimulatedCluster:
         answers: the head places and notices.
     """
 
-    def __init__(self, count: int, cpus: float, memory: int, kinds: Sequence[Needs], random: Random) -> None:
+    def __init__(self, count: int, cpus: float, memory: int, kinds: Sequence[ResourceNeeds], random: Random) -> None:
         self.loop = asyncio.get_running_loop()
         self.random = random
         self.capacity = Capacity(kinds, self.loop.time)
@@ -87,7 +87,7 @@ class SimulatedCluster:
             process.place(node)
             self._changed(node)
 
-    def _choose(self, needs: Needs) -> Node:
+    def _choose(self, needs: ResourceNeeds) -> Node:
         candidates = []
         for node in self.nodes:
             if node.listed and node.fits(needs):

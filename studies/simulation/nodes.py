@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import Protocol
 
-from server.cluster.needs import Needs
+from server.cluster.resource_needs import ResourceNeeds
 
 
 class NodeState(Enum):
@@ -24,7 +24,7 @@ class NodeState(Enum):
 class Placed(Protocol):
     """A process as its node sees it."""
 
-    needs: Needs
+    needs: ResourceNeeds
 
     @property
     def queued(self) -> bool:
@@ -67,7 +67,7 @@ class Node:
     def __post_init__(self) -> None:
         self.free_cpus, self.free_memory = self.cpus, self.memory
 
-    def fits(self, needs: Needs) -> bool:
+    def fits(self, needs: ResourceNeeds) -> bool:
         """True where there is room for a process."""
         return self.free_cpus >= needs.cpus and self.free_memory >= needs.memory
 
@@ -101,7 +101,7 @@ class Capacity:
         listed: nodes with room by kind, as Ray knows them: one that is silent and not yet lost is among them.
     """
 
-    def __init__(self, kinds: Sequence[Needs], now: Callable[[], float]) -> None:
+    def __init__(self, kinds: Sequence[ResourceNeeds], now: Callable[[], float]) -> None:
         self.kinds = kinds
         self.listed = [0] * len(kinds)
         self._numbers = {(needs.cpus, needs.memory): number for number, needs in enumerate(kinds)}
@@ -112,7 +112,7 @@ class Capacity:
         self._since = [0.0] * len(kinds)
         self._seconds = [[0.0, 0.0] for _ in kinds]
 
-    def kind(self, needs: Needs) -> int:
+    def kind(self, needs: ResourceNeeds) -> int:
         """The kind of a process's needs."""
         return self._numbers[needs.cpus, needs.memory]
 

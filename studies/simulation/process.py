@@ -8,9 +8,9 @@ from collections.abc import Callable, Coroutine
 from dataclasses import replace
 from typing import Any
 
-from server.cluster.needs import Needs
+from server.cluster.resource_needs import ResourceNeeds
 from server.messages import SceneSpec, WaitsForNode
-from server.processes.placement import STOP_SECONDS, AnyProcess, Entry, Placement, ProcessExit
+from server.processes.placement import STOP_SECONDS, Entry, Placement, ProcessExit, ProcessHandle
 from studies.simulation.cluster import SimulatedCluster
 from studies.simulation.delays import LATE_S, LONGEST_SHARE, MESSAGE_S, STOPPING_S, TOLD_S, WAIT_S
 from studies.simulation.nodes import Node, NodeState
@@ -28,7 +28,7 @@ class SimulatedProcess:
     def __init__(
         self,
         placement: SimulatedPlacement,
-        needs: Needs,
+        needs: ResourceNeeds,
         spec: SceneSpec,
         on_message: Callable[[Any], None],
         on_end: Callable[[ProcessExit], None],
@@ -51,7 +51,7 @@ class SimulatedProcess:
 
     @property
     def pid(self) -> int | None:
-        """See `AnyProcess`."""
+        """See `ProcessHandle`."""
         return None if self.work is None else self._number
 
     @property
@@ -62,13 +62,13 @@ class SimulatedProcess:
     # Of the service.
 
     def send(self, message: Any) -> None:
-        """See `AnyProcess`."""
+        """See `ProcessHandle`."""
         if not self.over and self.work is not None:
             work = self.work
             self._last_order = self._pass(lambda: work.order(message), self._last_order)
 
     async def stop(self, seconds: float = STOP_SECONDS) -> None:
-        """See `AnyProcess`."""
+        """See `ProcessHandle`."""
         self._let_go()
         if self.node is not None:
             await asyncio.sleep(min(seconds, self._cluster.random.uniform(*STOPPING_S)))
@@ -179,7 +179,7 @@ class SimulatedProcess:
 
     def _explain(self) -> None:
         if not self.over and self.work is None:
-            self._on_message(WaitsForNode(f"its worker is not placed on a node yet; it needs {self.needs.words()}"))
+            self._on_message(WaitsForNode(f"its worker is not placed on a node yet; it needs {self.needs.describe()}"))
 
     def _tell_end(self, why: ProcessExit) -> None:
         if not self.over:
@@ -203,7 +203,7 @@ class SimulatedPlacement(Placement):
         cluster: SimulatedCluster,
         frames: FrameRecord,
         times: TimeRecord,
-        needs: Callable[[SceneSpec], Needs],
+        needs: Callable[[SceneSpec], ResourceNeeds],
         between_s: float,
     ) -> None:
         super().__init__()
@@ -216,7 +216,7 @@ class SimulatedPlacement(Placement):
 
     def start(
         self, entry: Entry, spec: Any, on_message: Callable[[Any], None], on_end: Callable[[ProcessExit], None]
-    ) -> AnyProcess:
+    ) -> ProcessHandle:
         """See `Placement`."""
         assert isinstance(spec, SceneSpec)
         needs = replace(self._needs(spec), scene=spec.folder.name)

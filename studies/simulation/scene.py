@@ -131,7 +131,7 @@ class SimulatedScene:
             case Ready():
                 self._background.run(self._resume(message, self.worker.life))
             case FrameCommitted():
-                self.worker.deaths.committed()
+                self.worker.deaths.note_commit()
                 self._frames.report(self.plan.name, message.index, message.report["worker"])
                 self._committed, self._at = message.index + 1, None
                 self._begin()
@@ -148,12 +148,12 @@ class SimulatedScene:
         self.worker.ready = True
         self._times.resume(self.plan.name, self.plan.kind)
         self._begin()
-        self._background.run(self.worker.sweep(), endless=True)
+        self._background.run(self.worker.remove_earlier_epochs(), endless=True)
         self._end_if_done()
 
     def _worker_ended(self, reason: ProcessExit) -> None:
         self._times.want(self.plan.name, "loss", self.plan.kind)
-        _, delay = self.worker.deaths.died(reason)
+        _, delay = self.worker.deaths.note_death(reason)
         self.trouble = f"the worker is gone: {reason}"
         self._background.run(self._after_death(reason, delay))
 

@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable
 from random import Random
 
-from server.cluster.needs import Needs
+from server.cluster.resource_needs import ResourceNeeds
 from server.messages import SceneSpec
 from studies.simulation.cluster import SimulatedCluster
 from studies.simulation.delays import DOWN_S, RECOVER_S
@@ -35,7 +35,7 @@ class SimulatedService:
         frames: FrameRecord,
         times: TimeRecord,
         takeovers: Takeovers,
-        needs: Callable[[SceneSpec], Needs],
+        needs: Callable[[SceneSpec], ResourceNeeds],
         between_s: float,
     ) -> None:
         self.up = True

@@ -13,7 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from scas4d_core.settings import Settings
-from server.cluster.needs import Needs, needs_of
+from server.cluster.resource_needs import ResourceNeeds, resource_needs
 from server.messages import SceneSpec
 from server.processes import worker
 from server.settings import ServerSettings
@@ -165,8 +165,8 @@ async def _run(sizes: Sizes, data: DataFolder) -> Outcome:
     )
 
 
-def _needs(spec: SceneSpec) -> Needs:
-    needs = needs_of(worker.main, spec, ServerSettings())
+def _needs(spec: SceneSpec) -> ResourceNeeds:
+    needs = resource_needs(worker.main, spec, ServerSettings())
     assert needs is not None
     return needs
 

@@ -7,12 +7,12 @@ from typing import Annotated
 
 import typer
 
-from client.cli.capture_options import takes_capture
+from client.cli.capture_options import with_capture_options
 from client.importers.open_source import CaptureOptions
 from studies.options import Again, Captures, Page, write_page
 
 
-@takes_capture
+@with_capture_options
 def variants(
     captures: Captures,
     options: CaptureOptions,
@@ -24,7 +24,7 @@ def variants(
             "preset=adaptive, or a constant by its dotted name. The first is what the others are compared with.",
         ),
     ],
-    out: Annotated[Path, typer.Option(help="Folder of the study: rows, frames 0. Run again to go on.")] = Path(
+    out: Annotated[Path, typer.Option(help="Folder of the study: rows, frames 0. Run again to continue.")] = Path(
         "out/variants"
     ),
     variant: Annotated[list[str] | None, typer.Option(help="Only this variant; all when left out.")] = None,

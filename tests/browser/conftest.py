@@ -70,7 +70,7 @@ def service(tmp_path_factory):
 @pytest.fixture(scope="session")
 def finished(service):
     """A scene whose frames are all committed."""
-    with Client(service.url, patience=HANG_S) as sdk:
+    with Client(service.url, busy_timeout=HANG_S) as sdk:
         id = start_scene(sdk)
         for index in range(FRAMES):
             push(sdk, id, index)

@@ -12,7 +12,7 @@ from client.sdk import Client
 @pytest.fixture
 def five(service):
     """A scene with five committed frames."""
-    with Client(service.url, patience=HANG_S) as sdk:
+    with Client(service.url, busy_timeout=HANG_S) as sdk:
         id = start_scene(sdk, "again")
         try:
             for index in range(5):

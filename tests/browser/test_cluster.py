@@ -10,7 +10,15 @@ from running import Running, fake_settings, make_rig
 
 from client.sdk import Client
 
-NODE = {"gpus": 0, "memory_mb": 16_000, "memory_taken_mb": 0, "cpus": 8, "cpus_taken": 0, "labels": {}, "scenes": []}
+NODE = {
+    "gpus": 0,
+    "memory_mb": 16_000,
+    "memory_reserved_mb": 0,
+    "cpus": 8,
+    "cpus_reserved": 0,
+    "labels": {},
+    "scenes": [],
+}
 WORDS = "document.getElementById('cluster-words').textContent"
 
 
@@ -25,8 +33,8 @@ def told(scene):
             "n1",
             "stage-1.studio.example",
             labels={"rig": "stage-a", "disk": "fast"},
-            cpus_taken=2.5,
-            memory_taken_mb=3_900,
+            cpus_reserved=2.5,
+            memory_reserved_mb=3_900,
             scenes=[scene, "0123456789ab"],
         ),
         node("n2", "stage-2.studio.example", alive=False),
@@ -37,7 +45,7 @@ def told(scene):
         {"scene": "ba9876543210", "role": "worker", "needs": needs, "seconds": 200},
         {"scene": scene, "role": "exporter", "needs": "0.1 CPU and 0.2 GB of memory", "seconds": 1},
     ]
-    return {"placement": "ray", "nodes": nodes, "waiting": waiting, "answers": True}
+    return {"placement": "ray", "nodes": nodes, "waiting": waiting, "head_responds": True}
 
 
 class Stub:
@@ -105,14 +113,14 @@ def test_it_follows_while_it_is_open_and_keeps_the_focus(sized, stubbed, finishe
     dialog(sized)
     sized.locator(f'#cluster-nodes [data-scene="{finished}"]').focus()
     changed = copy.deepcopy(stubbed.answer)
-    changed["nodes"][1]["cpus_taken"] = 7.25
+    changed["nodes"][1]["cpus_reserved"] = 7.25
     changed["waiting"] = []
     stubbed.answer = changed
     until(sized, "document.getElementById('cluster-nodes').innerText.includes('7.25 of 8')")
     assert sized.evaluate("document.activeElement.dataset.scene") == finished
     assert sized.locator("#cluster-waiting").is_hidden()
     assert sized.locator("#cluster-words").inner_text().endswith("No process waits for a node.")
-    stubbed.answer = {**changed, "answers": False}
+    stubbed.answer = {**changed, "head_responds": False}
     until(sized, f"{WORDS}.startsWith('The head of the cluster does not answer')")
     stubbed.answer = None
     until(sized, f"{WORDS}.startsWith('The service ends. What is below')")

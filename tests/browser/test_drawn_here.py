@@ -102,7 +102,7 @@ def test_playing_slowly_shows_what_is_between_frames(page, service, finished):
 
 def test_frames_are_drawn_from_the_compact_files_of_the_scene(page, service):
     """Its answers end where a file of the service does, and begin with frames by which others are told."""
-    with Client(service.url, patience=HANG_S) as sdk:
+    with Client(service.url, busy_timeout=HANG_S) as sdk:
         id = start_scene(sdk, "long", ingest=IngestSettings(exact_states=24))
         for index in range(30):
             push(sdk, id, index)
@@ -117,7 +117,7 @@ def test_frames_are_drawn_from_the_compact_files_of_the_scene(page, service):
 
 
 def test_a_new_frame_is_drawn_live(page, service):
-    with Client(service.url, patience=HANG_S) as sdk:
+    with Client(service.url, busy_timeout=HANG_S) as sdk:
         id = start_scene(sdk, "growing")
         push(sdk, id, 0)
         sdk.wait(id, 0)

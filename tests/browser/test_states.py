@@ -23,7 +23,7 @@ def title(page, words):
 
 @contextmanager
 def scene_of(service, **options):
-    with Client(service.url, patience=HANG_S) as sdk:
+    with Client(service.url, busy_timeout=HANG_S) as sdk:
         id = start_scene(sdk, **options)
         yield sdk, id
         sdk.delete_scene(id)
@@ -119,7 +119,7 @@ def test_asleep(sized, service):
 
 
 def test_deleted(sized, service, finished):
-    with Client(service.url, patience=HANG_S) as sdk:
+    with Client(service.url, busy_timeout=HANG_S) as sdk:
         id = start_scene(sdk, "short")
         opened(sized, service, id)
         title(sized, "Waiting for the first frame")
@@ -133,7 +133,7 @@ def test_deleted(sized, service, finished):
 def test_offline(sized, tmp_path):
     service = Running(fake_settings(tmp_path), core=browser_engine.install)
     try:
-        with Client(service.url, patience=HANG_S) as sdk:
+        with Client(service.url, busy_timeout=HANG_S) as sdk:
             id = start_scene(sdk)
             push(sdk, id, 0)
             sdk.wait(id, 0)
@@ -213,7 +213,7 @@ def test_a_deletion_that_fails_is_told(sized, service):
 
 
 def test_a_scene_is_begun_again_and_deleted_by_hand(sized, service):
-    with Client(service.url, patience=HANG_S) as sdk:
+    with Client(service.url, busy_timeout=HANG_S) as sdk:
         id = start_scene(sdk, "by hand")
         for index in range(2):
             push(sdk, id, index)

@@ -31,7 +31,7 @@ def ready(page):
 
 @pytest.fixture(scope="module")
 def scene(service):
-    with Client(service.url, patience=HANG_S) as sdk:
+    with Client(service.url, busy_timeout=HANG_S) as sdk:
         id = start_scene(sdk, "takeaway")
         for index in range(4):
             push(sdk, id, index)

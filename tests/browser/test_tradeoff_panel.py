@@ -25,7 +25,7 @@ GROUPED = """async () => {
 @pytest.fixture
 def ran(service):
     """Frames with 100 and 40 iterations; frame 6 is held, of frame 7 a camera is left out."""
-    with Client(service.url, patience=HANG_S) as sdk:
+    with Client(service.url, busy_timeout=HANG_S) as sdk:
         id = start_scene(sdk, "budgets")
         for index in range(9):
             if index == 4:
@@ -103,7 +103,7 @@ def test_a_slider_that_is_let_go_where_it_was_changes_nothing(page, service, ran
 
 
 def test_frames_under_a_budget_in_time_are_one_point(page, service):
-    with Client(service.url, patience=HANG_S) as sdk:
+    with Client(service.url, busy_timeout=HANG_S) as sdk:
         id = start_scene(sdk, "times")
         for index in range(4):
             push(sdk, id, index)

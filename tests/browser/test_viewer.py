@@ -63,14 +63,14 @@ def test_a_scene_is_picked_and_shown_with_its_figures(page, service, finished):
 
 
 def test_the_effects_are_listed_with_what_switched_them(page, service):
-    with Client(service.url, patience=HANG_S) as sdk:
+    with Client(service.url, busy_timeout=HANG_S) as sdk:
         id = start_scene(sdk, settings={"effects": {"static_colour": "off"}})
         push(sdk, id, 0)
         sdk.wait(id, 0)
         opened(page, service, id)
         page.locator("#effects li").wait_for()
         assert page.locator("#effects li").all_inner_texts() == ["Static colour: pinned off"]
-        usual, idle = page.locator("#effects-words").inner_text().split("Not called for: ")
+        usual, idle = page.locator("#effects-words").inner_text().split("Not needed here: ")
         assert usual.startswith("In every update: ")
         assert "rigidity" in usual
         assert "floor" in idle
@@ -186,7 +186,7 @@ def test_a_bumped_camera_shows(page, service, finished):
 
 
 def test_a_scene_from_its_first_frame_to_its_deletion(page, service, finished):
-    with Client(service.url, patience=HANG_S) as sdk:
+    with Client(service.url, busy_timeout=HANG_S) as sdk:
         id = start_scene(sdk, "newborn")
         opened(page, service, id)
         until(page, "document.querySelector('#curtain h2').innerText === 'Waiting for the first frame'")
@@ -211,7 +211,7 @@ def test_it_connects_again_when_the_service_restarts(page, tmp_path):
     settings = fake_settings(tmp_path)
     service = Running(settings, core=browser_engine.install)
     try:
-        with Client(service.url, patience=HANG_S) as sdk:
+        with Client(service.url, busy_timeout=HANG_S) as sdk:
             id = start_scene(sdk)
             push(sdk, id, 0)
             sdk.wait(id, 0)
@@ -223,7 +223,7 @@ def test_it_connects_again_when_the_service_restarts(page, tmp_path):
         assert page.locator("#curtain").is_hidden()  # the last picture stays
         service = Running(settings, service.port, core=browser_engine.install)
         page.wait_for_selector("#banner[hidden]", state="attached")
-        with Client(service.url, patience=HANG_S) as sdk:
+        with Client(service.url, busy_timeout=HANG_S) as sdk:
             push(sdk, id, 1)
         shown(page, frame="1")
     finally:
@@ -259,7 +259,7 @@ def test_a_token_is_asked_for_and_the_stream_opens_with_a_ticket(page, tmp_path)
     token = "a-token-that-is-long-enough"
     service = Running(fake_settings(tmp_path, token=token), core=browser_engine.install)
     try:
-        with Client(service.url, token=token, patience=HANG_S) as sdk:
+        with Client(service.url, token=token, busy_timeout=HANG_S) as sdk:
             id = start_scene(sdk)
             push(sdk, id, 0)
             sdk.wait(id, 0)
@@ -303,7 +303,7 @@ def test_nothing_comes_from_elsewhere(page, service, finished):
 
 
 def test_a_scene_that_begins_again_is_shown_anew(page, service):
-    with Client(service.url, patience=HANG_S) as sdk:
+    with Client(service.url, busy_timeout=HANG_S) as sdk:
         id = start_scene(sdk)
         for index in range(5):
             push(sdk, id, index)
@@ -438,7 +438,7 @@ def test_a_link_shows_one_scene_and_changes_nothing(page, tmp_path):
     token = "a-token-that-is-long-enough"
     service = Running(fake_settings(tmp_path, token=token), core=browser_engine.install)
     try:
-        with Client(service.url, token=token, patience=HANG_S) as sdk:
+        with Client(service.url, token=token, busy_timeout=HANG_S) as sdk:
             id, other = start_scene(sdk, "shown"), start_scene(sdk, "hidden")
             push(sdk, id, 0)
             sdk.wait(id, 0)

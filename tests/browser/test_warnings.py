@@ -14,7 +14,7 @@ from client.sdk import Client
 @pytest.fixture
 def guessed(service):
     """A scene whose frame 0 is a guess, and whose calibration seems to be off; its last frame has alarms."""
-    with Client(service.url, patience=HANG_S) as sdk:
+    with Client(service.url, busy_timeout=HANG_S) as sdk:
         id = start_scene(sdk, "guessed")
         try:
             push(sdk, id, 0, red=fakes.GUESSED)

@@ -137,7 +137,7 @@ def test_the_dump_of_a_frame_is_what_the_client_sends():
 
 def test_the_head_and_its_limits_are_those_of_the_wire():
     head, files = set(FrameHead.model_fields), set(FrameFile.model_fields)
-    rows = set(re.findall(r"^\| `([a-z\[\].]+)` \| [^|]*(?:integer|number|array|string|image|boolean)", PAGE, re.M))
+    rows = set(re.findall(r"^\| `([a-z_\[\].]+)` \| [^|]*(?:integer|number|array|string|image|boolean)", PAGE, re.M))
     assert rows == head | {f"files[].{name}" for name in files}
     for said in (
         MAGIC.decode(),

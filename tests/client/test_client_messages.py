@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from waiting import HANG_S
 
-from client.cli.extras import EXPORTS, SERVER, remedy
+from client.cli.extras import EXPORTS, SERVER, install_hint
 
 pytestmark = pytest.mark.slow
 
@@ -66,11 +66,11 @@ def test_the_client_alone_names_what_to_install(capture_folder, tmp_path, comman
 
 @pytest.mark.parametrize("package", EXPORTS)
 def test_a_missing_package_of_an_extra_names_the_extra(package):
-    said = remedy(ModuleNotFoundError(f"No module named {package!r}", name=f"{package}.module"))
+    said = install_hint(ModuleNotFoundError(f"No module named {package!r}", name=f"{package}.module"))
     assert said is not None
     assert package in said
     assert "pip install -e '.[exports]'" in said
-    assert remedy(ModuleNotFoundError("No module named 'other'", name="other")) is None
+    assert install_hint(ModuleNotFoundError("No module named 'other'", name="other")) is None
 
 
 def test_the_client_alone_still_helps(tmp_path):

@@ -13,7 +13,7 @@ from running import make_rig
 
 from client import errors
 from client.calls import frame, put_frame
-from client.retries import Retries, seconds_asked
+from client.retries import Retries, retry_after_seconds
 from client.sdk import AsyncClient, Client
 
 OK = {"scene": "s", "index": 0, "time": 0.0, "identity": "i"}
@@ -109,11 +109,11 @@ def clock(monkeypatch):
 
 
 def test_patience_with_a_full_queue_ends(clock):
-    client, script = scripted(*[busy()] * 99, patience=0.35)
+    client, script = scripted(*[busy()] * 99, busy_timeout=0.35)
     with pytest.raises(errors.Busy, match="said 429"):
         client.put_frame("s", 0, {"c": b"x"})
     assert 2 < len(script.requests) < 10
-    client, script = scripted(busy("60"), busy("60"), patience=0.1)  # asks for more than there is: one last try
+    client, script = scripted(busy("60"), busy("60"), busy_timeout=0.1)  # asks for more than there is: one last try
     with pytest.raises(errors.Busy):
         client.put_frame("s", 0, {"c": b"x"})
     assert len(script.requests) == 2
@@ -133,7 +133,7 @@ def test_patience_with_a_full_queue_ends(clock):
 )
 def test_a_predicted_wait_is_exact_and_a_long_one_is_asked_about_again(answer, least, most):
     retries = Retries(put_frame("s", 0, {"c": b"x"}), "http://nowhere", busy=1e6, outage=1)
-    assert least <= retries.after_answer(answer) <= most
+    assert least <= retries.after_response(answer) <= most
 
 
 def test_an_outage_is_waited_for_until_its_limit_and_no_longer(clock):
@@ -153,7 +153,7 @@ def test_waits_grow_to_a_limit_and_are_not_all_alike(clock):
         retries = Retries(frame("s", 0), "u", busy=0, outage=1e9)
         waits = []
         for _ in range(12):
-            waits.append(retries.after_break(httpx.ReadError("cut")))
+            waits.append(retries.after_connection_error(httpx.ReadError("cut")))
             clock[0] += waits[-1]
         runs.append(waits)
         expected = [min(0.2 * 2**n, 5.0) for n in range(12)]
@@ -164,10 +164,10 @@ def test_waits_grow_to_a_limit_and_are_not_all_alike(clock):
 def test_a_full_queue_says_that_the_service_is_back(clock):
     """An outage is counted from its own first failure, not from that of one long over."""
     retries = Retries(put_frame("s", 0, {"c": b"x"}), "u", busy=10, outage=0.2)
-    retries.after_break(httpx.ReadError("cut"))
+    retries.after_connection_error(httpx.ReadError("cut"))
     clock[0] += 0.25
-    assert retries.after_answer(busy()) is not None
-    assert retries.after_break(httpx.ReadError("cut")) <= 0.2
+    assert retries.after_response(busy()) is not None
+    assert retries.after_connection_error(httpx.ReadError("cut")) <= 0.2
 
 
 def test_a_delete_that_was_lost_on_the_way_back_is_done():
@@ -182,12 +182,12 @@ def test_a_delete_that_was_lost_on_the_way_back_is_done():
 
 
 def test_retry_after_is_seconds_or_a_date():
-    assert seconds_asked("7") == 7
+    assert retry_after_seconds("7") == 7
     later = format_datetime(datetime.now(UTC) + timedelta(seconds=30), usegmt=True)
-    assert 25 < seconds_asked(later) <= 30
-    assert seconds_asked(format_datetime(datetime.now(UTC) - timedelta(days=1), usegmt=True)) == 0
-    assert seconds_asked("soon") is None
-    assert seconds_asked("") is None
+    assert 25 < retry_after_seconds(later) <= 30
+    assert retry_after_seconds(format_datetime(datetime.now(UTC) - timedelta(days=1), usegmt=True)) == 0
+    assert retry_after_seconds("soon") is None
+    assert retry_after_seconds("") is None
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ def capture(capture_folder):
 
 @pytest.fixture
 def client(service):
-    with Client(service.url, patience=HANG_S) as client:
+    with Client(service.url, busy_timeout=HANG_S) as client:
         yield client
         for status in client.scenes():
             client.delete_scene(status.id)
@@ -30,13 +30,13 @@ def client(service):
 
 def test_losses_and_lateness_are_the_same_every_time():
     pace = Pace(fps=5, jitter=0.1, drop=0.3, seed=4)
-    lost = [index for index in range(1000) if pace.loses(index)]
-    assert lost == [index for index in range(1000) if Pace(fps=5, drop=0.3, seed=4).loses(index)]
-    assert lost != [index for index in range(1000) if Pace(fps=5, drop=0.3, seed=5).loses(index)]
+    lost = [index for index in range(1000) if pace.drops(index)]
+    assert lost == [index for index in range(1000) if Pace(fps=5, drop=0.3, seed=4).drops(index)]
+    assert lost != [index for index in range(1000) if Pace(fps=5, drop=0.3, seed=5).drops(index)]
     assert 240 < len(lost) < 360
     assert 0 not in lost
-    assert not Pace().loses(5)
-    late = [pace.late(index, "c") for index in range(1000)]
+    assert not Pace().drops(5)
+    late = [pace.delay(index, "c") for index in range(1000)]
     assert all(0 <= value <= 0.1 for value in late)
     assert 0.045 < sum(late) / 1000 < 0.055
 
@@ -49,7 +49,7 @@ def test_a_pace_that_cannot_be_is_named(field, value):
 
 def test_a_loop_goes_back_and_forth_and_time_only_forward(capture):
     sequence = Sequence(capture, start=1, loop=True)
-    assert [sequence.place(index) for index in range(9)] == [1, 2, 3, 2, 1, 2, 3, 2, 1]
+    assert [sequence.capture_index(index) for index in range(9)] == [1, 2, 3, 2, 1, 2, 3, 2, 1]
     times = [sequence.time(index) for index in range(9)]
     assert times == pytest.approx([index / 30 for index in range(9)])
     assert sequence.files(3).images == {name: capture.encoded_image(2, name) for name in ("0", "1")}
@@ -59,7 +59,7 @@ def test_a_loop_goes_back_and_forth_and_time_only_forward(capture):
     assert len(once) == 3
     once.close()
     alone = Sequence(capture, start=3, loop=True)
-    assert [alone.place(index) for index in range(3)] == [3, 3, 3]
+    assert [alone.capture_index(index) for index in range(3)] == [3, 3, 3]
     alone.close()
     with pytest.raises(ValueError, match=r"start 4 is not one of the frames 0…3"):
         Sequence(capture, start=4)
@@ -82,7 +82,7 @@ def test_a_rig_that_loses_frames_goes_on(client, capture, websocket):
     said = []
     pace = Pace(drop=0.5, seed=1)
     delivery = push(capture, client, pace=pace, frames=20, loop=True, websocket=websocket, on_message=said.append)
-    lost = [index for index in range(20) if pace.loses(index)]
+    lost = [index for index in range(20) if pace.drops(index)]
     assert delivery.lost == lost != []
     states = [client.frame(delivery.scene, index).state for index in range(20)]
     assert states == ["missing" if index in lost else "committed" for index in range(20)]
@@ -104,7 +104,7 @@ def test_each_camera_sends_its_own(client, capture, websocket):
         ingest=IngestSettings(minimum_cameras=1),
     )
     for index in range(8):
-        lost = [name for name in ("0", "1") if pace.loses(index, name)]
+        lost = [name for name in ("0", "1") if pace.drops(index, name)]
         report = client.frame(delivery.scene, index)
         assert report.state == ("missing" if len(lost) == 2 else "committed")
         if len(lost) == 1:
@@ -193,7 +193,7 @@ def test_a_restart_of_the_service_is_waited_out(capture, tmp_path):
             restarting.start()
 
     try:
-        with Client(running.url, outage=HANG_S, patience=HANG_S) as client:
+        with Client(running.url, outage=HANG_S, busy_timeout=HANG_S) as client:
             delivery = push(
                 capture, client, pace=Pace(fps=10), frames=20, loop=True, on_progress=told, on_message=said.append
             )

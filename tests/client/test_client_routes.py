@@ -88,7 +88,7 @@ def test_every_route_has_a_method_and_every_method_a_route(service):
 
 
 def test_pause_close_missing_and_listings(service):
-    with Client(service.url, patience=HANG_S) as client:
+    with Client(service.url, busy_timeout=HANG_S) as client:
         scene = client.create_scene(make_rig())
         try:
             assert client.rig(scene.id).names == ("c0", "c1")

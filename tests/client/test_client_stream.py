@@ -13,9 +13,9 @@ from websockets.asyncio.server import serve
 from client.errors import NotAuthorized, ServiceUnreachable
 from client.stream import AsyncStream, ViewEvent, finished_frames, view
 from client.wire import ProblemDetails
-from client.wire.stream import STREAM_PROTOCOL, BulkHead, pack
+from client.wire.stream import STREAM_PROTOCOL, BinaryHead, pack
 
-HEAD = BulkHead(type="render", id="v", missed=0, frame=4, media_type="image/png")
+HEAD = BinaryHead(type="render", id="v", missed=0, frame=4, media_type="image/png")
 
 
 def run(test):

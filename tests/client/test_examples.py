@@ -29,7 +29,7 @@ def examples() -> list[doctest.DocTest]:
 @pytest.fixture(scope="module")
 def scenes(service):
     """A scene whose frames 0 to 2 are committed, and one that takes further frames."""
-    with Client(service.url, patience=HANG_S) as client:
+    with Client(service.url, busy_timeout=HANG_S) as client:
         made = [client.create_scene(make_rig()).id for _ in range(2)]
         for id, count in zip(made, (3, 1), strict=True):
             for index in range(count):
@@ -42,7 +42,7 @@ def scenes(service):
 
 @pytest.mark.parametrize("example", examples(), ids=lambda test: test.name)
 def test_an_example_gives_what_it_says(example, service, scenes, capture_folder, tmp_path):
-    with Client(service.url, patience=HANG_S) as client:
+    with Client(service.url, busy_timeout=HANG_S) as client:
         given = {"client": client, "url": service.url, "rig": make_rig(), "pictures": pictures()}
         given |= {"folder": capture_folder, "out": tmp_path / "out", "np": np, "asyncio": asyncio, "time": time}
         given |= {"scene": scenes[0], "open_scene": scenes[1]}

@@ -12,7 +12,7 @@ IMAGES = {"c0": b"abc", "c1": b""}
 def test_a_frame_comes_back_as_it_was_sent():
     data = b"".join(frame_chunks(7, IMAGES, {"c0": b"mm"}, 0.25, part=True))
     head, pieces = parse_frame(data)
-    assert (head.index, head.time, head.part) == (7, 0.25, True)
+    assert (head.index, head.time, head.single_camera) == (7, 0.25, True)
     assert [(file.camera, file.kind, bytes(piece)) for file, piece in zip(head.files, pieces, strict=True)] == [
         ("c0", "image", b"abc"),
         ("c1", "image", b""),

@@ -43,7 +43,7 @@ def guarded_service(tmp_path_factory):
 
 @pytest.fixture
 def sdk(guarded_service):
-    with Client(guarded_service.url, token=TOKEN, patience=HANG_S) as client:
+    with Client(guarded_service.url, token=TOKEN, busy_timeout=HANG_S) as client:
         yield client
 
 

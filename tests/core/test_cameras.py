@@ -119,7 +119,7 @@ def changed(field, index, value):
         ("intrinsics", (0, 1), 0.5, "undo skew"),
         ("intrinsics", (1, 2), np.nan, "intrinsics holds NaN"),
         ("world_to_camera", (0, 3), np.inf, "world_to_camera holds NaN or infinity"),
-        ("world_to_camera", (slice(0, 3), slice(0, 3)), np.eye(3) * 1.5, "no rotation"),
+        ("world_to_camera", (slice(0, 3), slice(0, 3)), np.eye(3) * 1.5, "not a rotation"),
         ("world_to_camera", (slice(0, 3), slice(0, 3)), np.diag([1, 1, -1]), "left-handed frame"),
         ("world_to_camera", 3, (0, 0, 1, 1), "last row"),
     ],

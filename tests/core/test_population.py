@@ -215,7 +215,7 @@ def test_an_effect_that_breaks_the_rules_is_named(
     install(
         monkeypatch, lambda seen: replace(seen.result, gaussians=seen.result.gaussians.rows(np.arange(COUNT)[::-1]))
     )
-    with pytest.raises(ValueError, match="rows were lost or moved"):
+    with pytest.raises(ValueError, match="rows were removed or reordered"):
         scene.step(FRAMES[True][1])
     effect_module.effect.cache_clear()
 

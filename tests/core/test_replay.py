@@ -74,7 +74,7 @@ def test_frames_that_were_not_met_do_not_count_unless_all_are():
         seconds = {"decode": milliseconds / 1000}
         return FrameReport(0, 0.0, 5, seconds, [0.1], 30.0, 1, 1, errors={"end": error, "previous": 9.0}, **more)
 
-    clean, held = report(10, 0.1), report(99, 0.9, degraded="previous state kept: dark", kept="previous")
+    clean, held = report(10, 0.1), report(99, 0.9, degraded="previous state kept: dark", candidate="previous")
     tried = report(50, 0.5, attempts=["as set: 9 are not finite", "smaller steps"])
     found = summary(5, [clean, held, tried])
     assert (found.milliseconds, found.error, found.frames) == (pytest.approx(10), 0.1, 1)

@@ -116,7 +116,7 @@ def test_a_left_handed_frame_is_named():
     pose = np.diag([1.0, 1, -1, 1])
     with pytest.raises(CameraError, match=r"camera 'a': .* has determinant -1: a left-handed frame; mirror one axis"):
         Camera("a", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], pose, 64, 48)
-    with pytest.raises(CameraError, match=r"is no rotation \(determinant -8\)"):
+    with pytest.raises(CameraError, match=r"is not a rotation \(determinant -8\)"):
         Camera("a", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.diag([2.0, 2, -2, 1]), 64, 48)
 
 

@@ -72,7 +72,7 @@ def test_what_contradicts_a_preset_is_refused() -> None:
 
 
 def test_an_unknown_preset_names_those_there_are() -> None:
-    with pytest.raises(ValueError, match=r"preset='faster': there is no preset of this name; give one of .*scas4d"):
+    with pytest.raises(ValueError, match=r"preset='faster': there is no preset with this name; give one of .*scas4d"):
         preset("faster")
 
 

@@ -35,9 +35,9 @@ MATCHER = re.compile(r'(\w+)\s*(?:=~|!~|!=|=)\s*"([^"]*)"')
 def families(tmp_path_factory: pytest.TempPathFactory) -> list[Metric]:
     """All metrics of a service that is ready, and has had every outcome: other tests may have had some of them."""
     for outcome in ("answered", "failed", "cancelled"):  # `Readers.ask`
-        counters.ANSWER_SECONDS.labels("render", outcome)
+        counters.QUERY_SECONDS.labels("render", outcome)
     settings = ServerSettings(data=tmp_path_factory.mktemp("data"))
-    room = {"cpus": 8, "cpus_taken": 1, "gpus": 0, "memory_mb": 16_000, "memory_taken_mb": 700}
+    room = {"cpus": 8, "cpus_reserved": 1, "gpus": 0, "memory_mb": 16_000, "memory_reserved_mb": 700}
     node = Node(id="n", host="h", alive=True, scenes=["s"], **room)
     cluster = Cluster(placement="ray", nodes=[node], waiting=[])
     state = ServiceState(settings, [], 0, 1.0, {"idle": 0}, cluster)

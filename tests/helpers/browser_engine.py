@@ -56,8 +56,8 @@ class DrawnReconstruction(fakes.FakeReconstruction):
         alarms = []
         if frame.index >= BUMPED_FROM:
             fits["c2"] = {"psnr": 21.0, "colour_shift": [0.06, 0.01, -0.02], "health": 0.2}
-            alarms = [{"what": "camera_misfit", "camera": "c2", "evidence": "its picture fits 11.0 dB worse: moved?"}]
-            alarms.append({"what": "light", "camera": None, "evidence": "the pictures are 1.3 times as bright"})
+            alarms = [{"kind": "camera_misfit", "camera": "c2", "evidence": "its picture fits 11.0 dB worse: moved?"}]
+            alarms.append({"kind": "light", "camera": None, "evidence": "the pictures are 1.3 times as bright"})
         seconds = {"total": (0.8 + 0.1 * (frame.index % 3)) * self.iterations / fakes.ITERATIONS}
         more = {"cameras": fits, "psnr": 31.0 + np.sin(frame.index), "seconds": seconds, "alarms": alarms}
         if not self.history.indices and next(iter(frame.images.values()))[0, 0, 0] == fakes.GUESSED:

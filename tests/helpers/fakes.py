@@ -161,16 +161,16 @@ class FakeReconstruction:
             **(notes or {}),
         }
         if red == HELD:
-            record |= {"degraded": "previous state kept: the fake was asked to", "kept": "previous", "used": []}
+            record |= {"degraded": "previous state kept: the fake was asked to", "candidate": "previous", "used": []}
         if red == STANDS:
-            record |= {"iterations": 0, "kept": "previous", "used": []}
+            record |= {"iterations": 0, "candidate": "previous", "used": []}
         if red == LEAVES_OUT:
             record["dropped"] = {**record["dropped"], "c1": "it shows nothing"}
-            out = {"what": "camera_left_out", "camera": "c1", "evidence": "left out of this frame: it shows nothing"}
+            out = {"kind": "camera_left_out", "camera": "c1", "evidence": "left out of this frame: it shows nothing"}
             record["alarms"] = [*record.get("alarms", []), out]
         if red == LATE:
-            record["timing"] = {"c0": {"frames": 0.0, "error": 0.02, "off": False}}
-            record["timing"]["c1"] = {"frames": 0.4, "error": 0.02, "off": True}
+            record["timing"] = {"c0": {"frames": 0.0, "error": 0.02, "out_of_step": False}}
+            record["timing"]["c1"] = {"frames": 0.4, "error": 0.02, "out_of_step": True}
         if red == GUESSED and not known:
             record |= {
                 "cloud": {"method": "volume", "points": count, "coverage": 0.0},
@@ -183,7 +183,7 @@ class FakeReconstruction:
             {"iterations": self.iterations, "milliseconds": MS_EACH * self.iterations, "loss": 0.25},
         ]
         record["errors"] = {"previous": 0.5, "end": 1 / self.iterations}
-        record |= {"kept": record.get("kept", "end"), "attempts": ["as set"], "threads": 2}
+        record |= {"candidate": record.get("candidate", "end"), "attempts": ["as set"], "threads": 2}
         self.history.append(frame.index, frame.time, state(self.points, frame.index, before, red), record)
         return report
 

@@ -16,9 +16,9 @@ from starlette.responses import JSONResponse, StreamingResponse
 from starlette.routing import Route, WebSocketRoute
 from waiting import HANG_S, wait_for
 
-from server.connections.config import guarded
+from server.connections.client_limit import ClientLimit
+from server.connections.config import uvicorn_config
 from server.connections.guard import ConnectionGuard, ConnectionLimits
-from server.connections.proxies import ClientLimit
 from server.connections.websocket import limit_messages
 from server.settings import ServerSettings
 
@@ -194,7 +194,7 @@ def stub(uvicorn_options=None, **changes):
     with socket.create_server(("127.0.0.1", 0)) as listening:
         seen.port = listening.getsockname()[1]
         seen.guard = app.state.guard
-        config = guarded(app, log_level="error", timeout_graceful_shutdown=1, **(uvicorn_options or {}))
+        config = uvicorn_config(app, log_level="error", timeout_graceful_shutdown=1, **(uvicorn_options or {}))
         server = uvicorn.Server(config)
         thread = threading.Thread(target=server.run, args=([listening],))
         thread.start()

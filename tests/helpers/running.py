@@ -14,7 +14,7 @@ from waiting import HANG_S, wait_for
 
 from scas4d_core.cameras import Camera, Rig
 from server.app import create_app
-from server.connections.config import guarded
+from server.connections.config import uvicorn_config
 from server.problems import Problem
 from server.processes.placement import Placement
 from server.settings import ServerSettings
@@ -33,7 +33,7 @@ class Running:
             free.bind(("127.0.0.1", 0))
             self.port = port or free.getsockname()[1]
         self.app = create_app(settings, placement(core))
-        config = guarded(self.app, port=self.port, log_level="error")
+        config = uvicorn_config(self.app, port=self.port, log_level="error")
         self.server = uvicorn.Server(config)
         self.thread = threading.Thread(target=self.server.run)
         self.thread.start()

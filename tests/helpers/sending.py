@@ -22,7 +22,10 @@ FRAMED = {"Content-Type": FRAME_MEDIA_TYPE}
 def serving(folder):
     running = Running(fake_settings(folder))
     try:
-        with httpx.Client(base_url=running.url, timeout=HANG_S) as http, Client(running.url, patience=HANG_S) as sdk:
+        with (
+            httpx.Client(base_url=running.url, timeout=HANG_S) as http,
+            Client(running.url, busy_timeout=HANG_S) as sdk,
+        ):
             yield http, sdk
     finally:
         running.stop()
@@ -93,7 +96,10 @@ def animated():
 def serving_with(folder, **changes):
     running = Running(fake_settings(folder, **changes))
     try:
-        with httpx.Client(base_url=running.url, timeout=HANG_S) as http, Client(running.url, patience=HANG_S) as sdk:
+        with (
+            httpx.Client(base_url=running.url, timeout=HANG_S) as http,
+            Client(running.url, busy_timeout=HANG_S) as sdk,
+        ):
             yield running, http, sdk
     finally:
         running.stop()

@@ -25,7 +25,7 @@ def http(service):
 
 @pytest.fixture
 def sdk(service):
-    with Client(service.url, patience=HANG_S) as client:
+    with Client(service.url, busy_timeout=HANG_S) as client:
         yield client
 
 

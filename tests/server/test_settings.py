@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from server.settings import ServerSettings, SettingsError, unknown
+from server.settings import ServerSettings, SettingsError, unknown_names
 
 ROOT = Path(__file__).parents[2]
 
@@ -29,7 +29,7 @@ def test_what_is_given_wins_over_the_environment_and_that_over_the_file(tmp_path
     ("text", "said"),
     [
         ('tokken = "x"', r"tokken.*token_file"),
-        ("max_scenes = ", "no TOML"),
+        ("max_scenes = ", "not valid TOML"),
         ("max_scenes = 0", "setting max_scenes.*greater than or equal to 1"),
         ('host = "::"', "no token"),
         ('allowed_origins = ["studio.example"]', "allowed_origins.*scheme"),
@@ -59,7 +59,7 @@ def test_a_file_that_is_not_there_is_refused():
 
 def test_a_misspelt_variable_is_noticed():
     environment = {"SCAS4D_PORT": "1", "SCAS4D_PROT": "1", "SCAS4D_CONFIG": "x", "SCAS4D_URL": "y", "PATH": "/bin"}
-    assert unknown(environment) == ["SCAS4D_PROT"]
+    assert unknown_names(environment) == ["SCAS4D_PROT"]
 
 
 @pytest.mark.parametrize("name", ServerSettings.model_fields)

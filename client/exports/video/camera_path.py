@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.exports.video.key_poses import KeyPose, KeyPoses, pose_error, read_key_poses
-from client.exports.video.rig_view import RigView, looking
+from client.exports.video.rig_view import RigView, look_at
 from scas4d_core.cameras import Camera, CameraError, Rig
 from scas4d_core.errors import InputError
 
@@ -21,15 +21,15 @@ Float = NDArray[np.float64]
 CameraPath = Callable[[float], Camera]
 """Seconds since the beginning of the video to the camera, in the user's world, as large as the picture."""
 
-POLE = np.radians(88)
+MAX_ELEVATION = np.radians(88)
 """Highest an orbit goes: straight from above, "up" would have no direction."""
 
 
-def fitted(camera: Camera, size: tuple[int, int]) -> Camera:
+def fit_to_size(camera: Camera, size: tuple[int, int]) -> Camera:
     """The camera for a picture of another size (width, height): its own picture fits whole, in the middle.
 
     >>> camera = Camera("a", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
-    >>> wide = fitted(camera, (256, 96))
+    >>> wide = fit_to_size(camera, (256, 96))
     >>> wide.fx, wide.cx, wide.cy
     (200.0, 128.0, 48.0)
     """
@@ -41,26 +41,26 @@ def fitted(camera: Camera, size: tuple[int, int]) -> Camera:
     return Camera(camera.name, lens, camera.world_to_camera, width, height)
 
 
-def centred(camera: Camera, size: tuple[int, int]) -> Camera:
-    """As ``fitted``, with the optical axis in the middle of the picture."""
-    fitted_camera = fitted(camera, size)
+def centre_axis(camera: Camera, size: tuple[int, int]) -> Camera:
+    """As ``fit_to_size``, with the optical axis in the middle of the picture."""
+    fitted_camera = fit_to_size(camera, size)
     scale = min(fitted_camera.fx, fitted_camera.fy)
     lens = np.array([[scale, 0, size[0] / 2], [0, scale, size[1] / 2], [0, 0, 1]])
     return Camera(fitted_camera.name, lens, fitted_camera.world_to_camera, *size)
 
 
-def still(camera: Camera, size: tuple[int, int]) -> CameraPath:
+def fixed_path(camera: Camera, size: tuple[int, int]) -> CameraPath:
     """The path of a camera that stands.
 
     >>> camera = Camera("a", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
-    >>> still(camera, (64, 48))(3.0).cx
+    >>> fixed_path(camera, (64, 48))(3.0).cx
     32.0
     """
-    standing = fitted(camera, size)
+    standing = fit_to_size(camera, size)
     return lambda seconds: standing
 
 
-def orbit(rig: Rig, start: Camera, size: tuple[int, int], turn: float) -> CameraPath:
+def orbit_path(rig: Rig, start: Camera, size: tuple[int, int], turn: float) -> CameraPath:
     """A way around the point that the rig looks at.
 
     Args:
@@ -70,31 +70,31 @@ def orbit(rig: Rig, start: Camera, size: tuple[int, int], turn: float) -> Camera
     >>> pose = np.eye(4)
     >>> pose[2, 3] = 2  # two units before the point that it looks at
     >>> rig = Rig((Camera("a", lens, pose, 64, 48),))
-    >>> path = orbit(rig, rig["a"], (64, 48), turn=90)
+    >>> path = orbit_path(rig, rig["a"], (64, 48), turn=90)
     >>> path(0.0).centre.round(6) + 0, path(1.0).centre.round(6) + 0
     (array([ 0.,  0., -2.]), array([2., 0., 0.]))
     """
     from scipy.spatial.transform import Rotation
 
-    view, lens = RigView.of(rig), centred(start, size)
+    view, lens = RigView.of(rig), centre_axis(start, size)
     offset = start.centre - view.target
     distance = float(np.linalg.norm(offset)) or view.radius
     height = float(offset @ view.up)
     flat = offset - height * view.up
     if np.linalg.norm(flat) < 1e-6 * distance:  # right above: from below in its picture
         flat = np.cross(view.up, np.eye(3)[np.abs(view.up).argmin()])
-    pitch = float(np.clip(np.arctan2(height, np.linalg.norm(flat)), -POLE, POLE))
+    pitch = float(np.clip(np.arctan2(height, np.linalg.norm(flat)), -MAX_ELEVATION, MAX_ELEVATION))
     flat = flat / np.linalg.norm(flat)
 
     def at(seconds: float) -> Camera:
         around = Rotation.from_rotvec(view.up * np.radians(turn) * seconds).apply(flat)
         eye = view.target + distance * (np.cos(pitch) * around + np.sin(pitch) * view.up)
-        return looking(lens, eye, view.target, view.up)
+        return look_at(lens, eye, view.target, view.up)
 
     return at
 
 
-def by_keys(
+def key_pose_path(
     file: Path, rig: Rig, size: tuple[int, int], seconds_of_frame: Mapping[int, float], start: Camera
 ) -> CameraPath:
     """The path through the key poses of a file; before the first and after the last key the camera stands.
@@ -109,7 +109,7 @@ def by_keys(
         InputError: a fault in the file; the message names the field.
     """
     given = read_key_poses(file)
-    lens = centred(start, size)
+    lens = centre_axis(start, size)
     times = _times(given, seconds_of_frame, file)
     up = RigView.of(rig).up if given.up is None else np.array(given.up) / np.linalg.norm(given.up)
     poses = [_camera(key, place, lens, up, file) for place, key in enumerate(given.keys)]
@@ -118,9 +118,9 @@ def by_keys(
     aims = [key.look_at for key in given.keys if key.look_at is not None]
     if len(aims) == len(given.keys):
         aim_of = _spline(times, aims)
-        pose_at: CameraPath = lambda t: looking(lens, place_of(t), aim_of(t), up)  # noqa: E731
+        pose_at: CameraPath = lambda t: look_at(lens, place_of(t), aim_of(t), up)  # noqa: E731
     else:
-        pose_at = _turning(times, poses, place_of, lens)
+        pose_at = _interpolated_rotations(times, poses, place_of, lens)
 
     def at(seconds: float) -> Camera:
         now = float(np.clip(seconds, times[0], times[-1]))
@@ -153,7 +153,7 @@ def _times(given: KeyPoses, seconds_of_frame: Mapping[int, float], file: Path) -
 
 def _camera(key: KeyPose, place: int, lens: Camera, up: Float, file: Path) -> Camera:
     if key.position is not None and key.look_at is not None:
-        return looking(lens, np.array(key.position), np.array(key.look_at), up)
+        return look_at(lens, np.array(key.position), np.array(key.look_at), up)
     try:
         return Camera(f"keys[{place}]", lens.intrinsics, np.array(key.world_to_camera), lens.width, lens.height)
     except CameraError as error:
@@ -183,7 +183,9 @@ def _spline(times: Float, points: Sequence[Sequence[float] | Float]) -> Callable
     return lambda seconds: np.asarray(spline(seconds), np.float64)
 
 
-def _turning(times: Float, poses: list[Camera], place_of: Callable[[float], Float], lens: Camera) -> CameraPath:
+def _interpolated_rotations(
+    times: Float, poses: list[Camera], place_of: Callable[[float], Float], lens: Camera
+) -> CameraPath:
     from scipy.spatial.transform import Rotation, RotationSpline
 
     turns = Rotation.from_matrix(np.stack([camera.rotation for camera in poses]))

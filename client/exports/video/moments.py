@@ -43,12 +43,12 @@ def moments(
         share = 0.0 if after is None else max(seconds - before[1], 0.0) / (after[1] - before[1])
         nearest = before if after is None or share <= 0.5 + 1e-6 else after
         if between and after is not None and share > 0:
-            yield Moment(nearest[0], interpolated(before[2], after[2], share))
+            yield Moment(nearest[0], interpolate(before[2], after[2], share))
         else:
             yield Moment(nearest[0], nearest[2])
 
 
-def interpolated(a: Gaussians, b: Gaussians, share: float) -> Gaussians:
+def interpolate(a: Gaussians, b: Gaussians, share: float) -> Gaussians:
     """A state between two of a scene, at ``share`` 0…1 of the way from ``a`` to ``b``.
 
     Centres and colours go straight; axes turn with the material rotations, so that what turns keeps its size. What is
@@ -56,23 +56,23 @@ def interpolated(a: Gaussians, b: Gaussians, share: float) -> Gaussians:
 
     >>> a = Gaussians.of_points([[0, 0, 2]], radius=0.1)
     >>> b = a.concatenate(Gaussians.of_points([[0, 1, 2]], radius=0.1))
-    >>> interpolated(a, b, 0.5).opacities
+    >>> interpolate(a, b, 0.5).opacities
     array([0.9 , 0.45], dtype=float32)
     """
     count = len(a)
     old = b.rows(np.arange(count))
     here, there = a.present, old.present
     part = np.where(here & there, np.float32(share), there.astype(np.float32))
-    turn = _between_turns(a.rotations, old.rotations, part)
+    turn = _slerp(a.rotations, old.rotations, part)
     axes_a = np.swapaxes(quaternions_to_matrices(a.rotations), 1, 2) @ a.factors
     axes_b = np.swapaxes(quaternions_to_matrices(old.rotations), 1, 2) @ old.factors
     fade = np.where(here, 1.0, share) * np.where(there, 1.0, 1 - share)
     mixed = {
-        "means": _mixed(a.means, old.means, part),
-        "factors": quaternions_to_matrices(turn) @ _mixed(axes_a, axes_b, part),
+        "means": _mix(a.means, old.means, part),
+        "factors": quaternions_to_matrices(turn) @ _mix(axes_a, axes_b, part),
         "rotations": turn,
-        "colours": _mixed(a.colours, old.colours, part),
-        "foreground": _mixed(a.foreground, old.foreground, part),
+        "colours": _mix(a.colours, old.colours, part),
+        "foreground": _mix(a.foreground, old.foreground, part),
         "opacities": (old.own_opacities * fade).astype(np.float32),
     }
     born = b.rows(np.arange(count, len(b)))
@@ -82,25 +82,25 @@ def interpolated(a: Gaussians, b: Gaussians, share: float) -> Gaussians:
     gloss = b.gloss if a.gloss is None or b.gloss is None else _gloss(a.gloss, b.gloss, share)
     environment = b.environment
     if a.environment is not None and b.environment is not None:
-        environment = _mixed(a.environment, b.environment, np.full(len(a.environment), share, np.float32))
+        environment = _mix(a.environment, b.environment, np.full(len(a.environment), share, np.float32))
     return Gaussians(**arrays, ids=b.ids, retired=gone, gloss=gloss, environment=environment)
 
 
-def _mixed(a: NDArray[Any], b: NDArray[Any], part: NDArray[Any]) -> NDArray[np.float32]:
+def _mix(a: NDArray[Any], b: NDArray[Any], part: NDArray[Any]) -> NDArray[np.float32]:
     """Rows between those of two arrays, ``part`` [N] of the way."""
     ways = part.reshape(-1, *[1] * (a.ndim - 1))
     return np.asarray(a + ways * (b - a), np.float32)
 
 
-def _between_turns(a: NDArray[Any], b: NDArray[Any], part: NDArray[Any]) -> NDArray[np.float32]:
+def _slerp(a: NDArray[Any], b: NDArray[Any], part: NDArray[Any]) -> NDArray[np.float32]:
     """[N, 4] unit quaternions between two, the short way."""
     near = np.where((a * b).sum(axis=1, keepdims=True) < 0, -b, b)
-    mixed = _mixed(a, near, part)
+    mixed = _mix(a, near, part)
     size = np.linalg.norm(mixed, axis=1, keepdims=True)
     return np.asarray(np.where(size > 1e-6, mixed / np.maximum(size, 1e-6), a), np.float32)
 
 
 def _gloss(a: NDArray[Any], b: NDArray[Any], share: float) -> NDArray[np.float32]:
     count = min(len(a), len(b))
-    mixed = _mixed(a[:count], b[:count], np.full(count, share, np.float32))
+    mixed = _mix(a[:count], b[:count], np.full(count, share, np.float32))
     return np.concatenate([mixed, b[count:]])

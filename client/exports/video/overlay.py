@@ -21,11 +21,11 @@ WIDTH = 1 / 200
 """Of the picture's height."""
 OPAQUE = 0.5
 """Opacity from which a Gaussian is of a surface and not of haze."""
-MOST_MOVED = 0.5
+CANDIDATES_PER_ROW = 0.5
 """Share of the Gaussians, those that move most, of which some are taken."""
 
 
-def rows_that_move(states: Sequence[Gaussians], count: int) -> NDArray[np.intp]:
+def moving_rows(states: Sequence[Gaussians], count: int) -> NDArray[np.intp]:
     """[count] rows, or fewer: of the Gaussians that move most, some whose ways are far apart; none where none moves.
 
     Args:
@@ -33,7 +33,7 @@ def rows_that_move(states: Sequence[Gaussians], count: int) -> NDArray[np.intp]:
 
     >>> a = Gaussians.of_points([[0, 0, 2], [1, 0, 2], [2, 0, 2]], radius=0.1)
     >>> b = a.replace(means=a.means + np.float32([[0, 0, 0], [0, 1, 0], [0, 2, 0]]))
-    >>> rows_that_move([a, b], 1)
+    >>> moving_rows([a, b], 1)
     array([2])
     """
     first = states[0]
@@ -47,7 +47,7 @@ def rows_that_move(states: Sequence[Gaussians], count: int) -> NDArray[np.intp]:
     if not rows.size or not count:
         return np.zeros(0, np.intp)
     rows = rows[np.argsort(-moved[rows], kind="stable")]
-    rows = rows[: max(count, round(MOST_MOVED * rows.size))]
+    rows = rows[: max(count, round(CANDIDATES_PER_ROW * rows.size))]
     ways = np.concatenate([state.means[rows] for state in states], axis=1)
     chosen: NDArray[np.intp] = rows[farthest_first(ways, count)]
     return chosen
@@ -63,7 +63,7 @@ class Trails:
     >>> trails = Trails(np.array([0]), WorldFrame(np.zeros(3)), length=9)
     >>> trails.add(state)
     >>> camera = Camera("a", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
-    >>> drawn = trails.drawn(np.zeros((48, 64, 3), np.uint8), camera)
+    >>> drawn = trails.draw(np.zeros((48, 64, 3), np.uint8), camera)
     >>> bool(drawn[24, 32].any()), bool(drawn[4, 4].any())
     (True, False)
     """
@@ -79,7 +79,7 @@ class Trails:
         places[~state.present[self._rows]] = np.nan
         self._places.append(places)
 
-    def drawn(self, picture: Picture, camera: Camera) -> Picture:
+    def draw(self, picture: Picture, camera: Camera) -> Picture:
         """The picture [H, W, 3] with the trails over it; camera: of the picture, user's world."""
         height, width = picture.shape[:2]
         uv = np.stack([camera.project(places)[0] for places in self._places]) * SHARPER

@@ -16,14 +16,14 @@ DARKEST = 0.35
 """Brightness of a part where the scene is black; 1 where it is white."""
 
 
-def painted(state: Gaussians, labels: NDArray[Any]) -> NDArray[np.float32]:
+def part_colours(state: Gaussians, labels: NDArray[Any]) -> NDArray[np.float32]:
     """[N, 3] RGB: the colour of the part, as bright as the Gaussian is; grey where it belongs to none.
 
     Args:
         labels: [M] part of each Gaussian, −1 for none; those after the M-th belong to none.
 
     >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1, colours=1.0)
-    >>> painted(state, np.array([0])).round(2)
+    >>> part_colours(state, np.array([0])).round(2)
     array([[0.33, 0.65, 0.95],
            [1.  , 1.  , 1.  ]], dtype=float32)
     """

@@ -75,13 +75,13 @@ def _unit(vector: Float) -> Float:
     return vector / size if size > 0 else np.array([0.0, 0.0, 1.0])
 
 
-def looking(camera: Camera, eye: Float, target: Float, up: Float) -> Camera:
+def look_at(camera: Camera, eye: Float, target: Float, up: Float) -> Camera:
     """The camera moved to ``eye`` [3] and turned towards ``target`` [3], ``up`` [3] upwards in its picture.
 
     Where it looks along ``up``, the picture's "up" is some direction across.
 
     >>> camera = Camera("a", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
-    >>> moved = looking(camera, np.array([5.0, 0, 0]), np.zeros(3), np.array([0.0, -1, 0]))
+    >>> moved = look_at(camera, np.array([5.0, 0, 0]), np.zeros(3), np.array([0.0, -1, 0]))
     >>> moved.project([0, 0, 0])[0], moved.to_camera([0, -1, 0]).round(6) + 0
     (array([32., 24.]), array([ 0., -1.,  5.]))
     """

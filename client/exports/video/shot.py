@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from client.exports.sources import Source
-from client.exports.video.camera_path import CameraPath, by_keys, orbit, still
+from client.exports.video.camera_path import CameraPath, fixed_path, key_pose_path, orbit_path
 from client.exports.video.moments import moments
-from client.exports.video.overlay import Trails, rows_that_move
-from client.exports.video.part_paint import painted
+from client.exports.video.overlay import Trails, moving_rows
+from client.exports.video.part_paint import part_colours
 from client.pictures import Picture, eight_bit
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.captures import Capture
@@ -28,8 +28,8 @@ class VideoOptions:
     """Options of a video.
 
     Attributes:
-        path: `orbit`, `camera`, or a JSON file of key poses (docs/videos.md).
-        camera: of the rig or of the capture beside: it is looked through, or the orbit begins there; None: the first.
+        path: `orbit_path`, `camera`, or a JSON file of key poses (docs/videos.md).
+        camera: of the rig or of the compared capture, to look through or to start the orbit at; None: the first.
         turn: degrees a second of the orbit, to the camera's right.
         fps: of the video; None: that of the frames. speed: seconds of the scene in one of the video.
         seconds: of the video; None: until the frames end.
@@ -41,12 +41,12 @@ class VideoOptions:
 
     path: str = "orbit"
     camera: str | None = None
-    turn: float = 30.0
+    orbit_speed: float = 30.0
     fps: float | None = None
     speed: float = 1.0
     seconds: float | None = None
     size: tuple[int, int] | None = None
-    between: bool = False
+    interpolate: bool = False
     tracks: int = 0
     trail: float = 1.0
     parts: bool = False
@@ -91,13 +91,13 @@ class Shot:
         indices, first = list(self.times), next(iter(self.times.values()))
         wanted = (first + number / self.fps * options.speed for number in range(self.count))
         states = self.given.states(indices[0], indices[-1])
-        for number, moment in enumerate(moments(states, wanted, between=options.between)):
+        for number, moment in enumerate(moments(states, wanted, between=options.interpolate)):
             camera = self.path(number / self.fps)
-            colours = None if labels is None else painted(moment.state, labels)
+            colours = None if labels is None else part_colours(moment.state, labels)
             picture = eight_bit(renderer.render(moment.state, camera, background, colours=colours).colour)
             if trails is not None:
                 trails.add(moment.state)
-                picture = trails.drawn(picture, camera)
+                picture = trails.draw(picture, camera)
             yield picture if self.truth is None else np.concatenate([picture, self.truth(moment.frame)], axis=1)
 
     def _labels(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
@@ -107,24 +107,26 @@ class Shot:
         return labels
 
     def _trails(self) -> Trails:
-        rows = rows_that_move(self.given.some(list(self.times)), self.options.tracks)
+        rows = moving_rows(self.given.some(list(self.times)), self.options.tracks)
         if not rows.size:
             raise InputError("tracks: nothing moves in these frames", "leave --tracks out, or choose other --frames")
         return Trails(rows, self.given.head.world, round(self.options.trail * self.fps) + 1)
 
 
-def shot(given: Source, low: int, high: int, options: VideoOptions, beside: Capture | None, *, even: bool) -> Shot:
+def plan_shot(
+    given: Source, low: int, high: int, options: VideoOptions, compared: Capture | None, *, even: bool
+) -> Shot:
     """Checks what is asked for.
 
     Args:
-        given: the states. low, high: first and last frame. beside: the capture whose pictures stand beside.
+        given: the states. low, high: first and last frame. compared: its true pictures are shown to the right.
         even: whether both sides of the picture have to be even; an odd size of a camera is cut, one that was asked
             for is refused.
 
     Raises:
         InputError: frames, a camera or pictures that are not there, or options that contradict each other.
     """
-    _check(options, beside)
+    _check(options, compared)
     times = given.within(low, high)
     first, last = min(times.values()), max(times.values())
     fps = options.fps or given.rate
@@ -135,27 +137,31 @@ def shot(given: Source, low: int, high: int, options: VideoOptions, beside: Capt
             f"fps {fps:g} and speed {options.speed:g} make {length * fps:.0f} pictures",
             f"give --frames, --fps or --speed that make at most {MOST_PICTURES}",
         )
-    camera = _camera(given, options.camera, beside)
+    camera = _camera(given, options.camera, compared)
     size = _size(options.size, camera, even)
     shown = {index: (time - first) / options.speed for index, time in times.items()}
     path = _path(given.head.rig or Rig((camera,)), camera, size, options, shown)
-    truth = None if beside is None else _truth(beside, camera, size, max(times))
+    truth = None if compared is None else _truth(compared, camera, size, max(times))
     return Shot(given, times, options, fps, max(1, int(length * fps + 1e-6)), size, path, truth)
 
 
-def _check(options: VideoOptions, beside: Capture | None) -> None:
-    if beside is not None and options.path != "camera":
-        raise InputError(f"beside is given for path {options.path!r}", "give --path camera: cameras have true pictures")
-    if beside is not None and options.between:
-        raise InputError("beside and between contradict each other: between frames there is no truth", "leave one out")
+def _check(options: VideoOptions, compared: Capture | None) -> None:
+    if compared is not None and options.path != "camera":
+        raise InputError(
+            f"compare is given for path {options.path!r}", "give --path camera: cameras have true pictures"
+        )
+    if compared is not None and options.interpolate:
+        raise InputError(
+            "compare and interpolate exclude each other: there is no truth between frames", "leave one out"
+        )
 
 
-def _camera(given: Source, name: str | None, beside: Capture | None) -> Camera:
+def _camera(given: Source, name: str | None, compared: Capture | None) -> Camera:
     """The camera of a name, as the scene has refined it, or one that only the capture has; without a name the first."""
     cameras = {}
-    if beside is not None:
+    if compared is not None:
         cameras = {
-            camera.name: camera for rig in (beside.full_rig, beside.full_test_rig) if rig for camera in rig.cameras
+            camera.name: camera for rig in (compared.full_rig, compared.full_test_rig) if rig for camera in rig.cameras
         }
     if given.head.rig is not None:
         cameras = {camera.name: camera for camera in given.head.rig.cameras} | {
@@ -164,7 +170,7 @@ def _camera(given: Source, name: str | None, beside: Capture | None) -> Camera:
     if not cameras:
         raise InputError(
             f"{given.name} has no cameras; those of USD and .glb are not read back",
-            "give the folder of scas4d reconstruct, its .s4d file, or --beside a capture",
+            "give the folder of scas4d reconstruct, its .s4d file, or --compare a capture",
         )
     if name is None:
         return next(iter(cameras.values()))
@@ -187,28 +193,28 @@ def _path(
     rig: Rig, camera: Camera, size: tuple[int, int], options: VideoOptions, shown: Mapping[int, float]
 ) -> CameraPath:
     if options.path == "orbit":
-        return orbit(rig, camera, size, options.turn)
+        return orbit_path(rig, camera, size, options.orbit_speed)
     if options.path == "camera":
-        return still(camera, size)
-    return by_keys(Path(options.path), rig, size, shown, camera)
+        return fixed_path(camera, size)
+    return key_pose_path(Path(options.path), rig, size, shown, camera)
 
 
-def _truth(beside: Capture, camera: Camera, size: tuple[int, int], last: int) -> Callable[[int], Picture]:
+def _truth(compared: Capture, camera: Camera, size: tuple[int, int], last: int) -> Callable[[int], Picture]:
     """Gives the true picture of a frame, in the place where ``fitted`` puts the camera's own."""
-    training = camera.name in beside.full_rig.names
-    if not training and (beside.full_test_rig is None or camera.name not in beside.full_test_rig.names):
-        raise InputError(f"beside: capture {beside.name} has no camera {camera.name!r}", "give another --camera")
-    if last >= beside.frame_count:
+    training = camera.name in compared.full_rig.names
+    if not training and (compared.full_test_rig is None or camera.name not in compared.full_test_rig.names):
+        raise InputError(f"compare: capture {compared.name} has no camera {camera.name!r}", "give another --camera")
+    if last >= compared.frame_count:
         raise InputError(
-            f"beside: capture {beside.name} has {beside.frame_count} frames, and frame {last} is shown",
-            f"give --frames up to {beside.frame_count - 1}, or the capture that was reconstructed",
+            f"compare: capture {compared.name} has {compared.frame_count} frames, and frame {last} is shown",
+            f"give --frames up to {compared.frame_count - 1}, or the capture that was reconstructed",
         )
     scale = min(size[0] / camera.width, size[1] / camera.height)
     width, height = round(scale * camera.width), round(scale * camera.height)
     left, top = (size[0] - width) // 2, (size[1] - height) // 2
 
     def true(index: int) -> Picture:
-        frame = beside.frame(index) if training else beside.test_frame(index)
+        frame = compared.frame(index) if training else compared.test_frame(index)
         picture = np.zeros((size[1], size[0], 3), np.uint8)
         picture[top : top + height, left : left + width] = resize_area(frame.images[camera.name], (width, height))
         return picture

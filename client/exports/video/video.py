@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 from client.exports.sources import frame_range, opened
-from client.exports.video.shot import VideoOptions, shot
+from client.exports.video.shot import VideoOptions, plan_shot
 from client.exports.video.video_file import check_suffix, video_file
 from client.importers.extras import pyav
 from client.progress import Bars, console
@@ -23,7 +23,7 @@ def make_video(
     options: VideoOptions,
     *,
     frames: str | None = None,
-    beside: Capture | None = None,
+    compared: Capture | None = None,
     url: str,
     token: str | None,
 ) -> Path:
@@ -32,7 +32,7 @@ def make_video(
     Args:
         source: as `opened` takes it. out: ends in `.mp4` or `.webp`; None: an MP4 beside the source, named after it.
         frames: `A:B`, the frames from A to B, both counted in; None: all.
-        beside: the capture; the true picture of the same camera stands to the right of each render.
+        compared: the capture; the true picture of the same camera is shown to the right of each render.
         url, token: of the service.
 
     Returns:
@@ -40,7 +40,7 @@ def make_video(
 
     Raises:
         InputError: an option that cannot be, or frames, a camera or parts that are not there.
-        MissingExtra: PyAV is not installed.
+        MissingExtraError: PyAV is not installed.
     """
     low, high = frame_range(frames)
     if out is not None:
@@ -50,7 +50,7 @@ def make_video(
         if given.of.damage is not None:
             console.print(f"only a part can be read: {given.of.damage}", soft_wrap=True)
         target = out or given.beside / f"{given.name}-{Path(options.path).stem}.mp4"
-        planned = shot(given, low, high, options, beside, even=check_suffix(target) == ".mp4")
+        planned = plan_shot(given, low, high, options, compared, even=check_suffix(target) == ".mp4")
         _compile_kernels(bars)
         with video_file(target, planned.fps) as add:
             for number, picture in enumerate(planned.pictures()):
@@ -73,7 +73,7 @@ def picture_size(text: str) -> tuple[int, int]:
     size = (int(match[1]), int(match[2])) if match else (0, 0)
     if not all(SMALLEST <= side <= LARGEST for side in size):
         raise InputError(
-            f"size {text!r} is no size of a picture", f"give WIDTHxHEIGHT, as 1280x720, {SMALLEST} to {LARGEST} each"
+            f"size {text!r} is not a picture size", f"give WIDTHxHEIGHT, such as 1280x720, {SMALLEST} to {LARGEST} each"
         )
     return size
 
@@ -89,7 +89,9 @@ def background_colour(text: str) -> tuple[float, float, float]:
     try:
         red, green, blue = ImageColor.getrgb(text)[:3]
     except ValueError:
-        raise InputError(f"background {text!r} is no colour", "give a name or #rrggbb, as white or #202020") from None
+        raise InputError(
+            f"background {text!r} is not a colour", "give a name or #rrggbb, such as white or #202020"
+        ) from None
     return red / 255, green / 255, blue / 255
 
 

@@ -58,7 +58,7 @@ def video_file(path: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
 
     Raises:
         InputError: another suffix, no picture was added, or the file cannot be written.
-        MissingExtra: PyAV is not installed.
+        MissingExtraError: PyAV is not installed.
 
     >>> with video_file(out / "grey.mp4", 25) as add:
     ...     for level in range(3):
@@ -74,7 +74,7 @@ def video_file(path: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
             encoder = _Encoder(beside, suffix, fps)
             yield encoder.add
             if not encoder.count:
-                raise InputError(f"out {str(path)!r} would hold no picture", "give frames that there are")
+                raise InputError(f"out {str(path)!r} would hold no picture", "give frames that exist")
             encoder.finish()
         except av.FFmpegError as error:
             remedy = "give a smaller size, or another --fps"

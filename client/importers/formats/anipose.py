@@ -38,7 +38,7 @@ def read_anipose(path: Path, document: Mapping[str, Any]) -> Calibration:
         if key == "metadata":
             continue
         if not isinstance(table, Mapping):
-            raise CaptureError(f"{path}: {key} is no table of a camera; leave it out")
+            raise CaptureError(f"{path}: {key} is not the table of a camera; leave it out")
         name = table.get("name", key)
         if not isinstance(name, str | int):
             raise CaptureError(f"{path}: [{key}] has the name {name!r}; give text")

@@ -33,7 +33,7 @@ def read_caliscope(path: Path, document: Mapping[str, Any]) -> Calibration:
     for key, table in document["cameras"].items():
         where = f"{path}: [cameras.{key}]"
         if not isinstance(table, Mapping):
-            raise CaptureError(f"{where} is no table of a camera; leave it out")
+            raise CaptureError(f"{where} is not the table of a camera; leave it out")
         name = f"{'port' if 'port' in table else 'cam'}_{table.get('cam_id', table.get('port', key))}"
         if table.get("ignore") is True or not _calibrated(table):
             left_out.append(name)

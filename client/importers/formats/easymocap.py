@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from client.importers.calibration import NAMES, Calibration, calibration_of_cameras, can_be_named
-from client.importers.formats.file_storage import first_of, read_storage, size_of_pictures
+from client.importers.formats.file_storage import first_field, read_storage, size_of_pictures
 from client.importers.formats.opencv_camera import numbers, opencv_camera, picture_size, rodrigues
 from client.importers.lens import LensCamera
 from scas4d_core.captures import CaptureError
@@ -38,7 +38,7 @@ def read_easymocap(folder: Path, capture: Path) -> Calibration:
 
     Raises:
         CaptureError: a file or field is missing or cannot be; the message names it and the remedy.
-        MissingExtra: OpenCV is not there.
+        MissingExtraError: OpenCV is not there.
     """
     for name in (INTRINSICS, EXTRINSICS):
         if not (folder / name).is_file():
@@ -67,14 +67,14 @@ def _camera(
     elif vector is not None:
         matrix = numbers(where, f"Rot_{name}", rotation, (9,)).reshape(3, 3)
         if np.abs(rodrigues(numbers(where, f"R_{name}", vector, (3,))) - matrix).max() > APART:
-            raise CaptureError(f"{where}: R_{name} and Rot_{name} are different rotations; write the file anew")
+            raise CaptureError(f"{where}: R_{name} and Rot_{name} are different rotations; write the file again")
     where = f"{folder / INTRINSICS}: camera {name!r}"
     size = [intrinsics.get(f"{side}_{name}") for side in "WH"]
     return opencv_camera(
         where,
         name,
         matrix=intrinsics.get(f"K_{name}"),
-        distortions=first_of(intrinsics, (f"dist_{name}", f"D_{name}")),
+        distortions=first_field(intrinsics, (f"dist_{name}", f"D_{name}")),
         rotation=rotation,
         translation=extrinsics.get(f"T_{name}"),
         size=size_of_pictures(capture, name, where) if None in size else picture_size(where, size),

@@ -32,7 +32,7 @@ def read_storage(path: Path) -> dict[str, Any]:
 
     Raises:
         CaptureError: it cannot be read.
-        MissingExtra: OpenCV is not there.
+        MissingExtraError: OpenCV is not there.
     """
     cv2 = load("cv2", needed="reading OpenCV's YAML and XML files")
     try:
@@ -73,7 +73,7 @@ def _value(node: Any) -> Any:
     return None
 
 
-def first_of(stored: Mapping[str, Any], names: tuple[str, ...]) -> Any:
+def first_field(stored: Mapping[str, Any], names: tuple[str, ...]) -> Any:
     """The first field of these names that is there; None where there is none."""
     return next((stored[name] for name in names if stored.get(name) is not None), None)
 
@@ -86,7 +86,7 @@ def size_of_pictures(folder: Path, camera: str, where: str) -> tuple[int, int]:
 
     Raises:
         CaptureError: there is neither, or it cannot be read.
-        MissingExtra: a video has to be read and PyAV is not there.
+        MissingExtraError: a video has to be read and PyAV is not there.
     """
     images = folder / "images" / camera
     if images.is_dir():

@@ -24,12 +24,12 @@ READ = (
 )
 
 
-def found_in(capture: Path) -> list[Path]:
+def find_calibrations(capture: Path) -> list[Path]:
     """The calibrations in a capture's folder: a file each, or the folder of several that belong together."""
-    return [path for name in FOLDERS for path in _found_here(capture / name)]
+    return [path for name in FOLDERS for path in _calibrations_in(capture / name)]
 
 
-def _found_here(folder: Path) -> list[Path]:
+def _calibrations_in(folder: Path) -> list[Path]:
     if not folder.is_dir():
         return []
     names = sorted(path for path in folder.iterdir() if path.is_file())
@@ -49,13 +49,13 @@ def _is_toml(path: Path) -> bool:
 
 
 def is_calibration(path: Path) -> bool:
-    """True where `read_found` knows the kind of a file or folder by its name."""
+    """True where `read_calibration_file` knows the kind of a file or folder by its name."""
     if path.is_dir():
-        return bool(_found_here(path))
+        return bool(_calibrations_in(path))
     return path.is_file() and (path.suffix.lower() in (".toml", *ENDS) or path.name.lower().endswith(QUALISYS))
 
 
-def read_found(path: Path, capture: Path) -> Calibration:
+def read_calibration_file(path: Path, capture: Path) -> Calibration:
     """Reads a calibration.
 
     Args:
@@ -63,13 +63,13 @@ def read_found(path: Path, capture: Path) -> Calibration:
 
     Raises:
         CaptureError: of no known kind, several in the folder, or it cannot be read.
-        MissingExtra: it needs a package of the extra `importers`.
+        MissingExtraError: it needs a package of the extra `importers`.
     """
     if path.is_dir():
-        here = _found_here(path)
+        here = _calibrations_in(path)
         if here == [path]:
             return read_opencv_files(path, capture)
-        return read_found(only(here, path), capture)
+        return read_calibration_file(single_calibration(here, path), capture)
     if path.name.lower().endswith(QUALISYS):
         return read_qualisys(path)
     if path.suffix.lower() == ".toml":
@@ -79,7 +79,7 @@ def read_found(path: Path, capture: Path) -> Calibration:
     return read_opencv_files(path.parent, capture)
 
 
-def only(found: list[Path], folder: Path) -> Path:
+def single_calibration(found: list[Path], folder: Path) -> Path:
     """The one calibration that was found.
 
     Raises:

@@ -64,7 +64,7 @@ def _view(where: str, meta: Mapping[str, Any], frame: Mapping[str, Any], undo: F
     to_world[:3, 3] /= scale
     given = {**meta, **frame}
     size = (_whole(where, given, "w"), _whole(where, given, "h"))
-    model = given.get("camera_model") or _model_unsaid(given)
+    model = given.get("camera_model") or _default_model(given)
     if not isinstance(model, str):
         raise CaptureError(f"{where}: camera_model is {model!r}; give one of {', '.join(MODELS)}")
     fx = _focal(where, given, "x", size[0])
@@ -85,7 +85,7 @@ def _view(where: str, meta: Mapping[str, Any], frame: Mapping[str, Any], undo: F
     return CalibratedImage(path, camera, time)
 
 
-def _model_unsaid(given: Mapping[str, Any]) -> str:
+def _default_model(given: Mapping[str, Any]) -> str:
     """The model where the file names none, as of instant-ngp: by `is_fisheye` and the coefficients."""
     if given.get("is_fisheye"):
         return "OPENCV_FISHEYE"

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from client.importers.calibration import Calibration, calibration_of_cameras
 from client.importers.formats.easymocap import EXTRINSICS, INTRINSICS
-from client.importers.formats.file_storage import first_of, read_storage, size_of_pictures
+from client.importers.formats.file_storage import first_field, read_storage, size_of_pictures
 from client.importers.formats.opencv_camera import opencv_camera, picture_size
 from client.importers.lens import LensCamera
 from scas4d_core.captures import CaptureError
@@ -54,14 +54,14 @@ def read_opencv_files(folder: Path, capture: Path) -> Calibration:
 
     Raises:
         CaptureError: a field is missing or cannot be; the message names file, field and remedy.
-        MissingExtra: OpenCV is not there.
+        MissingExtraError: OpenCV is not there.
     """
     return calibration_of_cameras(folder, [_camera(path, capture) for path in camera_files(folder)])
 
 
 def _camera(path: Path, capture: Path) -> LensCamera:
     stored, where = read_storage(path), str(path)
-    rotation, translation = first_of(stored, ROTATION), first_of(stored, TRANSLATION)
+    rotation, translation = first_field(stored, ROTATION), first_field(stored, TRANSLATION)
     if rotation is None or translation is None:
         raise CaptureError(
             f"{path}: has no pose; give R and T, world to camera (extrinsic_parameters of OpenCV's sample are poses of "
@@ -71,8 +71,8 @@ def _camera(path: Path, capture: Path) -> LensCamera:
     return opencv_camera(
         where,
         path.stem,
-        matrix=first_of(stored, MATRIX),
-        distortions=first_of(stored, DISTORTION),
+        matrix=first_field(stored, MATRIX),
+        distortions=first_field(stored, DISTORTION),
         rotation=rotation,
         translation=translation,
         size=size_of_pictures(capture, path.stem, where) if None in size else picture_size(where, size),

@@ -80,7 +80,7 @@ def _cameras(path: Path) -> list[_QualisysCamera]:
             cameras[-1].parts[name] = attributes
 
     def declared(*_: Any) -> None:
-        raise CaptureError(f"{path}: declares a document type, which no calibration of QTM does; export it anew")
+        raise CaptureError(f"{path}: declares a document type, which no calibration of QTM does; export it again")
 
     parser = expat.ParserCreate()
     parser.StartElementHandler = started

@@ -1,1 +1,1 @@
-"""Effects on colour: light, shading, shadows, gloss, camera gains."""
+"""Effects on colour: light, shading, shadows, gloss and camera gains."""

@@ -1,12 +1,12 @@
-"""Gains of cameras: each camera and channel shows the scene so many times as bright, fixed or drifting.
+"""Camera gains: a brightness factor per camera and channel, fixed or drifting.
 
-A gain is applied to light before the sRGB curve. On the curve's power part, s = 1.055 L^(1/2.4) − 0.055, a gain γ makes
-of a value s the value a s + 0.055 (a − 1) with a = γ^(1/2.4): s + 0.055 is multiplied by a. So one number a channel is
-learnt, and it is read off the pictures: the median over pixels of (picture + 0.055) / (rendering + 0.055). Where the
-gains are learnt as free gains and offsets, as in frame 0, the two make up for each other.
+A gain is applied to linear light, before the sRGB curve. On the power part of the curve, s = 1.055 L^(1/2.4) − 0.055, a
+gain γ turns a value s into a s + 0.055 (a − 1) with a = γ^(1/2.4). In other words, s + 0.055 is multiplied by a. One
+number per channel is therefore estimated: the median over pixels of (image + 0.055) / (rendering + 0.055). Independent
+gains and offsets, as in frame 0, would compensate each other.
 
-Renderings are those of the update: each round over the cameras gives each gain once, and the gains take half of the
-way. Later frames start from them. Once the effect is off, they stay as they were last.
+The renderings are those of the update. Each pass over the cameras updates each gain once, by half of the difference.
+Later frames start from these gains. When the effect is switched off, the gains keep their last values.
 """
 
 from __future__ import annotations
@@ -25,18 +25,19 @@ from scas4d_core.update.parts import Array, Arrays, Attempt, PlanBuilder, Update
 
 NAME = "camera_gain"
 POWER = 2.4
-"""Of the sRGB curve: a gain of light is the gain of s + 0.055 to this power."""
-# Thresholds of the effect: 0.011 at most on the five objects (cloth) and 0.002 on stage, whose cameras are alike; 0.025
-# on basketball, whose gains frame 0 knows, and that gains 0.03 dB with these; 0.078 to 0.094 on lamps.
+"""Exponent of the sRGB curve: a gain in linear light is the gain of s + 0.055 to this power."""
+# Measured spreads for the thresholds: at most 0.011 on the five objects (cloth) and 0.002 on stage, whose cameras are
+# alike; 0.025 on basketball, whose gains frame 0 has found and which gains 0.03 dB with the effect; 0.078 to 0.094 on
+# lamps.
 
 
 def current_exposures(
     exposures: dict[str, Array], carried: Mapping[str, Arrays], names: tuple[str, ...]
 ) -> dict[str, Array]:
-    """The exposures of the cameras, [3, 2] gain and offset by name: those given, or the gains as they were last.
+    """Returns the exposures of the cameras, [3, 2] gain and offset by name: as given, or from the latest gains.
 
     Args:
-        exposures: that frame 0 found. carried: arrays of the effects. names: of the rig's cameras.
+        exposures: found in frame 0. carried: arrays of the effects. names: of the rig's cameras.
     """
     if NAME not in carried:
         return exposures
@@ -44,13 +45,13 @@ def current_exposures(
 
 
 class CameraGains(UpdatePart):
-    """Where the gains of an update start, and what they leave for the next one."""
+    """Sets the initial gains of an update and stores its final gains for the next one."""
 
     def __init__(self, builder: PlanBuilder) -> None:
         self._rows = {name: row for row, name in enumerate(builder.factory.rig.names)}
 
     def begin(self, attempt: Attempt) -> None:
-        """Gains as the frame before left them, or as frame 0 did."""
+        """Starts from the gains of the previous frame, or from those of frame 0."""
         if NAME in attempt.carried:
             attempt.gains = attempt.carried[NAME]["gains"].copy()
             return
@@ -60,22 +61,22 @@ class CameraGains(UpdatePart):
         attempt.gains = gains / _centre(gains)
 
     def end(self, attempt: Attempt, state: Gaussians) -> Gaussians:
-        """Leaves the gains for the frame after."""
+        """Stores the gains for the next frame."""
         attempt.carried[NAME] = {"gains": attempt.engine.gains()}
         return state
 
 
 def _centre(gains: Array) -> Array:
-    """[3] the geometric mean over the cameras [C, 3]."""
+    """Returns the [3] geometric mean over the cameras [C, 3]."""
     centre: Array = np.exp(np.log(gains).mean(axis=0))
     return centre
 
 
 def spread_of(seen: FrameObservation) -> float | None:
-    """Standard deviation over the cameras of the colour of their gains of light; None: untold.
+    """Returns the standard deviation of the colour gains over the cameras, in linear light; None if there are too few.
 
-    It is estimated from means of pictures and renderings. What all channels of a camera share has no say: a thing
-    before black that is drawn too small, or that shines a little, is as dark in all of them.
+    It is estimated from the means of images and renderings. The common factor of a camera's channels is removed: an
+    object that is rendered slightly too small or glossy in front of black changes all channels alike.
     """
     spreads = []
     for view in seen.views:
@@ -92,10 +93,10 @@ def spread_of(seen: FrameObservation) -> float | None:
 
 @dataclass(frozen=True)
 class CameraGain(Effect):
-    """A gain for each camera and channel, read off the renderings of an update."""
+    """A gain per camera and channel, estimated from the renderings of an update."""
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """How much the cameras' gains differ: those that are known, times what their pictures still lack."""
+        """Returns how much the gains differ between the cameras: known gains and remaining differences."""
         spread = spread_of(seen)
         return (
             None
@@ -104,7 +105,7 @@ class CameraGain(Effect):
         )
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the gains; they are read off whole pictures."""
+        """Adds the gains to the plan; they need full images."""
         builder.plan.full_images = builder.plan.camera_gains = True
         builder.parts.append(CameraGains(builder))
 

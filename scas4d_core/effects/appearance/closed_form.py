@@ -1,10 +1,10 @@
-"""Colours in closed form, once a frame: what the pictures have more than the render, spread over what is seen.
+"""Closed-form colour updates, once per frame, that distribute the image residuals over the visible Gaussians.
 
-Each Gaussian's colour takes steps to the mean, over the pixels of some views, of what the pictures have more than the
-render, weighted by the Gaussian's share of each pixel: SIRT with ordered subsets (Gilbert 1972; Hudson and Larkin
-1994), whose steps of 1 do not overshoot, because the shares of a pixel add up to at most 1. The kernels are those of
-the rasterizer. The last subset has the last word on what is seen otherwise from elsewhere, as something that has
-entered and is in no state yet; so each subset looks from all sides, and no pixel counts for much.
+Each step changes a Gaussian's colour by the mean residual (image minus rendering) over the pixels of some views,
+weighted by the Gaussian's share of each pixel. This is SIRT with ordered subsets (Gilbert 1972; Hudson and Larkin
+1994). Steps of size 1 do not overshoot, because the shares of a pixel sum to at most 1. The kernels are those of the
+rasterizer. The last subset dominates where views disagree, for example at a new object that the state does not contain
+yet. Therefore each subset has views from all sides, and the residual of each pixel is clamped.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ if TYPE_CHECKING:
     from scas4d_core.engines.views import TrainingView
 
 SUBSETS = 6
-"""Steps a frame, each from as many of the views as the others."""
+"""Number of steps per frame; the views are divided evenly between them."""
 MOST = 0.2
-"""RGB in 0…1 that a pixel counts as more or less: what differs by more is not the light of a frame. With `visit`, which
-a ball enters, subsets from one side each and no such bound cost 10 dB: frames after it were not believed."""
+"""Limit on the residual of a pixel, RGB in 0…1; larger differences are not due to lighting. On `visit`, which a ball
+enters, one-sided subsets without this limit cost 10 dB, and later frames were rejected."""
 FEW = 1.0
-"""Pixels' worth of blending weight that is added to each Gaussian's: what is hardly seen stays as it is."""
+"""Blending weight, in pixels, that is added to each Gaussian's, so that barely visible Gaussians keep their colours."""
 
 
 def follow_pictures(
     state: Gaussians, views: Sequence[TrainingView], renderer: Renderer, learnt: NDArray[np.uint8]
 ) -> Gaussians:
-    """The state with the colours of some Gaussians stepped to what the pictures show.
+    """Returns the state with the colours of some Gaussians updated to match the images.
 
     Args:
-        state: as it is shown in the pictures. views: of the frame. renderer: draws them.
-        learnt: [N] 1 for the Gaussians whose colours are stepped; the others keep theirs.
+        state: geometry that matches the images. views: of the frame. renderer: renders them.
+        learnt: [N] 1 for the Gaussians whose colours are updated; the others keep theirs.
     """
     views = from_all_sides(views)
     for first in range(min(SUBSETS, len(views))):
@@ -54,7 +54,7 @@ def follow_pictures(
 
 
 def from_all_sides(views: Sequence[TrainingView]) -> list[TrainingView]:
-    """The views, each next one from as far as can be from those before; whatever the order of the rig's cameras is."""
+    """Returns the views in farthest-first order, independent of the order of the rig's cameras."""
     left = sorted(views, key=attrgetter("name"))
     centres = np.array([-view.camera.pose[:, :3].T @ view.camera.pose[:, 3] for view in left])
     return [left[index] for index in farthest_first(centres, len(left))]

@@ -1,9 +1,9 @@
-"""Colour that depends on direction: things mirror their surroundings, which stay while the things turn.
+"""View-dependent colour: glossy objects reflect their surroundings, which stay fixed while the objects turn.
 
-Each Gaussian has a normal and a strength, all share one environment (``kernels.appearance.direction``). A colour by the
-Gaussian's own harmonics, turned with it, would be wrong after a few frames: the highlight of a lamp that stands wanders
-over what turns. It is learnt with frame 0 (``first_frame.glossy``) and goes on in the updates: what turns brings its
-highlights to other places, which determines normals and lamps better than one frame can.
+Each Gaussian has a normal and a strength, and all share one environment (``kernels.appearance.direction``). Spherical
+harmonics that turn with each Gaussian would be wrong after a few frames, because the highlight of a fixed lamp moves
+over a turning surface. The gloss is learnt with frame 0 (``first_frame.glossy``) and refined by updates. Turning moves
+highlights to new places, which determines normals and lamps better than a single frame.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ if TYPE_CHECKING:
     from scas4d_core.effects.evidence import FrameObservation
 
 TURNED_TOGETHER = 32
-"""Gaussians from whose places the rotation of a normal is estimated."""
+"""Number of neighbouring Gaussians whose positions determine the rotation of a normal."""
 FEW = 4
-"""Views that the evidence is taken from."""
+"""Number of views used for the evidence."""
 
 
 def neighbourhood_turns(before: Array, after: Array, near: NDArray[np.int64]) -> NDArray[np.float64]:
-    """[M, 3, 3] the rotation of each Gaussian's neighbourhood between two states (Kabsch 1976).
+    """Returns the [M, 3, 3] rotation of each Gaussian's neighbourhood between two states (Kabsch 1976).
 
-    Normals are turned by it rather than by the rotations of single Gaussians: a normal belongs to a surface, and places
-    do not add up the errors of all frames before. On `gloss` both came out alike.
+    Normals are rotated by it instead of by single Gaussians' rotations: a normal belongs to a surface, and positions do
+    not accumulate the errors of earlier frames. On `gloss`, both variants gave the same result.
 
     Args:
-        before, after: [N, 3] metres. near: [M, k] rows of the neighbourhood.
+        before, after: [N, 3] metres. near: [M, k] rows of each neighbourhood.
     """
     there, now = before[near].astype(np.float64), after[near].astype(np.float64)
     there -= there.mean(axis=1, keepdims=True)
     now -= now.mean(axis=1, keepdims=True)
     spread = np.einsum("nki,nkj->nij", now, there)
-    spread[~np.isfinite(spread).all(axis=(1, 2))] = np.eye(3)  # such a place is held back; its neighbours keep theirs
+    spread[~np.isfinite(spread).all(axis=(1, 2))] = np.eye(3)  # non-finite neighbourhoods are held back
     left, _, right = np.linalg.svd(spread)
     left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
     turns: NDArray[np.float64] = left @ right
@@ -51,21 +51,21 @@ def neighbourhood_turns(before: Array, after: Array, near: NDArray[np.int64]) ->
 
 
 def neighbourhoods(means: Array) -> NDArray[np.int64]:
-    """[N, k] the nearest of each, itself the first."""
+    """Returns [N, k] rows of the nearest neighbours of each Gaussian, itself first."""
     count = len(means)
     nearest: NDArray[np.int64] = np.asarray(cKDTree(means).query(means, min(TURNED_TOGETHER, count))[1])
     return nearest.reshape(count, -1)
 
 
 class DirectionPart(UpdatePart):
-    """Turns the gloss with the deformation; does nothing in a scene whose frame 0 had none."""
+    """Rotates the gloss with the deformation; does nothing if frame 0 has no gloss."""
 
     def __init__(self, builder: PlanBuilder) -> None:
         self._roots = builder.first.means
         self._near: NDArray[np.int64] | None = None
 
     def end(self, attempt: Attempt, state: Gaussians) -> Gaussians:
-        """Θ_t has the gloss turned with its neighbourhood, where it moved."""
+        """Rotates the gloss of Θ_t with its neighbourhood, if the state moved."""
         if state.gloss is None or state.environment is None or attempt.kept is Candidate.PREVIOUS:
             return state
         if self._near is None:
@@ -76,10 +76,10 @@ class DirectionPart(UpdatePart):
 
 @dataclass(frozen=True)
 class Direction(Effect):
-    """Waits for the evidence of frame 0."""
+    """View-dependent colour; off until frame 0 gives evidence."""
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """The share of the squared error of a few pictures that the gloss takes away."""
+        """Returns the share of the squared image error that the gloss removes, on a few views."""
         from scas4d_core.update.best_state import spread_cameras
 
         if seen.before.gloss is None:
@@ -96,7 +96,7 @@ class Direction(Effect):
         return Evidence(share, f"explains {100 * share:.0f} % of the residual")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the part; what a camera sees of what stands is another thing in each frame."""
+        """Adds the part; full images are needed, because static surfaces look different in each frame too."""
         builder.plan.full_images = builder.plan.gloss = True
         builder.parts.append(DirectionPart(builder))
 

@@ -1,8 +1,8 @@
-"""Light over time: while it changes, colours follow faster, those of what moves as fast as those of what stands.
+"""Lighting that changes over time: colours adapt faster, those of moving Gaussians as fast as those of static ones.
 
-What a lamp that crosses a room or dims does to colours is a few numbers: surfaces that face alike and lie together
-become brighter or darker together. That is the evidence. The colours themselves take it on one by one: a relative
-change linear or quadratic in orientation and place, learnt beside them, made pictures no better once they were free to.
+A lamp that moves or dims changes colours in few degrees of freedom: surfaces with similar orientation and position
+become brighter or darker together. This is the evidence. The colours themselves adapt individually. A relative change
+that is linear or quadratic in orientation and position, learnt in addition, did not improve the images.
 """
 
 from __future__ import annotations
@@ -21,24 +21,25 @@ if TYPE_CHECKING:
     from scas4d_core.gaussians import Gaussians
     from scas4d_core.settings import Settings
 
-# Thresholds of the effect: 0.032 a frame at most on the five objects (robot, as it turns fastest: shading follows what
-# turns in a light that stays), 0.012 on stage, whose shadows wander, 0.023 to 0.061 while the lamp of lamps crosses.
+# Measured changes per frame for the thresholds: at most 0.032 on the five objects (robot, which turns fastest, so that
+# its shading changes under constant light), 0.012 on stage with its moving shadows, 0.023 to 0.061 on lamps while the
+# lamp moves.
 SAMPLE = 2000
-"""Gaussians at most that the evidence is taken from: it has seven numbers to find."""
+"""Maximum number of Gaussians used for the evidence; only seven values per channel are estimated."""
 OPAQUE = 0.3
-"""Opacity from which a Gaussian's colour is that of a surface."""
+"""Minimum opacity at which a Gaussian's colour counts as that of a surface."""
 
 
 Double = NDArray[np.float64]
 
 
 def orientation_and_place(state: Gaussians, rows: NDArray[np.int64], centre: Double) -> Double:
-    """[R, 7] 1, the normal, the place: what the relative change of a Gaussian's light is taken to be linear in.
+    """Returns [R, 7] regressors of the relative light change: 1, the normal, and the position.
 
-    The normal is the shortest axis, on the side of the cameras. The place is in metres from the mean of all.
+    The normal is the shortest axis, oriented towards the cameras. The position is in metres relative to the mean.
 
     Args:
-        rows: [R] of the Gaussians that are asked for. centre: of the cameras, metres.
+        rows: [R] rows of the Gaussians. centre: of the cameras, in metres.
     """
     factors, means = state.factors[rows].astype(np.float64), state.means[rows].astype(np.float64)
     axes = np.linalg.eigh(factors @ factors.transpose(0, 2, 1)).eigenvectors
@@ -48,10 +49,10 @@ def orientation_and_place(state: Gaussians, rows: NDArray[np.int64], centre: Dou
 
 
 def change_of_light(before: Gaussians, after: Gaussians, centre: Double) -> float:
-    """Relative change of the colours from a state to the next that orientation and place explain, root mean square.
+    """Returns the RMS relative colour change between two states that orientation and position explain.
 
     Args:
-        centre: [3] of the cameras, metres.
+        centre: [3] of the cameras, in metres.
     """
     rows = np.flatnonzero(before.opacities > OPAQUE)
     rows = rows[:: max(1, len(rows) // SAMPLE)]
@@ -63,7 +64,8 @@ def change_of_light(before: Gaussians, after: Gaussians, centre: Double) -> floa
         old = before.colours[rows, channel].astype(np.float64)
         change = after.colours[rows, channel] - old
         weighed = terms * old[:, None]
-        light = np.linalg.lstsq(weighed.T @ weighed, weighed.T @ change, rcond=None)[0]  # seven numbers: well enough
+        # seven unknowns: the normal equations are accurate enough
+        light = np.linalg.lstsq(weighed.T @ weighed, weighed.T @ change, rcond=None)[0]
         explained += float(np.square(weighed @ light).sum())
         total += float(np.square(old).sum())
     return float(np.sqrt(explained / max(total, 1e-12)))
@@ -71,14 +73,14 @@ def change_of_light(before: Gaussians, after: Gaussians, centre: Double) -> floa
 
 @dataclass(frozen=True)
 class Light(Effect):
-    """Faster colours."""
+    """Faster adaptation of colours while the lighting changes."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused where no colours of what moves are learnt."""
+        """Refused if the colours of moving Gaussians are not learnt."""
         return refusal_at_zero(settings, "rate_colour")
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """How much the colours change together from a frame to the next."""
+        """Returns how much the colours change together from one frame to the next."""
         if not seen.views:
             return None
         centre = np.mean([camera.centre for camera in seen.rig.cameras], axis=0)
@@ -86,7 +88,7 @@ class Light(Effect):
         return Evidence(min(1.0, change), f"the light changes by {change:.1%} a frame")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Frees the colours that are learnt, also from a frame that is shown well enough in the light before."""
+        """Enables faster colours, and disables skipping of frames that the previous lighting already explains."""
         builder.plan.learns_colours().changing_light = True
         builder.plan.disables_skip = True
 

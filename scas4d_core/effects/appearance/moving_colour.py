@@ -1,4 +1,4 @@
-"""Colours of what moves: RGB of each Gaussian follows the pictures (Dynamic3DGaussians)."""
+"""Colours of moving Gaussians: their RGB follows the images (Dynamic3DGaussians)."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MovingColour(Effect):
-    """RGB of the Gaussians that move, at the rate ``rate_colour``."""
+    """RGB of the moving Gaussians, learnt at the rate ``rate_colour``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused with a rate of 0."""
+        """Refused if the rate is 0."""
         return refusal_at_zero(settings, "rate_colour")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Frees their colours."""
+        """Makes their colours learnable."""
         builder.plan.learns_colours().moving = True
 
 

@@ -1,7 +1,8 @@
-"""Shading of what moves: as things turn in the light, their colours follow the pictures, once a frame in closed form.
+"""Shading of moving Gaussians: their colours follow the images once per frame, in closed form, as objects turn.
 
-A hundred steps of Adam at a rate that leaves motion visible do not follow what turns: the error is carried into the
-next frame, and grows. At the end of an update the motion is found, and the rest is looks (``closed_form``).
+Adam at a rate low enough not to absorb motion cannot follow the shading of turning objects: the error carries over to
+the next frame and grows. At the end of an update the motion is found, and the remaining residual is appearance
+(``closed_form``).
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ if TYPE_CHECKING:
 
 
 class ShadingPart(UpdatePart):
-    """Steps the colours of what moves at the end of an update."""
+    """Updates the colours of moving Gaussians at the end of an update."""
 
     def __init__(self, builder: PlanBuilder) -> None:
         self._moves = np.zeros(len(builder.first), np.uint8)
         self._moves[builder.hierarchy.rows] = 1
 
     def end(self, attempt: Attempt, state: Gaussians) -> Gaussians:
-        """Steps them, where a motion is what is kept and colours were not held."""
+        """Updates them if a motion was kept and colours were learnt."""
         if attempt.kept is Candidate.PREVIOUS or attempt.rates.colour == 0 or not self._moves.any():
             return state
         return follow_pictures(state, attempt.views, attempt.renderer, self._moves)
@@ -37,14 +38,14 @@ class ShadingPart(UpdatePart):
 
 @dataclass(frozen=True)
 class Shading(Effect):
-    """A closed-form step of the colours of what moves."""
+    """A closed-form colour update of moving Gaussians."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused with a rate of 0."""
+        """Refused if the rate is 0."""
         return refusal_at_zero(settings, "rate_colour")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the part."""
+        """Adds the part to the update."""
         builder.parts.append(ShadingPart(builder))
 
 

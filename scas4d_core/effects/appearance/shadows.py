@@ -1,7 +1,8 @@
-"""Shadows and light that wander over what stands: its colours follow the pictures once a frame, in closed form.
+"""Moving shadows and light: the colours of static Gaussians follow the images once per frame, in closed form.
 
-At the end of an update the standing Gaussians' colours take the steps of ``closed_form``. That is done in frames in
-which what stands looks other than in frame 0: elsewhere it would fit noise, and what cameras do not agree upon.
+At the end of an update, the colours of static Gaussians take the steps of ``closed_form``. This happens only in frames
+in which the static scene looks different from frame 0. In other frames it would fit noise and disagreement between
+cameras.
 """
 
 from __future__ import annotations
@@ -29,25 +30,25 @@ if TYPE_CHECKING:
 
 NAME = "shadows"
 CHANGED = 0.02
-"""Difference of a mean colour, RGB in 0…1, from which a square looks other than in frame 0."""
+"""Difference of a mean colour, RGB in 0…1, above which a square looks different from frame 0."""
 HARDLY = 0.005
-"""Share of the squares of what stands up to which nothing is learnt from a frame. With a tenth of it `basketball`
-gains 0.06 dB on changed pixels, and noise is nearer to being learnt."""
+"""Share of changed static squares up to which nothing is learnt from a frame. At a tenth of it, `basketball` gains 0.06
+dB on changed pixels, but noise is more likely to be learnt."""
 ENOUGH = 0.5
-"""Share of the cameras of frame 0 from which a frame teaches: what a few of them see is their own noise as well."""
+"""Minimum share of frame 0's cameras for learning from a frame: with few cameras, their noise would be learnt."""
 STANDS = 0.05
-"""Share of Gaussians that stand, below which there is nothing for shadows to wander over."""
+"""Minimum share of static Gaussians; with fewer, there is no background for shadows."""
 
 
 class ShadowsPart(UpdatePart):
-    """Steps the colours of what stands at the end of an update."""
+    """Updates the colours of static Gaussians at the end of an update."""
 
     def __init__(self, builder: PlanBuilder) -> None:
         self._stands = np.ones(len(builder.first), np.uint8)
         self._stands[builder.hierarchy.rows] = 0
 
     def end(self, attempt: Attempt, state: Gaussians) -> Gaussians:
-        """Steps them, where the end of the update is what is kept."""
+        """Updates them if the final state of the update is kept and the frame looks different from frame 0."""
         if attempt.kept is not Candidate.END or not self._stands.any() or attempt.rates.static_colour == 0:
             return state
         before: Arrays = attempt.carried.get(NAME, {})
@@ -62,14 +63,14 @@ class ShadowsPart(UpdatePart):
 
 @dataclass(frozen=True)
 class Shadows(Effect):
-    """A closed-form step of the colours of what stands."""
+    """A closed-form colour update of static Gaussians."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused with a rate of 0."""
+        """Refused if the rate is 0."""
         return refusal_at_zero(settings, "rate_static_colour")
 
     def first_frame_arrays(self, seen: FrameObservation) -> Arrays | None:
-        """[h, w, 4] float16 of each view: mean colours of squares, and 1 where what moves reaches."""
+        """Returns [h, w, 4] float16 per view: mean colours of squares, and 1 if moving Gaussians reach the square."""
         state = seen.result.gaussians
         stands = float((~state.moving).mean())
         if 0 < stands < STANDS:
@@ -77,17 +78,17 @@ class Shadows(Effect):
         arrays = {}
         for view in seen.views:
             means = _means(view)
-            # Where all seems to move, as without masks, it is not known yet what stands.
+            # If all Gaussians appear to move, as without masks, the static ones are not known yet.
             hidden = _hidden(view, state, seen.renderer) if stands else np.zeros(means.shape[:2])
             arrays[view.name] = np.concatenate([means, hidden[..., None]], axis=-1).astype(np.float16)
         return arrays
 
     def on_at_first(self, seen: FrameObservation) -> bool:
-        """True where something stands."""
+        """Returns true if enough of the scene is static."""
         return bool((~seen.result.gaussians.moving).mean() >= STANDS)
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """Share of what stands, seen in frame 0 and now, that looks other than then."""
+        """Returns the share of static squares, seen in frame 0 and now, that have changed since frame 0."""
         before: Arrays = seen.result.carried.get(NAME, {})
         if seen.result.gaussians.moving.all():
             return None
@@ -98,19 +99,19 @@ class Shadows(Effect):
                 changed += int((squares & stands).sum())
                 compared += int(stands.sum())
         if not before:
-            return Evidence(0.0, "")  # what frame 0 left is lost
+            return Evidence(0.0, "")  # the arrays of frame 0 were lost
         if compared == 0:
             return None
         share = changed / compared
         return Evidence(share, f"{100 * share:.0f} % of what stands looks other than in frame 0")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the part."""
+        """Adds the part to the update."""
         builder.parts.append(ShadowsPart(builder))
 
 
 def _means(view: TrainingView) -> Array:
-    """[h, w, 3] mean colours of the picture's whole squares, without the camera's exposure."""
+    """Returns the [h, w, 3] mean colours of the image's whole squares, without the camera's exposure."""
     gain, offset = view.exposure[:3, 0], view.exposure[:3, 1]
     return (view.squares - offset) / gain
 
@@ -118,13 +119,13 @@ def _means(view: TrainingView) -> Array:
 def _compared(
     before: NDArray[Any], view: TrainingView, state: Gaussians, renderer: Renderer
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """[h, w] squares that look other than before, and those that what moves reaches neither then nor now."""
+    """Returns [h, w] squares that have changed, and squares that moving Gaussians reach neither then nor now."""
     changed: NDArray[np.bool_] = np.abs(_means(view) - before[..., :3].astype(np.float32)).max(axis=-1) >= CHANGED
     return changed, (before[..., 3] == 0) & ~_hidden(view, state, renderer)
 
 
 def _hidden(view: TrainingView, state: Gaussians, renderer: Renderer) -> NDArray[np.bool_]:
-    """[h, w] squares that what moves reaches."""
+    """Returns [h, w] squares that moving Gaussians reach."""
     height, width, each = view.target.shape[1] // SIDE, view.target.shape[2] // SIDE, SIDE // BLOCK
     blocks = renderer.reached(state, np.flatnonzero(state.moving), view.camera)
     grid = blocks[: height * each, : width * each]

@@ -1,4 +1,4 @@
-"""Colours of what stands: RGB of each Gaussian follows the pictures (Dynamic3DGaussians)."""
+"""Colours of static Gaussians: their RGB follows the images (Dynamic3DGaussians)."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StaticColour(Effect):
-    """RGB of the Gaussians that stand, at the rate ``rate_static_colour``."""
+    """RGB of the static Gaussians, learnt at the rate ``rate_static_colour``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused with a rate of 0."""
+        """Refused if the rate is 0."""
         return refusal_at_zero(settings, "rate_static_colour")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Frees their colours."""
+        """Makes their colours learnable."""
         builder.plan.learns_colours().static = True
         builder.plan.full_images = True
 

@@ -1,1 +1,1 @@
-"""Effects on cameras: their poses."""
+"""Effects on camera poses."""

@@ -1,9 +1,9 @@
-"""Direct photometric alignment: the small twist of a camera's pose that brings a rendering onto its picture.
+"""Direct photometric alignment: finds the small pose twist of a camera that aligns a rendering with its image.
 
-A twist is six numbers in the camera's axes, shift (metres) and turn (radians), applied on the left of its pose:
-``world_to_camera' = exp(twist) world_to_camera``. By it what is seen at a pixel moves by ``flow``, and the rendering
-changes by −slope · flow: Gauss-Newton, with the mean slope of picture and rendering (Benhimane and Malis 2004) and
-Cauchy's weights. One step is taken of a frame: the next frame goes on.
+A twist is six numbers in camera axes, translation (metres) and rotation (radians), applied on the left of the pose:
+``world_to_camera' = exp(twist) world_to_camera``. It displaces the content of a pixel by ``flow``, and the rendering
+changes by −gradient · flow. Gauss-Newton uses the mean gradient of image and rendering (Benhimane and Malis 2004) and
+Cauchy weights. Each frame takes a single step; later frames continue from it.
 """
 
 from __future__ import annotations
@@ -17,33 +17,37 @@ Array = NDArray[np.float32]
 Double = NDArray[np.float64]
 
 LOOKED_AT = 4096
-"""Pixels of a picture that are looked at, about: rows and columns apart."""
+"""Approximate number of sampled pixels per image, on a regular grid."""
 MOST = 1000
-"""Share of the informative pixels that are used, about: more pixels of a room add nothing that objects do not show."""
+"""Approximate maximum number of informative pixels that are used; more pixels hardly improve the estimate."""
 STEEP = 0.02
-"""Length of the slope, of a value 0…1 a pixel, from which a pixel shows a shift: flatter pixels show noise."""
+"""Minimum gradient magnitude, in values of 0…1 per pixel, of an informative pixel; flatter pixels show noise."""
 CAUCHY = 2.4
-"""Times the usual residual, at which a pixel has half of its weight (95 % efficient under Gaussian noise)."""
+"""Residual, as a multiple of its usual size, at which the Cauchy weight is one half (95 % efficiency for Gaussian
+noise).
+"""
 QUIETEST = 1 / 255
-"""Residual, 0…1, that is usual at least: the rounding of pictures."""
+"""Lower bound of the usual residual, 0…1: the quantization of 8-bit images."""
 FEW = 50
-"""Informative pixels that a shift needs at least."""
+"""Minimum number of informative pixels for an estimate."""
 TURNED, SHIFTED = 4.0, 0.25
-"""Pixels that a turn, and a shift at the depth of the picture's middle, are thought to move it by before anything is
-seen: tripods sag and are knocked, which turns a camera rather than shifts it. It decides where the two look alike: with
-1 pixel of shift, and a prior for each step instead of for all, turns of 0.5° were undone by shifts of 1 cm."""
+"""Prior standard deviations, in pixels, of a rotation and of a translation (at the depth of the image centre). Tripods
+sag or are knocked, which rotates a camera more than it translates it. The prior decides when the two look alike. With 1
+pixel of translation, and a prior per step instead of for the total, rotations of 0.5° were compensated by translations
+of 1 cm."""
 SMALLEST = 1e-9
-"""Of the trace, added to equations that may have no solution."""
+"""Regularization, relative to the trace, of equations that may be singular."""
 RESIDUAL_SCALE = 0.02
-"""Residual, 0…1, at which ``FEW`` pixels with a slope of 1 weigh as much as what is thought before."""
+"""Residual, 0…1, at which ``FEW`` pixels with a gradient of 1 weigh as much as the prior."""
 
 
 class AlignedPixels(NamedTuple):
-    """A picture and its rendering, at some pixels.
+    """An image and its rendering at selected pixels.
 
     Attributes:
-        target, shown: [3, P] RGB in 0…1, with the exposure of the camera. slopes: [3, 2, P] a pixel, along x and y.
-        places: [2, P] positions u, v of the pixels. pixels: [P] which they are, of the picture's.
+        target, shown: [3, P] RGB in 0…1, with the camera's exposure. slopes: [3, 2, P] image gradients per pixel, along
+            x and y.
+        places: [2, P] pixel positions u, v. pixels: [P] flat pixel indices in the image.
     """
 
     target: Array
@@ -54,12 +58,13 @@ class AlignedPixels(NamedTuple):
 
 
 class Equations(NamedTuple):
-    """The normal equations of one picture, in K numbers.
+    """The normal equations of one image in K unknowns.
 
     Attributes:
-        matrix: [K, K], vector: [K]; a twist ξ leaves the weighted squares ``energy − 2 vector·ξ + ξ·matrix·ξ``, in
-            units of ``RESIDUAL_SCALE``. Shifts are in units of ``depth``. energy: those of the residual as it is.
-        depth: metres, of the picture's middle.
+        matrix: [K, K], vector: [K]; a twist ξ leaves the weighted squared error ``energy − 2 vector·ξ + ξ·matrix·ξ``,
+            in units of ``RESIDUAL_SCALE``. Translations are in units of ``depth``. energy: weighted squared error
+            without a twist.
+        depth: of the image centre, in metres.
     """
 
     matrix: Double
@@ -69,11 +74,11 @@ class Equations(NamedTuple):
 
 
 def align_pixels(target: Array, shown: Array, every: int = 1) -> AlignedPixels | None:
-    """Both at the informative pixels among those that are looked at; None: there are too few.
+    """Samples both images at the informative pixels; returns None if there are too few.
 
     Args:
-        target: [3, H, W]. shown: [3, H, W], or [3, h, w] where it is thinned to every so many rows and columns, and the
-            slopes are those of the target alone.
+        target: [3, H, W]. shown: [3, H, W], or [3, h, w] if it has only every ``every``-th row and column; the
+            gradients are then those of the target only.
     """
     _, height, width = target.shape
     step = every * max(1, round(float(np.sqrt(height * width / LOOKED_AT))) // every)
@@ -102,12 +107,12 @@ def align_pixels(target: Array, shown: Array, every: int = 1) -> AlignedPixels |
 
 
 def flow(lens: Array | Double, places: Double, depth: Double | float = 1.0) -> Double:
-    """[2, 6, ...] pixels that each number of a twist moves what is seen at some places, to first order.
+    """Returns the [2, 6, ...] first-order pixel displacement at some pixels per unit of each twist component.
 
     Args:
-        lens: fx, fy, cx, cy, … places: [2, ...] u, v. depth: [...] along z; shifts of the twist are in the same unit.
+        lens: fx, fy, cx, cy, … places: [2, ...] u, v. depth: [...] along z, in the unit of the twist's translations.
 
-    >>> flow(np.array([100, 100, 8, 8]), np.array([8.0, 8.0]), 2.0)[0]  # across, of what lies on the axis
+    >>> flow(np.array([100, 100, 8, 8]), np.array([8.0, 8.0]), 2.0)[0]  # horizontal, for a point on the optical axis
     array([ 50.,   0.,   0.,   0., 100.,   0.])
     """
     fx, fy, cx, cy = (float(number) for number in lens[:4])
@@ -115,17 +120,18 @@ def flow(lens: Array | Double, places: Double, depth: Double | float = 1.0) -> D
     near, none = np.broadcast_to(1 / np.asarray(depth, np.float64), x.shape), np.zeros_like(x)
     across = np.stack([near, none, -x * near, -x * y, 1 + x * x, -y])
     down = np.stack([none, near, -y * near, -1 - y * y, x * y, x])
-    moved: Double = np.stack([fx * across, fy * down]) + 0.0  # no minus before a 0
+    moved: Double = np.stack([fx * across, fy * down]) + 0.0  # turns −0 into 0
     return moved
 
 
 def equations(seen: AlignedPixels, moved: Double, depth: float = 1.0) -> Equations:
-    """The normal equations of what moves the pixels.
+    """Returns the normal equations for given displacement fields.
 
-    They are weighed twice: with the residual as it is, what a shift explains would pass for things in the way.
+    They are weighted twice: weights from the initial residual alone would treat residuals that a shift explains as
+    outliers.
 
     Args:
-        moved: [2, K, P] pixels that each of K numbers moves them by. depth: see ``Equations``.
+        moved: [2, K, P] pixel displacements per unit of each of the K unknowns. depth: see ``Equations``.
     """
     residual = (seen.target - seen.shown).astype(np.float64).reshape(-1)
     terms = -np.einsum("cdp,dkp->kcp", seen.slopes.astype(np.float64), moved).reshape(moved.shape[1], -1)
@@ -138,17 +144,17 @@ def equations(seen: AlignedPixels, moved: Double, depth: float = 1.0) -> Equatio
 
 
 def _weights(residual: Double) -> Double:
-    """Of each residual."""
+    """Returns the Cauchy weight of each residual."""
     usual = max(QUIETEST, 1.4826 * float(np.median(np.abs(residual))))
     weights: Double = (FEW * RESIDUAL_SCALE**2) ** -1 / (1 + np.square(residual / (CAUCHY * usual)))
     return weights
 
 
 def twist_equations(lens: Array, seen: AlignedPixels, depth: Array) -> Equations:
-    """Those of a twist, six numbers.
+    """Returns the normal equations of a twist, in six unknowns.
 
     Args:
-        lens: of the camera. depth: [H, W] metres along z; NaN where nothing is seen, taken for the middle's.
+        lens: of the camera. depth: [H, W] metres along z; NaN (nothing rendered) is replaced by the median depth.
     """
     here = depth.reshape(-1)[seen.pixels].astype(np.float64)
     known = np.isfinite(here)
@@ -157,34 +163,35 @@ def twist_equations(lens: Array, seen: AlignedPixels, depth: Array) -> Equations
 
 
 def turn_equations(lens: Array, seen: AlignedPixels) -> Equations:
-    """Those of a turn, three numbers in pixels: across, down, and round by so many at a quarter of the width.
+    """Returns the normal equations of a rotation in three unknowns, in pixels: horizontal, vertical, and roll.
 
-    They hang on no depth.
+    Roll is the displacement at a quarter of the image width. The equations do not depend on depth.
     """
     return equations(seen, np.einsum("dkp,kl->dlp", flow(lens, seen.places)[:, 3:], turn_from_pixels(lens)))
 
 
 def turn_from_pixels(lens: Array) -> Double:
-    """[3, 3] the turn, radians, for each of the three numbers of ``turn_equations``."""
+    """Returns the [3, 3] rotation, in radians, per unit of the three unknowns of ``turn_equations``."""
     fx, fy, width = float(lens[0]), float(lens[1]), float(lens[4])
     return np.array([[0, -1 / fy, 0], [1 / fx, 0, 0], [0, 0, 4 / width]])
 
 
 def pixel_offset(lens: Array, twist: Double, depth: float) -> Double:
-    """[3] pixels across, down and round by which a twist moves the middle of a picture.
+    """Returns the [3] displacement (horizontal, vertical, roll) of the image centre by a twist, in pixels.
 
     Args:
-        depth: metres, of the middle.
+        depth: of the image centre, in metres.
     """
     middle = np.array([lens[4] / 2, lens[5] / 2], np.float64)
     return np.append(flow(lens, middle, depth) @ twist, twist[5] * float(lens[4]) / 4)
 
 
 def solve_twist(one: Equations, lens: Array, twist: Double, vector: Double | None = None) -> Double:
-    """[6] the twist beside one that a camera has already, shift in metres; their sum is small where little is seen.
+    """Returns the [6] increment of a twist (translation in metres); the prior keeps their sum small if little is
+    visible.
 
     Args:
-        twist: [6] that it has. vector: in the place of the equations' own.
+        twist: [6] current twist of the camera. vector: replaces the vector of the equations.
     """
     focal, units = float(lens[0] + lens[1]) / 2, np.array([one.depth] * 3 + [1.0] * 3)
     before = np.array([(focal / SHIFTED) ** 2] * 3 + [(focal / TURNED) ** 2] * 3)
@@ -194,7 +201,7 @@ def solve_twist(one: Equations, lens: Array, twist: Double, vector: Double | Non
 
 
 def to_camera_twist(one: Equations, pose: Double) -> Double:
-    """[6, 6] a twist of the world's axes, in the numbers of a camera's equations.
+    """Returns the [6, 6] matrix from a twist in world axes to the unknowns of a camera's equations.
 
     Args:
         pose: [4, 4] world to camera.
@@ -203,11 +210,11 @@ def to_camera_twist(one: Equations, pose: Double) -> Double:
 
 
 def adjoint(pose: Double) -> Double:
-    """[6, 6] a twist in the axes before a pose [4, 4], as it is in the axes after.
+    """Returns the [6, 6] matrix that maps a twist from the axes before a pose [4, 4] to the axes after it.
 
     >>> beside = np.eye(4)
-    >>> beside[0, 3] = 2.0  # the origin is seen 2 m to the right
-    >>> adjoint(beside) @ [0, 0, 0, 0, 1, 0]  # a turn about the origin turns and shifts
+    >>> beside[0, 3] = 2.0  # the origin is 2 m to the right of the camera
+    >>> adjoint(beside) @ [0, 0, 0, 0, 1, 0]  # a rotation about the origin rotates and translates
     array([0., 0., 2., 0., 1., 0.])
     """
     turn, matrix = pose[:3, :3], np.zeros((6, 6))
@@ -217,13 +224,13 @@ def adjoint(pose: Double) -> Double:
 
 
 def twist_to_matrix(twist: Double) -> Double:
-    """[4, 4] the exponential of a twist [6].
+    """Returns the [4, 4] exponential of a twist [6].
 
     >>> twist_to_matrix(np.array([1.0, 2, 3, 0, 0, 0]))[:3, 3]
     array([1., 2., 3.])
     """
     motion, cross, angle = np.eye(4), _crossing(twist[3:]), float(np.linalg.norm(twist[3:]))
-    small = angle < 1e-4  # series: the quotients below would lose their digits
+    small = angle < 1e-4  # series expansion, because the quotients below would lose precision
     one = 1 - angle**2 / 6 if small else np.sin(angle) / angle
     two = 0.5 - angle**2 / 24 if small else (1 - np.cos(angle)) / angle**2
     three = 1 / 6 - angle**2 / 120 if small else (1 - one) / angle**2
@@ -233,6 +240,6 @@ def twist_to_matrix(twist: Double) -> Double:
 
 
 def _crossing(vector: Double) -> Double:
-    """[3, 3] the cross product with a vector on the left."""
+    """Returns the [3, 3] cross-product matrix of a vector."""
     x, y, z = vector
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

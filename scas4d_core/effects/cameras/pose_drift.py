@@ -1,17 +1,16 @@
-"""Poses of cameras that drift: tripods sag, are knocked by a pixel or a few, and bend in the sun.
+"""Drifting camera poses: tripods sag, are knocked by a few pixels, or bend in the sun.
 
-Once a frame, after its update, the renderings of some cameras are compared with their pictures: the turn of a camera
-that would bring them onto each other is noted, as what the camera is off by against its calibration. One frame says
-little, for what moves is followed late. A camera is believed to have moved where its earlier frames show what its
-residual is now, and by ``LEAST`` pixels; then its pose follows, half of the way a frame. All others keep theirs to the
-bit.
+Once per frame, after the update, renderings of some cameras are compared with their images. The rotation that would
+align them is recorded as the camera's offset from its calibration. A single frame is unreliable, because moving objects
+are tracked with a delay. A camera counts as moved if offsets from earlier frames explain its current residual, and if
+the offset is at least ``LEAST`` pixels. Its pose then follows by half of the difference per frame. The poses of all
+other cameras stay bit-identical.
 
-The poses are those of the training views of the frames after: masks shift with their camera, probe views and what is
-new are seen from where it stands. Views that users ask for are rendered for the camera as it is given: "as camera 7"
-is as that was calibrated. Who is believed is decided before (``robust.outliers``): a camera that is off is excluded
-as ever, and still measured; it comes back once its pose is found, and stays excluded beyond the limit. A gain of
-a camera is the median over its pixels, which hardly sees a shift of some pixels; ``shadows`` may learn in such
-frames, but from all cameras.
+Later frames use these poses for their training views: masks move with their camera, and probe views and new Gaussians
+use the current pose. Views that users request are rendered with the given camera, so "as camera 7" is as calibrated.
+Exclusion of cameras is decided earlier (``robust.outliers``). A camera that is off is still excluded but is also
+measured. It returns once its pose is found, and stays excluded beyond the limit. Camera gains are medians over pixels
+and are hardly affected by small shifts. ``shadows`` may learn in such frames, but from all cameras.
 """
 
 from __future__ import annotations
@@ -51,35 +50,35 @@ if TYPE_CHECKING:
 
 NAME = "pose_drift"
 CAMERAS = 4
-"""Cameras that are needed to find one that is off: with fewer, moving Gaussians could explain the difference."""
+"""Minimum number of cameras for finding one that is off; with fewer, moving Gaussians could explain the difference."""
 ENOUGH = 0.5
-"""Share of the rig's cameras from which a frame teaches."""
+"""Minimum share of the rig's cameras in a frame for learning from it."""
 LEAST = 0.25
-"""Pixels from which a camera may be off: on captures whose cameras stand 0.15 at most, 0.4 on cloth that is shaken."""
+"""Minimum offset in pixels of a suspect camera. Fixed cameras have at most 0.15 on captures, 0.4 on shaken cloth."""
 TIMES = 4.0
-"""The same, of the median over the cameras: where many seem to be off, what moves is followed late."""
-# Thresholds of the effect: shares on captures whose cameras stand, at half size, are 0.14 at most on cloth played
-# backwards, 0.07 on cloth and the wheel, 0.03 on the others.
+"""Minimum offset relative to the median over cameras: if many cameras appear to be off, tracking is delayed."""
+# For the threshold of the effect: captures with fixed cameras, at half size, have shares of at most 0.14 on cloth
+# played backwards, 0.07 on cloth and the wheel, and 0.03 on the others.
 SHARE = 0.5
-"""Of the way to what a frame says, that poses and what is noted take: a drift is followed late by as much as it goes in
-a frame, and a frame in which a thing is followed late does half of the harm."""
+"""Share of the difference that poses and recorded offsets follow per frame. A drift is tracked with a delay of one
+frame's change, and a frame with delayed tracking does half of the harm."""
 STANDING = 6
-"""Cameras that stand, others in each frame, that are rendered where the effect is on: they show what of a twist is the
-scene's own motion."""
+"""Number of fixed cameras, different ones in each frame, that are rendered while the effect is on. They show which part
+of a twist is motion of the scene."""
 LARGEST, TURN = 0.02, radians(1)
-"""Share of the picture's width, and angle, by which a pose is moved at most: a camera that is off by more has been
-moved, and is excluded as ever."""
+"""Maximum pose correction, as a share of the image width and as an angle. A camera that is off by more has been moved
+and stays excluded."""
 COVERED = 0.1
-"""Alpha from which a pixel has a depth."""
+"""Minimum alpha of a pixel with a depth."""
 SMALLEST = 1e-3
-"""Added to the 3×3 equations of a turn in pixels, 0.3 pixels of one that weighs nothing: a bare wall shows no turn."""
+"""Added to the 3×3 equations of a rotation in pixels, equivalent to a weak prior: a plain wall shows no rotation."""
 
 
 def rig_with_drift(rig: Rig, carried: Mapping[str, Arrays]) -> Rig:
-    """The cameras as they stand by now; the rig itself where none has moved.
+    """Returns the rig with the current poses; the given rig if no camera has moved.
 
     Args:
-        rig: the cameras inside, as calibrated. carried: arrays of the effects.
+        rig: the cameras in the internal world, as calibrated. carried: arrays of the effects.
     """
     twists = carried.get(NAME, {}).get("twists")
     if twists is None or not twists.any():
@@ -93,14 +92,14 @@ def _moved(camera: Camera, twist: Double) -> Camera:
 
 @dataclass(eq=False)
 class Poses:
-    """The cameras of a rig, a row each.
+    """Pose offsets of a rig's cameras, one row per camera.
 
     Attributes:
-        twists: [C, 6] float64 by which each is moved against its calibration: shift (metres) and turn, camera's axes.
-        moved: [C, 3] the same in pixels, see ``alignment.pixel_offset``, when last looked at.
-        offsets: [C, 3] pixels that each has been off by, against its calibration: a mean that forgets.
-        shares: [C] 0…1 of its residual that offsets of earlier frames explained: a mean that forgets.
-        observations: [C] frames in which it was looked at.
+        twists: [C, 6] float64 correction from the calibration: translation (metres) and rotation, in camera axes.
+        moved: [C, 3] the correction in pixels at the last measurement, see ``alignment.pixel_offset``.
+        offsets: [C, 3] measured offset from the calibration in pixels, as an exponential moving average.
+        shares: [C] 0…1 share of the residual explained by earlier offsets, as an exponential moving average.
+        observations: [C] number of frames in which the camera was measured.
     """
 
     twists: Double
@@ -111,19 +110,21 @@ class Poses:
 
     @classmethod
     def of(cls, arrays: Arrays, count: int) -> Poses:
-        """From ``arrays``; those that are not there are 0."""
+        """Creates poses from ``arrays``; missing arrays are 0."""
         shapes = {"twists": (count, 6), "moved": (count, 3), "offsets": (count, 3), "shares": (count,)}
         blank: dict[str, NDArray[Any]] = {name: np.zeros(shape) for name, shape in shapes.items()}
         blank["observations"] = np.zeros(count, np.int64)
         return cls(**{name: arrays[name].copy() if name in arrays else empty for name, empty in blank.items()})
 
     def arrays(self) -> Arrays:
-        """As they are carried to the next frame; no twists where no camera has moved."""
+        """Returns the arrays for the next frame; without twists if no camera has moved."""
         arrays: Arrays = {name: getattr(self, name) for name in ("moved", "offsets", "shares", "observations")}
         return {**arrays, "twists": self.twists} if self.twists.any() else arrays
 
     def record_offset(self, row: int, turn: Equations) -> None:
-        """Notes what a camera's residual says, in the numbers of ``turn_equations``, relative to its present pose."""
+        """Records the offset that a camera's residual shows, in the unknowns of ``turn_equations``, relative to its
+        pose.
+        """
         here = self.moved[row]
         now = here + np.linalg.solve(turn.matrix + SMALLEST * np.eye(3), turn.vector)
         if self.observations[row] == 0:
@@ -136,31 +137,32 @@ class Poses:
         self.observations[row] += 1
 
     def suspects(self) -> NDArray[np.bool_]:
-        """[C] the cameras that may have moved: they are rendered, to be looked at again at once."""
+        """[C] cameras that may have moved; they are rendered and measured again."""
         sizes, looked = np.linalg.norm(self.offsets, axis=1), self.observations > 0
         usual = float(np.median(sizes[looked])) if looked.any() else 0.0
         off: NDArray[np.bool_] = sizes >= max(LEAST, TIMES * usual)
         return off
 
     def drifted(self) -> NDArray[np.bool_]:
-        """[C] the cameras that have moved."""
+        """[C] cameras that have moved."""
         return self.twists.any(axis=1) | (self.suspects() & (self.shares >= EFFECT.on_above))
 
 
 def _left(turn: Equations, way: Double) -> float:
-    """The weighted squares that a turn leaves."""
+    """Returns the weighted squared error that remains after a rotation."""
     return float(turn.energy - 2 * turn.vector @ way + way @ turn.matrix @ way)
 
 
 def step_twists(
     twists: Double, aligned: Mapping[int, tuple[Equations, Camera, Array]], follow: NDArray[np.bool_]
 ) -> Double:
-    """[C, 6] the twists after a frame, for the cameras that follow.
+    """Returns the [C, 6] twists after a frame, updated for the cameras in ``follow``.
 
-    A motion of the scene that its other cameras see as well is taken out before.
+    Scene motion that the other cameras see too is removed first.
 
     Args:
-        twists: before. aligned: by row, the equations of a camera, the camera as it is posed, and its lens.
+        twists: before the frame. aligned: by row, a camera's equations, the camera with its current pose, and its lens.
+        follow: [C] cameras whose twists are updated.
         follow: [C].
     """
     matrix, vector = np.eye(6) * 1e-6, np.zeros(6)
@@ -180,19 +182,19 @@ def step_twists(
 
 
 def limit_twist(twist: Double, lens: Array, depth: float) -> Double:
-    """The twist, or as much of it as a pose may be moved by."""
+    """Returns the twist, scaled down to the maximum correction."""
     size = float(np.linalg.norm(pixel_offset(lens, twist, depth)[:2])) / (LARGEST * float(lens[4]))
     return twist / max(1.0, size, float(np.linalg.norm(twist[3:])) / TURN)
 
 
 def remove_common_motion(twists: Double, rig: Rig, believed: NDArray[np.bool_]) -> Double:
-    """[C, 6] the twists without what most cameras share: that is a motion of the scene.
+    """Returns the [C, 6] twists without the component that most cameras share, which is motion of the scene.
 
-    The median is taken of each number, in the world's axes, over the cameras that are believed. With a mean, a camera
-    that is off by 3 pixels would move the others, and the world with them.
+    It is the median of each component, in world axes, over the accepted cameras. With a mean, a camera that is off by 3
+    pixels would move the other cameras, and the world with them.
 
     Args:
-        rig: as calibrated, or as posed: a motion does not turn its own twist. believed: [C].
+        rig: as calibrated or with current poses; both give the same result. believed: [C] accepted cameras.
     """
     worlds = [
         np.linalg.solve(adjoint(rig.cameras[row].world_to_camera), twists[row]) for row in np.flatnonzero(believed)
@@ -208,10 +210,10 @@ def remove_common_motion(twists: Double, rig: Rig, believed: NDArray[np.bool_]) 
 
 @dataclass(frozen=True)
 class PoseDrift(Effect):
-    """Poses that follow the pictures, once a frame."""
+    """Camera poses that follow the images, once per frame."""
 
     def record(self, seen: FrameObservation, on: bool) -> Arrays | None:
-        """What each camera is off by; where it is on, the poses of the frames after."""
+        """Returns the measured camera offsets and, while the effect is on, the poses for later frames."""
         if not _says(seen):
             return None
         poses = Poses.of(dict(seen.result.carried.get(NAME, {})), len(seen.rig))
@@ -239,7 +241,7 @@ class PoseDrift(Effect):
         return poses.arrays()
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """The share of its residual that a shift found in earlier frames explains, of the camera with the largest."""
+        """Returns the largest residual share of a camera that offsets from earlier frames explain."""
         arrays = seen.result.carried.get(NAME)
         if arrays is None or not _says(seen):
             return None
@@ -252,7 +254,7 @@ class PoseDrift(Effect):
         return Evidence(float(shares[row]), f"camera {seen.rig.names[row]} is off by {size:.1f} pixels")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds nothing: updates know nothing of it, for the poses are those of their views."""
+        """Adds nothing: the update uses the poses through its views."""
 
 
 def _says(seen: FrameObservation) -> bool:
@@ -260,7 +262,9 @@ def _says(seen: FrameObservation) -> bool:
 
 
 def _looked_at(seen: FrameObservation, poses: Poses, rows: Mapping[str, int]) -> list[TrainingView]:
-    """Views to be aligned: of cameras that are off or excluded, and of some that stand, others in each frame."""
+    """Returns the views to align: of drifted or excluded cameras, and of some fixed ones that change from frame to
+    frame.
+    """
     off = poses.drifted()
     standing = [view for view in seen.views if not off[rows[view.name]]]
     count = len(standing)
@@ -270,7 +274,7 @@ def _looked_at(seen: FrameObservation, poses: Poses, rows: Mapping[str, int]) ->
 
 
 def _aligned(seen: FrameObservation, views: list[TrainingView]) -> dict[int, tuple[Equations, Camera, Array]]:
-    """By row, the equations of each view, its camera and lens; without those that show too little."""
+    """Returns each view's equations, camera and lens by row; views with too little texture are left out."""
     rows, by_row = {name: row for row, name in enumerate(seen.rig.names)}, {}
     for view in views:
         shown, depth = _rendered(seen, view)
@@ -292,7 +296,7 @@ def _exposed(view: TrainingView, shown: Array) -> Array:
 
 
 def _rendered(seen: FrameObservation, view: TrainingView) -> tuple[Array, Array]:
-    """[3, H, W] as a view is rendered, without its exposure, and [H, W] metres along z; NaN where nothing is."""
+    """Returns a view's rendering [3, H, W] without exposure, and depths [H, W] in metres along z; NaN if empty."""
     state = seen.result.gaussians
     planes, rest = seen.renderer.render(state, view.camera, depth_channel=LABEL)
     alpha = 1 - rest

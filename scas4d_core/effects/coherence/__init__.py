@@ -1,1 +1,1 @@
-"""Effects that tie the motion of neighbouring Gaussians together."""
+"""Effects that couple the motion of neighbouring Gaussians."""

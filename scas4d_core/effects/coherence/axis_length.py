@@ -1,4 +1,4 @@
-"""Limit of the axes' lengths (paper, scale loss).
+"""Limit on the axis lengths (paper, scale loss).
 
 Kernel: ``kernels.deltas``; reference: ``engines.torch.losses.scale_loss``.
 """
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class AxisLength(Effect):
-    """The term ``weights.scale``."""
+    """The loss term ``weights.scale``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused with a weight of 0."""
+        """Refused if the weight is 0."""
         return refusal_at_zero(settings, "weights.scale")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the term, with its weight."""
+        """Adds the term with its weight."""
         builder.plan.axis_length = builder.update.weights.scale
 
 

@@ -1,12 +1,13 @@
-"""Bending: where things bend all over, as cloth does, neighbours turn each in their own way.
+"""Bending: in objects that bend everywhere, such as cloth, neighbours rotate independently.
 
-The term ``rotation`` is a sum of lengths of differences, so up to a point it holds neighbours to one and the same turn:
-it finds parts that are rigid, and takes from a cloth that swings nearly all differences of its turns. Where things bend
-it is left out, and rigidity, which ties positions to these turns, falls to nothing by the end of an update.
+The term ``rotation`` is a sum of norms of differences, so below a threshold it forces neighbours to the same rotation.
+It finds rigid parts, but removes nearly all rotation differences from swinging cloth. In bending scenes it is left out.
+Rigidity, which couples positions to these rotations, fades to zero during an update.
 
-The evidence is of positions alone, so it means the same with and without the terms. A patch, a hundredth of what moves,
-has turned as its positions say; the evidence is by how much it turned otherwise than most patches around, less what of
-its motion is no turn. Joints are few among the patches, and what is met badly moves unlike any rigid body: both say no.
+The evidence uses only positions, so it means the same with and without the terms. It measures patches of about a
+hundredth of the moving Gaussians. The evidence is the rotation of each patch relative to most of the patches around it.
+The part of the patch's motion that is not a rotation is subtracted. Joints affect few patches, and badly tracked
+patches do not move rigidly, so neither gives evidence.
 """
 
 from __future__ import annotations
@@ -27,30 +28,31 @@ if TYPE_CHECKING:
     from scas4d_core.settings import Settings
 
 SAMPLE = 4000
-"""Gaussians that patches are made of, or up to twice as many: a patch is the same part of a thing in all states."""
+"""Minimum number of sampled Gaussians, up to twice as many: a patch covers the same part of an object in all states."""
 PATCH = 40
-"""Gaussians of a patch beside its middle: positions of fewer are too noisy to show a turn."""
+"""Number of Gaussians in a patch in addition to its centre; fewer positions are too noisy to show a rotation."""
 PATCHES = 400
-"""Or up to twice as many: the evidence is a median over them."""
+"""Minimum number of patches, up to twice as many; the evidence is their median."""
 AROUND = 19
-"""Patches that a patch is compared with, the nearest: with it a twentieth of what moves."""
+"""Number of nearest patches that a patch is compared with; together a twentieth of the moving Gaussians."""
 REST = 1e-3
-"""Of the size of what moves: where nine tenths of it move less in a frame, the frame says nothing."""
+"""Minimum motion relative to the extent of the moving Gaussians; if 90 % move less, the frame gives no evidence."""
 
-# Thresholds, in radians: from 0.030 while `cloth` swings and the effect is off, backwards and with half of the cameras
-# too, from 0.037 while it is on; in all other captures 0.004 at most while it is off, 0.014 with rotation pinned off.
+# For the thresholds, in radians: at least 0.030 on swinging `cloth` while the effect is off, also backwards and with
+# half of the cameras, and at least 0.037 while it is on. All other captures have at most 0.004 while it is off, and
+# 0.014 with rotation pinned off.
 
 Double = NDArray[np.float64]
 
 
 def patch_rotations(before: Double, after: Double) -> tuple[Double, Double]:
-    """The rotations that come nearest to the motions of patches (Kabsch), and what of these is no rotation.
+    """Returns the best-fitting rotations of patch motions (Kabsch), and the residual that is not a rotation.
 
     Args:
-        before, after: [P, n, 3] metres, a patch's Gaussians.
+        before, after: [P, n, 3] positions of each patch's Gaussians, in metres.
 
     Returns:
-        [P, 3, 3], and [P] root mean square distance to the rotated patch, relative to the patch's own size.
+        [P, 3, 3] rotations, and [P] RMS distance to the rotated patch relative to the patch size.
     """
     old, new = (points - points.mean(axis=1, keepdims=True) for points in (before, after))
     left, lengths, right = np.linalg.svd(np.swapaxes(new, 1, 2) @ old)
@@ -63,10 +65,10 @@ def patch_rotations(before: Double, after: Double) -> tuple[Double, Double]:
 
 
 def measure_bending(before: Gaussians, after: Gaussians) -> float | None:
-    """How much patches turn otherwise than those around them, median in radians; None: too little moves, or too few.
+    """Returns the median rotation of patches relative to those around them, in radians; None if too little moves.
 
     Args:
-        before, after: Θ_{t−1} and Θ_t, the same Gaussians.
+        before, after: Θ_{t−1} and Θ_t, with the same Gaussians.
     """
     rows = np.flatnonzero(before.moving)
     rows = rows[:: max(1, len(rows) // SAMPLE)]
@@ -89,17 +91,17 @@ def measure_bending(before: Gaussians, after: Gaussians) -> float | None:
 
 @dataclass(frozen=True)
 class Bending(Effect):
-    """Turns that are free of one another."""
+    """Independent rotations of neighbours."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused where the term that it leaves out is pinned, or has no weight."""
+        """Refused if the rotation term, which this effect removes, is pinned or has weight 0."""
         mode = settings.effects.get("rotation", "auto")
         if mode != "auto":
             return f"effects.rotation is '{mode}'", "leave rotation 'auto'"
         return refusal_at_zero(settings, "weights.rotation")
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """The turn of neighbourhoods against those around them, from a frame to the next."""
+        """Returns the relative rotation between neighbourhoods from one frame to the next."""
         angle = measure_bending(seen.before, seen.result.gaussians)
         if angle is None:
             return None
@@ -107,7 +109,7 @@ class Bending(Effect):
         return Evidence(min(1.0, angle), f"neighbourhoods turn {np.degrees(angle):.1f}° a frame unlike each other")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Leaves out the term of rotation, and lets rigidity fall along an update."""
+        """Removes the rotation term, and lets rigidity fade during an update."""
         builder.plan.neighbour_terms, builder.plan.rotation = True, 0.0
         builder.plan.rigidity_fades = builder.plan.rigidity > 0
 

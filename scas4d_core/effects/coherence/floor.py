@@ -1,6 +1,6 @@
-"""The floor: nothing that moves sinks into it (Dynamic3DGaussians' floor loss, for a floor of any pose).
+"""Floor term: moving Gaussians do not sink below the floor (floor loss of Dynamic3DGaussians, for any plane).
 
-Kernel: ``engines.cpu.floor``; reference: ``losses.floor_loss``. Only a scene that names a floor has the term.
+Kernel: ``engines.cpu.floor``; reference: ``losses.floor_loss``. Only scenes with a floor plane have the term.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
     from scas4d_core.settings import Settings
 
 FLOOR_WEIGHT = 2.0
-"""Beside 1 for the image loss (Dynamic3DGaussians). A scene that wants no such term names no floor."""
+"""Weight relative to 1 for the image loss (Dynamic3DGaussians). To disable the term, leave the floor unset."""
 
 
 def floor_inside(plane: Sequence[float], world: WorldFrame) -> Plane:
-    """A plane (a, b, c, d) of the user's world as the inside world has it.
+    """Converts a plane (a, b, c, d) from the user's world to the internal world.
 
-    Positive values of a·x + b·y + c·z + d lie below the floor; inside, they are metres.
+    Positive values of a·x + b·y + c·z + d lie below the floor; in the internal world, they are metres.
 
     Raises:
-        ValueError: (a, b, c) is no direction.
+        ValueError: (a, b, c) is not a direction.
     """
     normal = np.asarray(plane[:3], dtype=np.float64)
     length = float(np.linalg.norm(normal))
@@ -42,10 +42,10 @@ def floor_inside(plane: Sequence[float], world: WorldFrame) -> Plane:
 
 @dataclass(frozen=True)
 class Floor(Effect):
-    """The term for the plane ``scene.floor``."""
+    """The loss term for the plane ``scene.floor``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused without a plane."""
+        """Refused if no plane is given."""
         if settings.scene.floor is None:
             return "the scene names no floor", "give scene.floor, a plane (a, b, c, d)"
         return None

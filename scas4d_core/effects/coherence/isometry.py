@@ -1,4 +1,4 @@
-"""Isometry of neighbours (Dynamic3DGaussians).
+"""Isometry term between neighbours (Dynamic3DGaussians).
 
 Kernel: ``kernels.neighbour_terms``; reference: ``engines.torch.losses.isometry_loss``.
 """
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Isometry(Effect):
-    """The term ``weights.isometry``."""
+    """The loss term ``weights.isometry``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused with a weight of 0."""
+        """Refused if the weight is 0."""
         return refusal_at_zero(settings, "weights.isometry")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the term, with its weight."""
+        """Adds the term with its weight."""
         builder.plan.neighbour_terms = True
         builder.plan.isometry = builder.update.weights.isometry
 

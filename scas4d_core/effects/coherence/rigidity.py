@@ -1,4 +1,4 @@
-"""Rigidity of neighbours (Dynamic3DGaussians).
+"""Rigidity term between neighbours (Dynamic3DGaussians).
 
 Kernel: ``kernels.neighbour_terms``; reference: ``engines.torch.losses.rigidity_loss``.
 """
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Rigidity(Effect):
-    """The term ``weights.rigidity``."""
+    """The loss term ``weights.rigidity``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused with a weight of 0."""
+        """Refused if the weight is 0."""
         return refusal_at_zero(settings, "weights.rigidity")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the term, with its weight."""
+        """Adds the term with its weight."""
         builder.plan.neighbour_terms = True
         builder.plan.rigidity = builder.update.weights.rigidity
 

@@ -1,4 +1,4 @@
-"""Rotation of neighbours (Dynamic3DGaussians).
+"""Rotation term between neighbours (Dynamic3DGaussians).
 
 Kernel: ``kernels.neighbour_terms``; reference: ``engines.torch.losses.rotation_loss``.
 """
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Rotation(Effect):
-    """The term ``weights.rotation``."""
+    """The loss term ``weights.rotation``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused with a weight of 0."""
+        """Refused if the weight is 0."""
         return refusal_at_zero(settings, "weights.rotation")
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the term, with its weight."""
+        """Adds the term with its weight."""
         builder.plan.neighbour_terms = True
         builder.plan.rotation = builder.update.weights.rotation
 

@@ -1,1 +1,1 @@
-"""Effects that free the parameters of the deformation, and its start from the previous motion."""
+"""Effects that enable the deformation parameters, and the start from the previous motion."""

@@ -1,4 +1,4 @@
-"""Rotation of clusters, r (paper, equation 6).
+"""Cluster rotation r (paper, equation 6).
 
 Kernel: ``kernels.cascade``; reference: ``engines.torch.deformation``.
 """

@@ -1,4 +1,4 @@
-"""Position-dependent scaling of clusters, c and s (paper, equation 6).
+"""Position-dependent cluster scaling with c and s (paper, equation 6).
 
 Kernel: ``kernels.cascade``; reference: ``engines.torch.deformation``.
 """

@@ -1,4 +1,4 @@
-"""Translation of clusters, t (paper, equation 6).
+"""Cluster translation t (paper, equation 6).
 
 Kernel: ``kernels.cascade``; reference: ``engines.torch.deformation``.
 """

@@ -1,4 +1,7 @@
-"""Δp of each Gaussian (paper, equation 7). Kernel: ``kernels.deltas``; reference: ``engines.torch.deformation``."""
+"""Position offset Δp per Gaussian (paper, equation 7).
+
+Kernel: ``kernels.deltas``; reference: ``engines.torch.deformation``.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""ΔR of each Gaussian (paper, equation 7). Kernel: ``kernels.deltas``; reference: ``engines.torch.deformation``."""
+"""Rotation ΔR per Gaussian (paper, equation 7).
+
+Kernel: ``kernels.deltas``; reference: ``engines.torch.deformation``.
+"""
 
 from __future__ import annotations
 

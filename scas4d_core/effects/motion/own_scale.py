@@ -1,4 +1,7 @@
-"""Δs of each Gaussian (paper, equation 7). Kernel: ``kernels.deltas``; reference: ``engines.torch.deformation``."""
+"""Log scale Δs per Gaussian (paper, equation 7).
+
+Kernel: ``kernels.deltas``; reference: ``engines.torch.deformation``.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +17,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class OwnScale(FreeColumns):
-    """Δs, at the rate ``rate_scale``."""
+    """Δs, learnt at the rate ``rate_scale``."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused with a rate of 0."""
+        """Refused if the rate is 0."""
         return refusal_at_zero(settings, "rate_scale")
 
 

@@ -1,6 +1,6 @@
-"""Prediction from the frame before: an update starts from the motion going on (paper, Optimization Pipeline).
+"""Prediction: an update starts from the motion of the previous frame (paper, Optimization Pipeline).
 
-The motion is carried on by ``update.warm_start``.
+``update.warm_start`` extrapolates the motion.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ if TYPE_CHECKING:
 
 CLUSTERS = ("cluster_rotation", "cluster_translation")
 OWN = ("own_position", "own_rotation")
-"""The effects whose parameters are carried on; those of Gaussians by the share ``update.momentum``."""
+"""Effects whose parameters are extrapolated; those of single Gaussians by the share ``update.momentum``."""
 
 
 @dataclass(frozen=True)
 class Prediction(Effect):
-    """The motion before as the start."""
+    """The previous motion as the start of an update."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused where all that it carries on is pinned off."""
+        """Refused if every effect that it extrapolates is pinned off."""
         carried = CLUSTERS if settings.update.momentum == 0 else CLUSTERS + OWN
         if any(settings.effects.get(name) != "off" for name in carried):
             return None
         return f"{' and '.join(carried)} are 'off'", "leave one of them 'auto'"
 
     def register(self, builder: PlanBuilder) -> None:
-        """Lets the update start from the motion before."""
+        """Lets the update start from the previous motion."""
         builder.plan.freedom = replace(builder.plan.freedom, prediction=True)
 
 

@@ -1,7 +1,7 @@
-"""The hull of what is new: voxels that several cameras see as new, and that no camera sees through.
+"""The hull of new objects: voxels that several cameras see as new and that few cameras see through.
 
-An octree, as for the visual hull of frame 0; beside its silhouettes a camera has pixels in which it has no say: those
-where the state shows a moving thing that may hide the new one.
+It is an octree, as for the visual hull of frame 0. In addition to silhouettes, each camera has pixels in which it is
+ignored: those in which a moving object of the state may hide the new one.
 """
 
 from __future__ import annotations
@@ -23,31 +23,31 @@ Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 AGREE = 4
-"""Cameras that must see a voxel as new: three see the same ghost in a rig of twenty."""
+"""Minimum number of cameras that see a voxel as new; in a rig of twenty, three can agree on a ghost."""
 MISSES = 0.1
-"""Share of the cameras with a say that may see a voxel as free: outlines are off by a pixel."""
+"""Maximum share of the counted cameras that see a voxel as free; outlines can be off by a pixel."""
 COARSE = 32
-"""Voxels along an edge of the first grid."""
+"""Number of voxels along an edge of the first grid."""
 VOXEL_PIXELS = 1.5
-"""Edge of the smallest voxel, at most, in pixels at the middle of the stage."""
+"""Maximum edge of the smallest voxel, in pixels at the centre of the scene."""
 MAX_CELLS = 1 << 24
-"""Cells of the grid that separates new objects; a sparser cluster is no object."""
+"""Maximum number of grid cells for separating new objects; a sparser cluster is not an object."""
 MAX_VOXELS = 1_000_000
-"""A level that would hold more is not entered."""
+"""Maximum number of voxels in a level; refinement stops before it is exceeded."""
 AT_ONCE = 1 << 16
-"""Voxels that are looked at together: each takes 200 bytes meanwhile."""
+"""Number of voxels that are tested at once; each needs 200 bytes of temporary memory."""
 SMALLEST = 27
-"""Voxels of a thing, at least: three along each edge."""
+"""Minimum number of voxels in an object: three along each edge."""
 SIDES = np.stack(np.meshgrid(*[np.arange(2, dtype=np.int32)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 @dataclass(frozen=True, eq=False)
 class Hull:
-    """Voxels of what is new.
+    """Voxels of new objects.
 
     Attributes:
-        points: [V, 3] their centres, inside world. surface: [V] those with an empty neighbour. things: [V] number of
-            the connected thing that each belongs to. voxel: edge, metres.
+        points: [V, 3] voxel centres in the internal world. surface: [V] true for voxels with an empty neighbour.
+            things: [V] number of the connected object of each voxel. voxel: edge length, in metres.
     """
 
     points: Float
@@ -56,15 +56,15 @@ class Hull:
     voxel: float
 
     def only(self, kept: Bool) -> Hull:
-        """The hull without some of its things; ``kept`` [V]."""
+        """Returns the hull with only the voxels in ``kept`` [V]."""
         return Hull(self.points[kept], self.surface[kept], self.things[kept], self.voxel)
 
 
 def carve_new(seen: Sequence[Novelty]) -> Hull:
-    """Carves what is new, out of the stage: a cube about its middle that holds all cameras.
+    """Carves new objects from a cube about the scene centre that contains all cameras.
 
     Args:
-        seen: what the cameras say.
+        seen: novelty maps of the cameras.
     """
     middle = look_at_point(seen)
     reach = max(float(np.linalg.norm(one.camera.centre - middle)) for one in seen)
@@ -89,7 +89,7 @@ def _depth_of(one: Novelty, point: Float) -> float:
 
 
 def _distance(pixels: Bool) -> Float:
-    """[H, W] pixels to the nearest of some; infinity where there are none."""
+    """Returns the [H, W] distance in pixels to the nearest true pixel; infinity if there is none."""
     if not pixels.any():
         return np.full(pixels.shape, np.inf)
     result: Float = distance_transform_edt(~pixels)
@@ -104,7 +104,7 @@ def _kept(
     for one, (new, possible) in zip(seen, distances, strict=True):
         camera = one.camera
         uv, depth = camera.project(centres)
-        # Before the last level a voxel stays if any part of it may be new, and a part may be seen beyond the border.
+        # Before the last level, a voxel is kept if any part of it may be new, including parts beyond the image border.
         slack = camera.fx * half / np.maximum(depth, 1e-9) + (0.71 if last else 1.5)
         border = 0.0 if last else slack
         with np.errstate(invalid="ignore"):
@@ -125,7 +125,7 @@ def _kept(
 def _hull(cells: NDArray[np.int32], origin: Float, voxel: float) -> Hull:
     if len(cells) == 0:
         return Hull(np.zeros((0, 3)), np.zeros(0, np.bool_), np.zeros(0, np.int64), voxel)
-    # Things far apart are moved together, with an empty layer between them: the grid is as large as they are.
+    # Distant objects are moved together with an empty layer between them, so that the grid stays small.
     close = np.stack([_without_gaps(column) for column in cells.T], axis=1)
     shape = close.max(axis=0) + 2
     if np.prod(shape) > MAX_CELLS:
@@ -144,7 +144,7 @@ def _hull(cells: NDArray[np.int32], origin: Float, voxel: float) -> Hull:
 
 
 def _without_gaps(places: NDArray[np.integer]) -> NDArray[np.int64]:
-    """Places along an axis, from 1 on, with one empty place for each gap.
+    """Renumbers positions along an axis from 1, with one empty position per gap.
 
     >>> _without_gaps(np.array([7, -900, 8, 30]))
     array([3, 1, 4, 6])
@@ -156,7 +156,7 @@ def _without_gaps(places: NDArray[np.integer]) -> NDArray[np.int64]:
 
 
 def footprint(one: Novelty, points: Float, voxel: float) -> Bool:
-    """[H, W] the pixels of a camera that show voxels with centres [P, 3]."""
+    """Returns the [H, W] pixels of a camera that show voxels with centres [P, 3]."""
     column, row, depth, inside = pixels_inside(one.camera, points)
     shown = np.zeros(one.new.shape, np.bool_)
     shown[row[inside], column[inside]] = True
@@ -168,10 +168,10 @@ def footprint(one: Novelty, points: Float, voxel: float) -> Bool:
 
 
 def colours_of(seen: Sequence[Novelty], points: Float, hull: Hull) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Median colour [P, 3] of points over the cameras that see them as new, and how many do [P]; NaN where none.
+    """Returns the median colour [P, 3] over the cameras that see a point as new, and their number [P]; NaN if none.
 
     Args:
-        points: [P, 3] on the hull's surface. hull: what hides them.
+        points: [P, 3] on the hull's surface. hull: occludes the points.
     """
     samples = np.full((len(seen), len(points), 3), np.nan, np.float32)
     front = hull.points[hull.surface]

@@ -1,4 +1,4 @@
-"""Things that enter: where cameras agree that nothing the state has explains the pictures, Gaussians are born."""
+"""Objects that enter: Gaussians are added in places that several cameras see and the state cannot explain."""
 
 from __future__ import annotations
 
@@ -29,27 +29,27 @@ Bool = NDArray[np.bool_]
 
 NAME = "entering"
 MIN_CAMERAS = 2
-"""Cameras of a glance that have to see something new before all are asked."""
+"""Minimum number of screened cameras that see something new before all cameras are checked."""
 SMALLEST = 0.003
-"""Share of a camera's pixels that it must see as new to have a say: 200 of 256 x 256. What an update leaves behind of
-things that move is smaller."""
+"""Minimum share of new pixels in an image for a camera to count: 200 of 256 x 256. Delayed tracking of moving objects
+leaves fewer."""
 SHARE = 0.05
-"""Of the squared error of all pictures that a thing explains, from which it is one."""
+"""Minimum share of the squared error of all images that an object explains, to switch the effect on."""
 WORTH = 0.01
-"""The same, from which Gaussians are born once the effect is on."""
+"""Minimum share for adding Gaussians while the effect is on."""
 SURPLUS = 0.5
-"""Of the pixels of things that are new, which must not be made up for by stale ones: else they came from there."""
+"""Minimum surplus of new over stale pixels, relative to the object's pixels; otherwise the object has only moved."""
 BORDER, SUDDEN = 0.5, 0.2
-"""What enters comes over the border of the pictures: of the cameras that see a thing, the share in which it touches it;
-and the share of the error that a thing has to explain that appears in their middle. There, an update that has not
-followed a limb shows one beside it: 0.07 in `stage`."""
+"""New objects enter across the image border. The first value is the minimum share of cameras in which an object touches
+the border. The second is the minimum share of the error for an object that appears elsewhere. Delayed tracking of a
+limb can look like such an object: 0.07 in `stage`."""
 TINY = 1e-12
-"""Of a sum of squared errors: none."""
+"""Lower bound of a sum of squared errors, against division by zero."""
 SETTLED = 4
-"""Frames after its birth in which a Gaussian is still fitted beside the update."""
+"""Number of frames in which an added Gaussian is still fitted outside the update."""
 DENIED = 0.5
-"""Share of the cameras that have what was born in view and see something else there, above which it is retired once it
-is settled: it was an error."""
+"""Share of the cameras with an added Gaussian in view that must see something else there to retire it. It is checked
+once, when the Gaussian is settled."""
 NONE = np.zeros(0, np.int64)
 NO_NEWBORNS: Arrays = {
     "rows": NONE,
@@ -62,20 +62,20 @@ NO_NEWBORNS: Arrays = {
     "share": np.array(0.0),
     "cameras": np.array(0),
 }
-"""What is left before anything was born."""
+"""Carried arrays before any Gaussian is added."""
 NEWBORN_ARRAYS = ("newborn", "thing", "centres", "volumes", "places")
-"""Arrays that are of the last frame alone, see ``NewbornTracking``."""
+"""Arrays that describe only the last frame, see ``NewbornTracking``."""
 BUDGET = 0.1
-"""Gaussians that are born in a frame at most, as a share of those that are there."""
+"""Maximum number of Gaussians added in a frame, as a share of the existing ones."""
 
 
 @dataclass(frozen=True, eq=False)
 class EnteredThings:
-    """The hull of what has entered.
+    """The hull of objects that have entered.
 
     Attributes:
-        seen: what the cameras say. hull: of the things that count. share: of the squared error that they explain.
-        cameras: that see them.
+        seen: novelty maps of the cameras. hull: of the accepted objects. share: of the squared error that they explain.
+        cameras: number of cameras that see them.
     """
 
     seen: Sequence[Novelty]
@@ -85,7 +85,7 @@ class EnteredThings:
 
 
 def find_entered(seen: FrameObservation) -> EnteredThings | None:
-    """What a frame shows that the state does not have; None where there is nothing of the kind."""
+    """Returns the objects in a frame that the state does not have; None if there are none."""
     if sum(_says(one) for one in screen_novelty(seen, MIN_CAMERAS, new=SMALLEST)) < MIN_CAMERAS:
         return None
     everyone = novelty_of_views(seen, seen.views)
@@ -118,7 +118,7 @@ def _says(one: Novelty) -> bool:
 
 
 def _find_denied(seen: Sequence[Novelty], means: NDArray[np.float64]) -> Bool:
-    """[P] the means in whose pixels most cameras see that nothing of the kind is there."""
+    """Returns [P] true for means at which most cameras see that the object does not exist."""
     against, asked = np.zeros(len(means), np.int64), np.zeros(len(means), np.int64)
     for one in seen:
         column, row, _, inside = pixels_inside(one.camera, means)
@@ -129,7 +129,7 @@ def _find_denied(seen: Sequence[Novelty], means: NDArray[np.float64]) -> Bool:
 
 
 def _record_newborns(found: EnteredThings, state: Gaussians, rows: NDArray[np.int64], left: Arrays) -> Arrays:
-    """The arrays that the births and returns of a frame add to those that were left; ``rows`` are theirs."""
+    """Returns the carried arrays, extended by the added and revived Gaussians in ``rows``."""
     things = np.unique(found.hull.things)
     thing = found.hull.things[cKDTree(found.hull.points).query(state.means[rows])[1]]
     own = [state.means[rows[thing == n]] for n in things]
@@ -154,10 +154,12 @@ def _record_newborns(found: EnteredThings, state: Gaussians, rows: NDArray[np.in
 
 @dataclass(frozen=True)
 class Entering(Effect):
-    """Births, in frames that show more than the state has."""
+    """Adds Gaussians in frames that show more than the state has."""
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """What is new explains so much; once something was born, what that explained, for as long as it is there."""
+        """Returns the error share that new objects explain; later the recorded share, while added Gaussians are
+        present.
+        """
         if not seen.views:
             return None
         left = seen.result.carried.get(NAME)
@@ -167,7 +169,7 @@ class Entering(Effect):
         return Evidence(0.0, "") if things is None else _evidence(things.share, things.cameras)
 
     def add_and_retire_gaussians(self, seen: FrameObservation) -> UpdateResult:
-        """The result with the Gaussians that are born, and the newborn ones settled."""
+        """Adds Gaussians for new objects, and refines those of recent frames."""
         from scas4d_core.effects.presence.newborn_fit import fit_newborns, refine_newborns, sample_seeds
 
         result, things = seen.result, find_entered(seen)
@@ -208,7 +210,7 @@ class Entering(Effect):
         return replace(result, gaussians=state, parents=parents, carried={**result.carried, NAME: arrays})
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the search for what was born in the frame before."""
+        """Adds the search for the objects that were added in the previous frame."""
         builder.parts.append(NewbornTracking(builder, NAME))
 
 

@@ -1,6 +1,6 @@
-"""Things that leave: Gaussians that move and are in no picture any more, they and what is about them, are retired.
+"""Objects that leave: moving Gaussians that, with their neighbourhood, are in no image are retired.
 
-They keep their rows and ids: they are neither drawn nor moved, until something that they explain comes into view.
+They keep their rows and ids. They are neither rendered nor moved until something that they explain comes into view.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ if TYPE_CHECKING:
 
 NAME = "leaving"
 SHARE, IDLE_SHARE = 0.02, 0.002
-"""Of the moving Gaussians that are in no picture, from which the effect is on, and below which it may go off."""
+"""Shares of the moving Gaussians in no image at which the effect switches on, and below which it may switch off."""
 FRAMES = 2
-"""In a row that a Gaussian is in no picture before it is retired: at the border a thing comes and goes."""
+"""Number of consecutive frames in no image before a Gaussian is retired; at the border, objects come and go."""
 ABOUT = 0.1
-"""Of the moving extent: what has a Gaussian in some picture as near as this has not left: the half of a thing that
-is in view leads the other."""
+"""Distance, relative to the moving extent, within which a visible Gaussian keeps its neighbours from being retired. The
+visible half of an object still guides the other half."""
 WIDTHS = 3.0
-"""Standard deviations of a Gaussian that have to be outside as well."""
+"""Number of standard deviations of a Gaussian that must also be outside the image."""
 
 
 def outside_all_views(state: Gaussians, rig: Rig) -> NDArray[np.bool_]:
-    """[N] the moving Gaussians that are in no picture.
+    """Returns [N] true for the moving Gaussians that are in no image.
 
     Args:
-        state: Θ_t. rig: the cameras inside, those that are not believed included: they come back.
+        state: Θ_t. rig: the cameras in the internal world, including excluded ones, which may return.
     """
     rows = np.flatnonzero(state.moving)
-    for camera in rig.cameras:  # of most scenes the first cameras show all that moves
+    for camera in rig.cameras:  # usually the first cameras already show all moving Gaussians
         if not len(rows):
             break
         uv, depth = camera.project(state.means[rows].astype(np.float64))
@@ -57,10 +57,10 @@ def outside_all_views(state: Gaussians, rig: Rig) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True)
 class Leaving(Effect):
-    """Retirements, in frames in which something has left all views."""
+    """Retires Gaussians that have left all views."""
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """How much of what moves is in no picture, or was when the first was retired, as long as it stays away."""
+        """Returns the share of moving Gaussians in no image, or the recorded share while any are retired."""
         if not seen.views:
             return None
         state = seen.result.gaussians
@@ -71,7 +71,7 @@ class Leaving(Effect):
         return _evidence(float(outside_all_views(state, seen.rig).sum()) / max(1, moving))
 
     def add_and_retire_gaussians(self, seen: FrameObservation) -> UpdateResult:
-        """The result with those retired that have been outside for long enough."""
+        """Retires the Gaussians that have been outside for long enough."""
         state = seen.result.gaussians
         out = outside_all_views(state, seen.rig)
         left: Arrays = dict(seen.result.carried.get(NAME, {}))
@@ -89,7 +89,7 @@ class Leaving(Effect):
         return replace(seen.result, gaussians=state.retire(gone) if gone.any() else state, carried=carried)
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds nothing: retirements come after the update of a frame."""
+        """Adds nothing: Gaussians are retired after the update of a frame."""
 
 
 def _evidence(share: float) -> Evidence:

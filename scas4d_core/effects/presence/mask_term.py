@@ -1,4 +1,4 @@
-"""The mask term: rendered labels look like the masks.
+"""Mask term: rendered labels match the masks.
 
 Kernel: ``kernels.image_loss``; reference: ``engines.torch.losses.image_loss``.
 """
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class MaskTerm(Effect):
-    """The term ``weights.mask``, or ``weights.mask_alone``, in frames that come with masks."""
+    """The loss term ``weights.mask`` or ``weights.mask_alone``, in frames with masks."""
 
     def refusal(self, settings: Settings) -> tuple[str, str] | None:
-        """Refused where masks are not used, and with both weights 0."""
+        """Refused if masks are not used, or if both weights are 0."""
         update = settings.update
         if not update.use_masks:
             return "update.use_masks is false", "give true"
@@ -29,8 +29,8 @@ class MaskTerm(Effect):
         return "update.weights.mask and update.weights.mask_alone are 0", "give one of them a weight above 0"
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds the term, with its weight."""
-        from scas4d_core.update.schedule import mask_weight  # it loads the kernels
+        """Adds the term with its weight."""
+        from scas4d_core.update.schedule import mask_weight  # deferred import, because it loads the kernels
 
         builder.plan.mask = mask_weight(builder.update, len(builder.hierarchy.rows), int(builder.first.present.sum()))
 

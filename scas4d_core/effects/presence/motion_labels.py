@@ -1,6 +1,6 @@
-"""Labels of what moves, learnt from changed pixels where no masks are given; all else is a background that stands.
+"""Labels of moving Gaussians, learnt from changed pixels if there are no masks; all others are static background.
 
-They are found by ``motion_mask`` between two updates.
+``motion_mask`` finds them between two updates.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ class MotionLabels(Effect):
     """Labels from motion, in scenes without masks."""
 
     def register(self, builder: PlanBuilder) -> None:
-        """Asks for them."""
+        """Enables learning of the labels."""
         builder.plan.learns_labels = True
 
 

@@ -1,11 +1,11 @@
-"""The labels of moving Gaussians: by the masks of frame 0; without masks learnt from the pictures of two frames.
+"""Labels of moving Gaussians: from the masks of frame 0 or, without masks, learnt from the images of two frames.
 
-A static Gaussian inside the silhouettes of nearly all cameras lies within a moving object, and moves with it. The label
-of an object is only learnt at its outside; a Gaussian that stays behind inside is a ghost once the object has gone.
+A static Gaussian inside the silhouettes of nearly all cameras lies within a moving object and moves with it. The label
+of an object is learnt only on its outside. A static Gaussian left inside becomes a ghost when the object moves away.
 
-Without masks, a pixel has changed where it differs from the frame before. A Gaussian moves when most of the cameras
-that see it have it in changed pixels: the background behind the new place of an object has changed for some cameras,
-but not for most.
+Without masks, a pixel counts as changed if it differs from the previous frame. A Gaussian moves if most cameras that
+see it have it in changed pixels. Background behind the new position of an object changes for some cameras but not for
+most.
 """
 
 from __future__ import annotations
@@ -25,48 +25,49 @@ from scas4d_core.posed_pictures import pixels_inside
 Array = NDArray[np.float32]
 
 CHANGE = 0.04
-"""Difference of a colour channel, 0…1, from which a pixel has changed: above the noise of a sensor and of JPEG."""
+"""Difference of a colour channel, 0…1, above which a pixel has changed; it is above sensor and JPEG noise."""
 REACH_PIXELS = 5
-"""Side of the square that a changed pixel marks: the inside of a plain surface moves without changing."""
+"""Side of the square that a changed pixel marks, because the inside of a plain surface moves without changing."""
 SEEN_PIXELS = 0.02
-"""Pixels' worth of blending weight from which a camera has a vote."""
+"""Blending weight, in pixels, above which a camera has a vote."""
 IN_CHANGE = 0.5
-"""Share of a Gaussian's weight in changed pixels from which a camera votes that it moves."""
+"""Share of a Gaussian's weight in changed pixels above which a camera votes that it moves."""
 MAJORITY = 0.5
-"""Share of the voting cameras that have to agree that a Gaussian moves; and at least two."""
+"""Share of the voting cameras, and at least two cameras, that must agree that a Gaussian moves."""
 
 STANDING_SHARE = 0.1
-"""Share of standing Gaussians from which a scene has a standing part; below, their labels are noise."""
+"""Minimum share of static Gaussians in a scene with a static part; below it, static labels are noise."""
 
 INSIDE_SHARE = 0.8
-"""Share of the cameras with a mask and a Gaussian in their picture whose masks have to hold its mean, for it to lie
-within a moving object. Automatic masks are ragged: with 0.7 to 0.9 the ghosts of `basketball` fade alike."""
+"""Minimum share of cameras with a mask and a Gaussian in view whose masks must contain its mean, for it to lie within a
+moving object. Automatic masks are ragged; with 0.7 to 0.9 the ghosts of `basketball` fade equally well."""
 INSIDE_CAMERAS = 3
-"""Such cameras there have to be at least: the silhouettes of two hold much that is empty."""
+"""Minimum number of such cameras; the intersection of two silhouettes contains much empty space."""
 
 FIRST_LABELS = 32
-"""Gaussians that must be found moving before the first labels are learnt: a mouse in a room is a few hundredths of a
-percent of it. Before, frames stand that the state shows (``robust.solve_frame``); of others all may move."""
+"""Minimum number of moving Gaussians for learning the first labels: a mouse in a room is a few hundredths of a percent
+of it. Before that, frames that the state already explains are skipped (``robust.solve_frame``); in other frames all
+Gaussians may move."""
 NEW_LABELS = 0.01
-"""Share of all Gaussians, and ..."""
+"""Share of all Gaussians that must be newly found moving before the hierarchy is rebuilt."""
 MORE_LABELS = 0.2
-"""... share of those that move, the smaller of which must be found moving anew before the hierarchy is built again."""
+"""Share of the moving Gaussians with the same effect; the smaller of the two numbers is sufficient."""
 
 
 def first_labels(gaussians: Gaussians, rig: Rig, masks: Mapping[str, NDArray[np.uint8]]) -> Gaussians:
-    """The Gaussians of frame 0 with the labels that the scene starts with.
+    """Returns the Gaussians of frame 0 with the initial labels of the scene.
 
     Args:
-        gaussians: as they were fitted. rig: inside, at the size of the masks.
-        masks: of frame 0, [H, W] by camera, not 0 on the foreground; empty where there are none.
+        gaussians: as fitted. rig: in the internal world, at the size of the masks.
+        masks: of frame 0, [H, W] by camera, non-zero on the foreground; empty if there are none.
     """
     return with_reliable_labels(with_mask_hull_labels(gaussians, rig, masks))
 
 
 def with_mask_hull_labels(gaussians: Gaussians, rig: Rig, masks: Mapping[str, NDArray[np.uint8]]) -> Gaussians:
-    """The Gaussians, with those in the visual hull of the masks moving as well (Laurentini 1994).
+    """Returns the Gaussians with those in the visual hull of the masks labelled as moving (Laurentini 1994).
 
-    Where no Gaussian is static, or none moves, labels say nothing of the inside, and stay.
+    If no Gaussian is static, or none moves, the labels cannot be extended and are unchanged.
 
     Args:
         gaussians, rig, masks: see ``first_labels``.
@@ -92,14 +93,14 @@ def with_mask_hull_labels(gaussians: Gaussians, rig: Rig, masks: Mapping[str, ND
 
 
 def with_reliable_labels(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians of frame 0, all of them moving where only a few stand.
+    """Returns the Gaussians of frame 0, all labelled as moving if only a few are static.
 
-    These few belong to an object, but no mask taught their label: they would stay behind when the object moves, and
-    hide it. In a cluster that does not move they stand just as well.
+    These few belong to an object, but no mask determined their label. They would stay behind when the object moves, and
+    hide it. If all Gaussians move, a static background forms clusters that do not move.
 
     >>> state = Gaussians.of_points([[x, 0, 0] for x in range(100)], radius=0.1)
     >>> few_stand = state.replace(foreground=np.float32([0] * 5 + [1] * 95))
-    >>> int(with_reliable_labels(few_stand).moving.sum())  # 5 of 100 are noise
+    >>> int(with_reliable_labels(few_stand).moving.sum())  # 5 static labels in 100 are noise
     100
     """
     standing = int((~gaussians.moving).sum())
@@ -109,12 +110,12 @@ def with_reliable_labels(gaussians: Gaussians) -> Gaussians:
 
 
 def changed_pixels(before: Array, now: Array) -> Array:
-    """[H, W] 1 where the planes [3, H, W] of two frames differ, and around; else 0.
+    """Returns [H, W] 1 in and around pixels that differ between planes [3, H, W] of two frames; 0 elsewhere.
 
     >>> before = np.zeros((3, 7, 7), np.float32)
     >>> now = before.copy()
     >>> now[0, 3, 3] = 0.5
-    >>> int(changed_pixels(before, now).sum())  # the pixel, and five by five about it
+    >>> int(changed_pixels(before, now).sum())  # a square of five by five around the pixel
     25
     """
     changed = (np.abs(now - before).max(axis=0) > CHANGE).astype(np.float32)
@@ -125,11 +126,11 @@ def changed_pixels(before: Array, now: Array) -> Array:
 def find_moving(
     gaussians: Gaussians, before: Sequence[TrainingView], now: Sequence[TrainingView], renderer: Renderer
 ) -> NDArray[np.bool_]:
-    """[N] bool: Gaussians that the pictures of two frames show to move.
+    """Returns [N] bool: true for Gaussians that move according to the images of two frames.
 
     Args:
-        gaussians: Θ_{t−1}. before, now: the views of both frames; cameras of only one are left out.
-        renderer: draws.
+        gaussians: Θ_{t−1}. before, now: the views of both frames; cameras in only one of them are ignored.
+        renderer: accumulates pixels onto Gaussians.
     """
     earlier = {view.name: view for view in before}
     says = np.zeros(len(gaussians), np.int64)
@@ -154,10 +155,10 @@ def learn_labels_from_motion(
     now: Sequence[TrainingView],
     renderer: Renderer,
 ) -> NDArray[np.bool_] | None:
-    """[N] bool: Gaussians that have been seen to move by now; None where hardly any are new, or too few moved ever.
+    """Returns [N] true for Gaussians seen to move so far; None if too few are new or too few ever moved.
 
     Args:
-        gaussians: Θ_{t−1}. known: [N] those that had been seen to move before, or None.
+        gaussians: Θ_{t−1}. known: [N] true for Gaussians seen to move earlier, or None.
         before, now: see ``find_moving``.
     """
     moving = find_moving(gaussians, before, now, renderer)
@@ -168,5 +169,5 @@ def learn_labels_from_motion(
 
 
 def with_labels(gaussians: Gaussians, labels: NDArray[np.bool_] | None) -> Gaussians:
-    """The Gaussians with the labels [N] learnt from motion; unchanged where ``labels`` is None."""
+    """Returns the Gaussians with the labels [N] learnt from motion; unchanged if ``labels`` is None."""
     return gaussians if labels is None else gaussians.replace(foreground=labels.astype(np.float32))

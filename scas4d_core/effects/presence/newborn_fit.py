@@ -1,7 +1,7 @@
-"""Grows Gaussians on the hull of what is new, and fits them alone to the pictures; all others stand still.
+"""Creates Gaussians on the hull of new objects and fits only these to the images.
 
-Only the part of each picture that shows the hull is rendered, with the Gaussians that reach into it: an iteration costs
-a small share of one of the update.
+Only the part of each image that shows the hull is rendered, with the Gaussians that reach into it. An iteration
+therefore costs a small fraction of one of the update.
 """
 
 from __future__ import annotations
@@ -35,33 +35,34 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 ITERATIONS = 400
-"""Of a fit: on the part of the pictures that shows the thing they take less time than an update of 100."""
+"""Iterations of a fit; on image crops they take less time than an update of 100 iterations."""
 SETTLING = 150
-"""Of the fit of what was born some frames ago, after each update."""
+"""Iterations for refining the Gaussians added in recent frames, after each update."""
 FEWEST = 0.25
-"""Share of the iterations of a fit, of which there must be time for more: what is half fitted is in every frame after,
-and the next frame finds it as well."""
+"""Minimum share of a fit's iterations for which there must be time. Half-fitted Gaussians would affect all later
+frames, and the next frame detects the object again anyway."""
 SHORTEST = 1e-6
-"""Metres, of an axis."""
+"""Minimum length of an axis, in metres."""
 FIRST_OPACITY = 0.6
-"""Of a Gaussian when it is born: on a surface that is known, more than the 0.1 of a cloud of which half is wrong."""
+"""Initial opacity of an added Gaussian; its surface is known, so it is above the 0.1 of the unreliable initial cloud.
+"""
 CONFIRMED = 2
-"""Cameras that must see the colour of a point."""
+"""Minimum number of cameras that must see the colour of a point."""
 MARGIN = 8
-"""Pixels about what is rendered: the window of SSIM, and the Gaussians' widths."""
+"""Margin around the rendered region, in pixels: the SSIM window and the widths of the Gaussians."""
 WIDTHS = 3.5
-"""Standard deviations that a Gaussian reaches."""
+"""Number of standard deviations that a Gaussian extends."""
 RATE_POSITION, RATE_COLOUR, RATE_OPACITY, RATE_SCALE, RATE_ROTATION = 3.2e-4, 1e-2, 5e-2, 1e-2, 4e-3
-"""Adam's rates of means (per metre of the rig's radius), RGB, logits of opacity, log scales, quaternions: one to four
-times those of frame 0, for an eighth of its iterations."""
+"""Adam learning rates of means (per metre of the rig's radius), RGB, opacity logits, log scales and quaternions. They
+are one to four times those of frame 0, which has eight times as many iterations."""
 END = 0.05
-"""Of the rates that is left at the end, along half a cosine."""
+"""Share of the rates that remains at the end of the half-cosine schedule."""
 BETA1, BETA2 = np.float32(0.8), np.float32(0.95)
-"""Of Adam: those of the update, whose iterations are as few."""
+"""Adam's decays, as in the update, which has similarly few iterations."""
 
 
 def sample_seeds(seen: Sequence[Novelty], hull: Hull, limit: int, rng: np.random.Generator) -> tuple[Float, Array]:
-    """Points [P, 3] on the hull's surface with their colours [P, 3]; at most ``limit``, drawn at random."""
+    """Returns at most ``limit`` random points [P, 3] on the hull's surface, with their colours [P, 3]."""
     points = hull.points[hull.surface]
     colours, count = colours_of(seen, points, hull)
     fine = np.flatnonzero(count >= CONFIRMED)
@@ -82,12 +83,13 @@ def fit_newborns(
     moves: bool,
     time: FitTime,
 ) -> Gaussians | None:
-    """Gaussians on points, fitted to the views beside those of the state; None where there is no time for it.
+    """Returns Gaussians at points, fitted to the views together with the fixed state; None if there is no time.
 
     Args:
-        state: Θ_t, all of whose Gaussians stay as they are. points: [P, 3] inside. colours: [P, 3].
-        views: of the frame. rig: the cameras inside. renderer: has background and limits of the scene.
-        rng: of the order of views. moves: whether they do, or stand. time: for the fit.
+        state: Θ_t; its Gaussians are not changed. points: [P, 3] in the internal world. colours: [P, 3].
+        views: of the frame. rig: the cameras in the internal world. renderer: has the background and limits of the
+            scene.
+        rng: for the order of views. moves: whether the new Gaussians are moving or static. time: for the fit.
     """
     parameters = initial_parameters(points, colours, None, len(points), rng)
     parameters[:, OPACITY] = logit(np.array(FIRST_OPACITY))
@@ -107,14 +109,14 @@ def refine_newborns(
     rng: np.random.Generator,
     time: FitTime,
 ) -> Gaussians:
-    """The state with means, factors and colours of some rows fitted to the views; opacities stay for ever.
+    """Returns the state with means, factors and colours of some rows fitted to the views; opacities are fixed.
 
     Args:
-        rows: of newborn Gaussians, whose hull and first update were rough. Revived glossy Gaussians are left as
-            they are: only colours are fitted, and gloss shows more than these.
-        time: for the fit; without enough of it they stay as they are.
+        rows: of recently added Gaussians, whose hull and first update were coarse. Revived glossy Gaussians are
+            skipped, because only colours are fitted and they show gloss as well.
+        time: for the fit; if it is not sufficient, the state is unchanged.
     """
-    if state.gloss is not None:  # those born later have none
+    if state.gloss is not None:  # Gaussians added later have no gloss
         rows = rows[rows >= len(state.gloss)]
     if not len(rows):
         return state
@@ -137,15 +139,15 @@ def refine_newborns(
         return state
     means, factors, colours = state.means.copy(), state.factors.copy(), state.colours.copy()
     means[rows], colours[rows] = fitted.means, fitted.colours
-    factors[rows] = fitted.factors @ axes.astype(np.float32)  # the axes that were transported stay the same ones
+    factors[rows] = fitted.factors @ axes.astype(np.float32)  # keeps the correspondence of the transported axes
     return state.replace(means=means, factors=factors, colours=colours)
 
 
 class _Schedule:
-    """The iterations of a fit: as many as are planned, or as there is time for; rates fall along half a cosine.
+    """The schedule of a fit: as many iterations as planned or as time allows; rates follow a half-cosine.
 
     Attributes:
-        whole: False where there was time for too few steps: what was fitted so far is of no use.
+        whole: false if there was time for too few steps; the result is then discarded.
     """
 
     def __init__(self, iterations: int, end: float | None, rates: Array) -> None:
@@ -181,10 +183,10 @@ def _fit_crops(
     iterations: int,
     opacities: bool = True,
 ) -> Gaussians | None:
-    """Fit parameters beside a state that stays fixed, each step to a part of one view; None where time is too short.
+    """Fits parameters next to a fixed state, each step on a crop of one view; returns None if time is too short.
 
     Args:
-        opacities: whether these change.
+        opacities: whether opacities are fitted.
     """
     fit = _beside(state, parameters, views, rig, renderer)
     rates = np.zeros(COLUMNS, np.float32)
@@ -204,7 +206,7 @@ def _fit_crops(
 def _beside(
     state: Gaussians, parameters: Array, views: Sequence[TrainingView], rig: Rig, renderer: Renderer
 ) -> GaussianFit:
-    """A fit to the parts of the views that show the parameters, beside the Gaussians of the state that reach there."""
+    """Returns a fit on the crops that show the parameters, with the state's Gaussians that reach into the crops."""
     factory, crops, fixed = ViewFactory(rig), [], []
     for view in views:
         camera = rig[view.name]
@@ -216,7 +218,7 @@ def _beside(
 
 
 def _box(camera: Camera, points: Float) -> tuple[int, int, int, int] | None:
-    """Left, top, right, bottom of the pixels that show points [P, 3] and a margin; None where hardly any do."""
+    """Returns left, top, right and bottom of a box around points [P, 3], with a margin; None if it is too small."""
     uv, depth = camera.project(points)
     if not (depth > 0).all():
         return None
@@ -226,7 +228,7 @@ def _box(camera: Camera, points: Float) -> tuple[int, int, int, int] | None:
 
 
 def _reaching(state: Gaussians, camera: Camera, box: tuple[int, int, int, int]) -> Int:
-    """Rows of the Gaussians that may reach into a part of a picture."""
+    """Returns the rows of the Gaussians that may reach into a crop."""
     uv, depth = camera.project(state.means.astype(np.float64))
     width = np.sqrt(np.square(state.factors).sum(axis=(1, 2)))
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,7 +1,7 @@
-"""Catches what was born in the frame before: its motion is not known yet, and it may fall further than its width.
+"""Tracks objects that were added in the previous frame: their motion is unknown and may exceed their width.
 
-Its hull is carved out of the pictures of the frame once more, without it; the way from the one hull to the other is
-where its clusters start from.
+The object's hull is carved again from the images of the frame, without the object itself. The displacement between the
+two hulls is the start for its clusters.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 
 SAME = 2.5
-"""Times larger or smaller that a hull may be and still be that of the same thing: it comes gradually into view."""
+"""Maximum ratio between the volumes of two hulls of the same object, which may enter gradually."""
 OWN = 0.5
-"""Share of a cluster's Gaussians that must belong to the thing for the cluster to start with its way."""
+"""Minimum share of a cluster's Gaussians in an object for the cluster to start with its displacement."""
 
 
 class NewbornTracking(UpdatePart):
-    """Sets the shift of the coarsest clusters of what was born in the frame before.
+    """Sets the initial translation of the coarsest clusters of objects added in the previous frame.
 
     Args:
-        name: of the effect, whose arrays name the rows ("newborn"), the thing of each ("thing"), and for each thing its
-            hull's centre ("centres", [T, 3] metres) and volume ("volumes", cubic metres), and the mean of its Gaussians
-            ("places", [T, 3] metres).
+        name: of the effect, whose arrays have the rows ("newborn") and object number of each added Gaussian ("thing").
+            For each object they have its hull's centre ("centres", [T, 3] metres) and volume ("volumes", cubic metres),
+            and the mean of its Gaussians ("places", [T, 3] metres).
     """
 
     def __init__(self, builder: PlanBuilder, name: str) -> None:
         self._hierarchy, self._factory, self._name = builder.hierarchy, builder.factory, name
 
     def begin(self, attempt: Attempt) -> None:
-        """Locates each thing that was born in the frame before in the pictures of this frame."""
+        """Locates each object added in the previous frame in the images of this frame."""
         arrays = attempt.carried.get(self._name)
         if arrays is None or not len(arrays["newborn"]) or not attempt.tables.clusters:
             return
@@ -57,7 +57,7 @@ class NewbornTracking(UpdatePart):
 
 
 def _displacement(state: Gaussians, arrays: Arrays, number: int) -> Float:
-    """[3] metres that a newborn thing has gone since its frame: an attempt may start from where another ended."""
+    """Returns the [3] displacement of an object since its frame; retries may start from the end of another attempt."""
     rows = arrays["newborn"][arrays["thing"] == number]
     if not len(rows):
         return np.zeros(3)
@@ -66,7 +66,7 @@ def _displacement(state: Gaussians, arrays: Arrays, number: int) -> Float:
 
 
 def _displacements(hull: Hull, arrays: Arrays) -> dict[int, Float]:
-    """By number of a newborn thing, [3] metres to the nearest hull of about its size."""
+    """Returns the [3] displacement in metres of each added object to the nearest hull of similar size."""
     displacements: dict[int, Float] = {}
     numbers = np.unique(hull.things)
     centres = np.array([hull.points[hull.things == number].mean(axis=0) for number in numbers]).reshape(-1, 3)

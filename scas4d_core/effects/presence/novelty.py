@@ -1,8 +1,8 @@
-"""Pixels of a frame that show what the state does not have, and those where the state shows what is not there.
+"""Novelty maps: pixels that show what the state lacks, and pixels in which the state shows what does not exist.
 
-With a mask a pixel is new where the mask has foreground and the rendered label has none. Without, it is new where the
-picture differs from the rendering of what stands. What merely moved and was not followed shows as both, new pixels and
-stale ones, of about the same number: only what is new beyond what is stale can have entered.
+With masks, a pixel is new if the mask has foreground and the rendered label has none. Without masks, a pixel is new if
+the image differs from the rendering of the static scene. Motion that was not tracked gives new and stale pixels in
+about equal numbers. Therefore only the surplus of new over stale pixels indicates a new object.
 """
 
 from __future__ import annotations
@@ -31,27 +31,28 @@ Bool = NDArray[np.bool_]
 Array = NDArray[np.float32]
 
 THERE, ABSENT = 0.5, 0.3
-"""Rendered label from which a pixel shows a moving Gaussian, and below which it shows none."""
+"""Rendered labels above which a pixel shows a moving Gaussian, and below which it shows none."""
 RIM = 3
-"""Pixels: narrower regions are rims, where the outline of what is known is off by a pixel."""
+"""Minimum width of a region, in pixels; narrower regions are outlines that are off by a pixel."""
 BARE = 0.5
-"""Transmittance that is left, from which the state has nothing in a pixel."""
+"""Transmittance above which the state is empty at a pixel."""
 DIFFERENT, TIMES_USUAL = 0.1, 3.0
-"""Without masks: the mean difference of a channel, 0…1, in a square of ``RIM`` pixels, from which it is another thing;
-and times the median of such differences over the picture."""
+"""Minimum difference without masks: the mean channel difference, 0…1, in a square of ``RIM`` pixels, and its multiple
+of the median over the image."""
 
 
 @dataclass(frozen=True, eq=False)
 class Novelty:
-    """What a camera says about a frame.
+    """The novelty map of a camera.
 
     Attributes:
-        view: of the frame. camera: inside. image: [H, W, 3] of its picture, 0…1, as the scene's colours are.
-        new: [H, W] shows what the state does not have. stale: [H, W] the state shows what is not there.
-        covered: [H, W] the state shows a moving thing, which something new may lie behind.
-        bare: [H, W] the state shows nothing at all where the picture has something that stands. behind: [H, W] picture
-            and state show static Gaussians, as far as can be measured.
-        error: [H, W] squared difference of picture and rendering, mean over the channels.
+        view: of the frame. camera: in the internal world. image: [H, W, 3] its image in 0…1, without the camera's
+            exposure.
+        new: [H, W] the image shows what the state lacks. stale: [H, W] the state shows what does not exist.
+        covered: [H, W] the state shows a moving object, which may hide something new.
+        bare: [H, W] the state is empty where the image shows static background. behind: [H, W] both show static
+            Gaussians, as far as measurable.
+        error: [H, W] squared difference between image and rendering, mean over channels.
     """
 
     view: TrainingView
@@ -66,15 +67,15 @@ class Novelty:
 
     @property
     def surplus(self) -> int:
-        """New pixels beyond the stale ones."""
+        """Number of new pixels minus number of stale pixels."""
         return int(self.new.sum()) - int(self.stale.sum())
 
 
 class CoarseNovelty(NamedTuple):
-    """What a thinned rendering of the end of an update says, roughly, without another rendering.
+    """A coarse novelty estimate from a subsampled rendering of the update, without rendering again.
 
     Attributes:
-        view: of the frame. new, bare: shares of the pixels, see ``Novelty``; regions come out smaller by their rims.
+        view: of the frame. new, bare: shares of the pixels, see ``Novelty``; regions appear smaller by their outlines.
     """
 
     view: TrainingView
@@ -83,28 +84,28 @@ class CoarseNovelty(NamedTuple):
 
 
 SCREENED_CAMERAS = 6
-"""Cameras at most that are looked at in each frame before all are; where the update has left no rendering, others each
-time."""
+"""Maximum number of cameras that are screened in each frame before all are checked. If the update has left no
+rendering, they change from frame to frame."""
 COARSE_SHARE = 0.5
-"""Of a share of pixels: a glimpse has to find so much of it. On the captures it finds 0.6 to 0.9 of such as count; of
-rims that are none, 0.2 to 0.6."""
+"""Share of the required pixels that a coarse estimate must find. On the captures it finds 0.6 to 0.9 of relevant
+regions, and 0.2 to 0.6 of irrelevant outlines."""
 
 _novelty_cache: WeakKeyDictionary[Gaussians, dict[str, Novelty]] = WeakKeyDictionary()
-"""What cameras say, by state: several effects ask for the same."""
+"""Novelty maps by state, because several effects use the same ones."""
 _coarse_cache: WeakKeyDictionary[UpdateTrace, list[CoarseNovelty]] = WeakKeyDictionary()
-"""Those of an update."""
+"""Coarse estimates by update."""
 
 
 def screen_novelty(seen: FrameObservation, least: int, new: float = 0.0, bare: float = 0.0) -> list[Novelty]:
-    """What some cameras say of a frame; nothing where too few of them can say that something is new, or bare.
+    """Returns novelty maps of some cameras; empty if too few of them may see something new or bare.
 
     Args:
-        least: cameras that have to. new, bare: share of its pixels that each of them has to see as such.
+        least: minimum number of such cameras. new, bare: minimum shares of each camera's pixels.
     """
     glimpses = _coarse_novelties(seen) if seen.result.trace.kept is Candidate.END else []
     if (
         len(glimpses) >= min(SCREENED_CAMERAS, len(seen.views)) > 0
-    ):  # fewer say too little: it ended otherwise than planned
+    ):  # with fewer, the update ended earlier than planned
         seem = [one.view for one in glimpses if one.new >= COARSE_SHARE * new and one.bare >= COARSE_SHARE * bare]
         return novelty_of_views(seen, seem[: max(SCREENED_CAMERAS, least)]) if len(seem) >= least else []
     count = len(seen.views)
@@ -113,7 +114,7 @@ def screen_novelty(seen: FrameObservation, least: int, new: float = 0.0, bare: f
 
 
 def _coarse_novelties(seen: FrameObservation) -> list[CoarseNovelty]:
-    """Those of the cameras that the update rendered last."""
+    """Returns the coarse estimates of the cameras that the update rendered last."""
     trace = seen.result.trace
     if trace not in _coarse_cache:
         _coarse_cache[trace] = [
@@ -123,7 +124,7 @@ def _coarse_novelties(seen: FrameObservation) -> list[CoarseNovelty]:
 
 
 def _coarse_novelty(view: TrainingView, thinned: Thinned) -> CoarseNovelty:
-    """One of a view and its rendering; four pixels that touch have to agree."""
+    """Returns a coarse estimate from a view and its rendering; all four pixels of a 2 × 2 square must agree."""
     every, shown = thinned
     target = view.target[:, ::every, ::every]
     gain, offset = view.exposure[:3, 0, None, None], view.exposure[:3, 1, None, None]
@@ -142,7 +143,7 @@ def _coarse_novelty(view: TrainingView, thinned: Thinned) -> CoarseNovelty:
 
 
 def _corners(plane: NDArray[Any]) -> tuple[NDArray[Any], ...]:
-    """[h − 1, w − 1] four times, the pixels of each square of two by two."""
+    """Returns the four [h − 1, w − 1] corner planes of all 2 × 2 squares."""
     return plane[:-1, :-1], plane[:-1, 1:], plane[1:, :-1], plane[1:, 1:]
 
 
@@ -153,7 +154,7 @@ def _all_corners(plane: Bool) -> Bool:
 
 
 def novelty_of_views(seen: FrameObservation, views: Sequence[TrainingView]) -> list[Novelty]:
-    """What some views say, in the colours of the frame before: what is new may be painted on what stands by now."""
+    """Returns novelty maps in the colours of the previous frame, as static colours may have absorbed the new object."""
     state = seen.result.gaussians
     known = _novelty_cache.setdefault(state, {})
     missing = [view for view in views if view.name not in known or known[view.name].view is not view]
@@ -171,11 +172,11 @@ def measure_novelty(
     rig: Rig | Mapping[str, Camera],
     renderer: Renderer,
 ) -> list[Novelty]:
-    """What each view says against a state.
+    """Returns the novelty map of each view relative to a state.
 
     Args:
-        state: Θ_t, updated to the frame. colours: [N, 3] RGB to render: of the frame before, so that what is new has
-            not been painted on what stands. views: of the frame.
+        state: Θ_t, updated to the frame. colours: [N, 3] RGB to render; those of the previous frame have not absorbed
+            new objects. views: of the frame.
     """
     shown = state.replace(colours=colours)
     return [_novelty(shown, view, rig[view.name], renderer) for view in views]
@@ -203,7 +204,7 @@ def _novelty(state: Gaussians, view: TrainingView, camera: Camera, renderer: Ren
 
 
 def _wide(pixels: Bool) -> Bool:
-    """The regions that are somewhere as wide as ``RIM``."""
+    """Returns the regions that are at least ``RIM`` pixels wide somewhere."""
     cores: Any = binary_opening(pixels, np.ones((RIM, RIM), np.bool_))
     grown: Bool = binary_propagation(cores, mask=pixels)
     return grown

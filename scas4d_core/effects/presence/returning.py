@@ -1,4 +1,4 @@
-"""Things that come back: what was retired is shown again, as itself, where it explains something that is new."""
+"""Objects that return: retired Gaussians are revived with their ids if they explain a new object."""
 
 from __future__ import annotations
 
@@ -20,20 +20,21 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 
 ALIKE = 1.5
-"""Times larger or smaller, root mean square from the middle, that a hull may be than what was retired."""
+"""Maximum ratio between the RMS sizes of a hull and of the retired Gaussians."""
 EXPLAINS = 0.8
-"""Of the squared error where the thing shows, that has to be gone with what was retired in its place: in a made-up room
-0.85 to 1 is with the same ball, up to a small turn, and 0.6 with one of another pattern. It is rather born anew than
-taken for another: an id is for ever."""
+"""Minimum share of the squared error at an object that the revived Gaussians must remove. In a synthetic room, the same
+ball removes 0.85 to 1, up to a small rotation, and one with another pattern 0.6. When in doubt, new Gaussians are added
+instead, because a wrong id would be permanent."""
 APART = 0.25
-"""Of the size of a hull: retired Gaussians that are no farther apart are of one thing."""
+"""Distance, relative to the size of a hull, up to which retired Gaussians belong to the same object."""
 
 
 class ReturnedThing(NamedTuple):
-    """Retired Gaussians that explain a thing.
+    """Retired Gaussians that explain a new object.
 
     Attributes:
-        thing: number in the hull. rows: of the state. shift: [3] metres from where they were retired.
+        thing: object number in the hull. rows: of the state. shift: [3] displacement from where they were retired, in
+            metres.
     """
 
     thing: int
@@ -42,10 +43,10 @@ class ReturnedThing(NamedTuple):
 
 
 def find_returned(seen: Sequence[Novelty], hull: Hull, state: Gaussians, renderer: Renderer) -> list[ReturnedThing]:
-    """What of the retired explains things that are new; they are shown as they were, moved to the hull's middle.
+    """Returns the retired Gaussians that explain new objects, if shown unchanged at the hull's centre.
 
     Args:
-        seen: what the cameras say. hull: of what is new. state: Θ_t. renderer: draws.
+        seen: novelty maps. hull: of the new objects. state: Θ_t. renderer: renders views.
     """
     retired = np.flatnonzero(state.retired & (state.foreground > 0.5))
     revivals: list[ReturnedThing] = []
@@ -70,7 +71,7 @@ def find_returned(seen: Sequence[Novelty], hull: Hull, state: Gaussians, rendere
 
 
 def revive_returned(state: Gaussians, found: Sequence[ReturnedThing]) -> Gaussians:
-    """The state with what has returned, where it is now."""
+    """Returns the state with the returned objects revived at their new positions."""
     means = state.means.copy()
     for one in found:
         means[one.rows] += one.shift.astype(np.float32)
@@ -79,17 +80,17 @@ def revive_returned(state: Gaussians, found: Sequence[ReturnedThing]) -> Gaussia
 
 
 def _size(points: Float) -> float:
-    """Metres, root mean square distance from the middle."""
+    """Returns the RMS distance from the centre, in metres."""
     return max(float(np.sqrt(np.square(points - points.mean(axis=0)).sum(axis=1).mean())), 1e-6)
 
 
 def _groups(means: Float, apart: float) -> list[NDArray[np.int64]]:
-    """Entries of means [R, 3] by thing: those whose cells, ``apart`` metres wide, touch."""
+    """Groups means [R, 3] by object: those whose cells of ``apart`` metres touch. Returns their indices."""
     if not len(means):
         return []
     cells = np.floor((means - means.min(axis=0)) / apart).astype(np.int64)
     places: list[NDArray[np.int64]] = []
-    for axis in range(3):  # empty stretches between things are cut to one cell
+    for axis in range(3):  # gaps between objects are reduced to one empty cell
         values = np.unique(cells[:, axis])
         steps = np.minimum(np.diff(values, prepend=values[0]), 2)
         places.append(np.cumsum(steps)[np.searchsorted(values, cells[:, axis])])
@@ -101,7 +102,7 @@ def _groups(means: Float, apart: float) -> list[NDArray[np.int64]]:
 
 
 def _left(seen: Sequence[Novelty], points: Float, voxel: float, state: Gaussians, renderer: Renderer) -> float:
-    """Share of the squared error at a thing that is left with a state."""
+    """Returns the share of the squared error at an object that remains with a state."""
     before = after = 0.0
     for one in seen:
         where = one.new & footprint(one, points, voxel)

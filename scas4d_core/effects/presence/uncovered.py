@@ -1,4 +1,4 @@
-"""Things that move uncover what they hid: Gaussians that stand are born where the state has nothing."""
+"""Uncovered background: static Gaussians are added where moving objects uncover regions that the state lacks."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ if TYPE_CHECKING:
 
 NAME = "uncovered"
 MIN_CAMERAS, MIN_CAMERAS_WHILE_ON = 3, 1
-"""Cameras of a glance that have to see something bare before all are asked; and where the effect is on. What moves on
-goes on uncovering, and a hole behind it is seen by few cameras at first."""
+"""Minimum number of screened cameras that see a bare region before all are checked: to switch the effect on, and while
+it is on. Continued motion keeps uncovering background, and at first few cameras see the hole."""
 SMALLEST = 0.0004
-"""Share of a camera's pixels that it must see as bare to have a say: 26 of 256 x 256, five by five."""
+"""Minimum share of bare pixels in an image for a camera to count: 26 of 256 x 256, five by five."""
 SHARE = 0.03
-"""Of the squared error of all pictures that is in the bare regions, from which they are worth it."""
+"""Minimum share of the squared error of all images in the bare regions, to switch the effect on."""
 WORTH = 0.005
-"""The same, from which Gaussians are born once the effect is on."""
+"""Minimum share for adding Gaussians while the effect is on."""
 BUDGET = 0.05
-"""Gaussians that are born in a frame at most, as a share of those that are there."""
+"""Maximum number of Gaussians added in a frame, as a share of the existing ones."""
 
 
 Found = tuple[UncoveredPoints, float]
 _points_cache: WeakKeyDictionary[Gaussians, dict[int, Found | None]] = WeakKeyDictionary()
-"""What was found, by state and the cameras of a glance that were asked for: evidence and births ask for the same."""
+"""Results by state and minimum number of screened cameras, shared by evidence and births."""
 
 
 def _find_points(seen: FrameObservation, glanced: int) -> Found | None:
-    """Points on what is uncovered, and the share of the squared error that they explain."""
+    """Returns points on uncovered surfaces, and the share of the squared error that they explain."""
     known = _points_cache.setdefault(seen.result.gaussians, {})
     if glanced not in known:
         known[glanced] = _looked_for(seen, glanced)
@@ -65,17 +65,17 @@ def _looked_for(seen: FrameObservation, glanced: int) -> Found | None:
 
 @dataclass(frozen=True)
 class UncoveredEffect(Effect):
-    """Births behind what moves away."""
+    """Adds static Gaussians behind moving objects."""
 
     def evidence(self, seen: FrameObservation) -> Evidence | None:
-        """What is bare has so much of the error; once something was born, fewer cameras have to see it."""
+        """Returns the error share of bare regions; after the first births, fewer cameras must see them."""
         if not seen.views:
             return None
         points = _find_points(seen, MIN_CAMERAS_WHILE_ON if NAME in seen.result.carried else MIN_CAMERAS)
         return Evidence(0.0, "") if points is None else _evidence(points[1])
 
     def add_and_retire_gaussians(self, seen: FrameObservation) -> UpdateResult:
-        """The result with the Gaussians that are born."""
+        """Adds Gaussians on the uncovered surfaces."""
         result, uncovered_points = seen.result, _find_points(seen, MIN_CAMERAS_WHILE_ON)
         if uncovered_points is None or uncovered_points[1] < WORTH:
             return result
@@ -104,7 +104,7 @@ class UncoveredEffect(Effect):
         )
 
     def register(self, builder: PlanBuilder) -> None:
-        """Adds nothing: births come after the update of a frame."""
+        """Adds nothing: Gaussians are added after the update of a frame."""
 
 
 def _evidence(share: float) -> Evidence:

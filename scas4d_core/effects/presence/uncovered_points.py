@@ -1,7 +1,7 @@
-"""Points on what a moving thing has uncovered: the surface around a bare region goes on through it.
+"""Points on uncovered surfaces: the surface around a bare region is continued through it.
 
-In a picture the inverse depth of a plane is linear in the pixel's place: it is fitted to what stands about the region.
-The points that come of it count where cameras agree on their colour.
+In an image, the inverse depth of a plane is linear in pixel coordinates. It is fitted to the static scene around the
+region. The resulting points are accepted if the cameras agree on their colour.
 """
 
 from __future__ import annotations
@@ -26,27 +26,28 @@ Float = NDArray[np.float64]
 Bool = NDArray[np.bool_]
 
 AROUND = 6
-"""Pixels about a region to which its plane is fitted."""
+"""Width, in pixels, of the ring around a region to which its plane is fitted."""
 FEWEST = 24
-"""Of these that a fit needs."""
+"""Minimum number of ring pixels for a fit."""
 OPAQUE = 0.1
-"""Transmittance up to which a pixel has a depth."""
+"""Maximum transmittance of a pixel with a depth."""
 ROUNDS = 5
-"""Of reweighted least squares: pixels of another surface about the region are outliers."""
+"""Iterations of reweighted least squares; pixels of other surfaces around the region are outliers."""
 NEAR = 0.02
-"""Relative difference of inverse depth that an inlier has, about."""
+"""Approximate relative difference of inverse depth of an inlier."""
 CAMERAS, SPREAD = 3, 0.08
-"""Cameras that must see a point, and the mean absolute deviation of a channel, 0…1, up to which they agree."""
+"""Minimum number of cameras that see a point, and maximum mean absolute colour deviation, 0…1, for agreement."""
 APART = 1.3
-"""Pixels, in the camera that sees it best, between points."""
+"""Spacing of points, in pixels of the camera that sees them best."""
 
 
 @dataclass(frozen=True, eq=False)
 class UncoveredPoints:
-    """Points on what was uncovered.
+    """Points on uncovered surfaces.
 
     Attributes:
-        points: [P, 3] inside world. colours: [P, 3] in 0…1. spacing: metres between neighbours, about.
+        points: [P, 3] in the internal world. colours: [P, 3] in 0…1. spacing: approximate distance of neighbours, in
+            metres.
     """
 
     points: Float
@@ -55,10 +56,10 @@ class UncoveredPoints:
 
 
 def find_uncovered_points(seen: Sequence[Novelty], state: Gaussians, renderer: Renderer) -> UncoveredPoints:
-    """Points in the bare regions of all cameras.
+    """Returns points in the bare regions of all cameras.
 
     Args:
-        seen: what the cameras say. state: Θ_t. renderer: draws.
+        seen: novelty maps. state: Θ_t. renderer: renders views.
     """
     standing = state.retire(state.moving)
     clouds = [_points(one, standing, renderer) for one in seen if one.bare.any()]
@@ -77,7 +78,7 @@ def find_uncovered_points(seen: Sequence[Novelty], state: Gaussians, renderer: R
 
 
 def _points(one: Novelty, standing: Gaussians, renderer: Renderer) -> Float:
-    """[P, 3] points of a camera's bare pixels."""
+    """Returns the [P, 3] points of a camera's bare pixels."""
     features = np.zeros((len(standing), 4), np.float32)
     planes, rest = renderer.render(standing, one.view.camera, features, depth_channel=0)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -95,7 +96,7 @@ def _points(one: Novelty, standing: Gaussians, renderer: Renderer) -> Float:
 
 
 def _plane(at: NDArray[np.int64], values: Array, wanted: NDArray[np.int64]) -> Float:
-    """Values of a plane at rows and columns [Q, 2], fitted to those at others [P, 2]; no less than a small number."""
+    """Fits a plane to values at pixels [P, 2] and returns its values at pixels [Q, 2], bounded from below."""
     design = np.column_stack([at, np.ones(len(at))]).astype(np.float64)
     weights = np.ones(len(at))
     middle = max(float(np.median(values)), 1e-6)
@@ -108,7 +109,7 @@ def _plane(at: NDArray[np.int64], values: Array, wanted: NDArray[np.int64]) -> F
 
 
 def _lifted(one: Novelty, pixels: NDArray[np.int64], depth: Float) -> Float:
-    """[P, 3] points in the world of pixels (row, column) at depths."""
+    """Lifts pixels (row, column) at depths to [P, 3] world points."""
     camera = one.camera
     x = (pixels[:, 1] + 0.5 - camera.cx) / camera.fx * depth
     y = (pixels[:, 0] + 0.5 - camera.cy) / camera.fy * depth
@@ -117,7 +118,7 @@ def _lifted(one: Novelty, pixels: NDArray[np.int64], depth: Float) -> Float:
 
 
 def _agreed(seen: Sequence[Novelty], points: Float) -> tuple[Array, Bool]:
-    """Median colour [P, 3] of points over the cameras that see what stands there, and whether these agree [P]."""
+    """Returns the median colour [P, 3] over the cameras that see static background, and whether they agree [P]."""
     samples = np.full((len(seen), len(points), 3), np.nan, np.float32)
     bare = np.zeros(len(points), np.int64)
     for sample, one in zip(samples, seen, strict=True):

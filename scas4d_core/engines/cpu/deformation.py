@@ -141,7 +141,7 @@ class CpuDeformation:
             ValueError: the last layer cannot.
         """
         if layers and layers >= len(self.clusters):
-            raise ValueError(f"{layers} of {len(self.clusters)} layers cannot rest: the last one goes on")
+            raise ValueError(f"{layers} of {len(self.clusters)} layers cannot be frozen: the last one always continues")
         if layers < self._frozen:
             self._unfreeze_layers()
         for layer in range(self._frozen, layers):

@@ -29,7 +29,7 @@ def translate_read_errors(name: str) -> Iterator[None]:
     >>> with translate_read_errors("a.glb"):
     ...     {}["accessors"]
     Traceback (most recent call last):
-    scas4d_core.errors.InputError: a.glb cannot be read (KeyError: 'accessors'); export it anew
+    scas4d_core.errors.InputError: a.glb cannot be read (KeyError: 'accessors'); export it again
     """
     try:
         yield
@@ -37,5 +37,5 @@ def translate_read_errors(name: str) -> Iterator[None]:
         raise
     except FAULTS as error:
         raise InputError(
-            f"{name} cannot be read ({type(error).__name__}: {message_of(error)})", "export it anew"
+            f"{name} cannot be read ({type(error).__name__}: {message_of(error)})", "export it again"
         ) from None

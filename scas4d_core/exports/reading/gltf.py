@@ -66,7 +66,7 @@ class GltfFrame:
             attributes = primitive["attributes"]
             if "_ID" not in attributes:
                 raise InputError(
-                    f"{self._name} has no ids (_ID), so nobody knows which Gaussian is which in other frames",
+                    f"{self._name} has no ids (_ID), so Gaussians cannot be identified in other frames",
                     "export it as usd or s4d; ids from 2^24 on are left out of .glb",
                 )
             means, scales, rotations = (
@@ -112,7 +112,7 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
         raise ValueError("it does not begin as one")
     length, kind = struct.unpack_from("<I4s", data, 12)
     if kind != b"JSON":
-        raise ValueError("its first chunk is no JSON")
+        raise ValueError("its first chunk is not valid JSON")
     document = json.loads(data[20 : 20 + length])
     begin = 20 + length
     if begin + 8 > len(data):

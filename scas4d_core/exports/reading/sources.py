@@ -179,4 +179,4 @@ def _vertex(name: str, read: Bytes) -> PlyData:
     try:
         return PlyData.read(io.BytesIO(read()))["vertex"]
     except Exception as error:
-        raise InputError(f"{name}: no 3D Gaussian Splatting .ply ({error})", REMEDY) from None
+        raise InputError(f"{name}: not a 3D Gaussian Splatting .ply ({error})", REMEDY) from None

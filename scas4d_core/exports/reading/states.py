@@ -121,7 +121,7 @@ class ExportedStates:
                 cloud = self.cloud(place)
             given = cloud.ids.tolist()
             if len(set(given)) < len(given):
-                raise InputError(f"frame {self.frames[place]}: an id belongs to two Gaussians", "export it anew")
+                raise InputError(f"frame {self.frames[place]}: an id belongs to two Gaussians", "export it again")
             new = np.array([id not in ids for id in given], np.bool_)
             ids.update({id: len(ids) + k for k, id in enumerate(np.asarray(given)[new].tolist())})
             of = cloud.splats

@@ -30,16 +30,14 @@ def open_usd(path: Path) -> ExportedStates:
     try:
         stage = usd.Stage.Open(str(path))
     except failure as error:
-        raise InputError(f"{path.name} is no USD ({message_of(error)})", REMEDY) from None
+        raise InputError(f"{path.name} is not USD ({message_of(error)})", REMEDY) from None
     prim = stage.GetPrimAtPath(GAUSSIANS)
     if not prim or not prim.IsA("ParticleField3DGaussianSplat"):
         raise InputError(f"{path.name} has no Gaussians at {GAUSSIANS}", REMEDY)
     primvars = geometry.PrimvarsAPI(prim)
     ids = primvars.GetPrimvar("scas4d:id").Get() if primvars.HasPrimvar("scas4d:id") else None
     if ids is None:
-        raise InputError(
-            f"{path.name} has no ids (primvars:scas4d:id), so nobody knows which Gaussian is which", REMEDY
-        )
+        raise InputError(f"{path.name} has no ids (primvars:scas4d:id), so Gaussians cannot be identified", REMEDY)
     reader = _Reader(stage, volume.ParticleField3DGaussianSplat(prim), np.array(ids, np.int64))
     origin = stage.GetRootLayer().customLayerData.get("scas4d", {})
     rate = float(stage.GetTimeCodesPerSecond())

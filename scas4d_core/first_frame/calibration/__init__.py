@@ -1,1 +1,1 @@
-"""Compares the calibration with the pictures of frame 0, and refines it on request."""
+"""Compares the calibration with the images of frame 0, and refines it on request."""

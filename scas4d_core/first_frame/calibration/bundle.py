@@ -1,10 +1,10 @@
-"""Bundle adjustment of a calibrated rig on matches of one moment, held to the calibration as far as nothing denies it.
+"""Bundle adjustment of a calibrated rig on the matches of one frame, with the calibration as a prior.
 
-Matches leave some of a rig's numbers open: where it is, which way it looks, how large it is, and nearly open some
-others, as whether its ring is a little bent. Here each camera is drawn to its pose as calibrated, by a Cauchy loss:
-what matches do not determine stays, and a camera that is far off pulls no other along. pycolmap triangulates
-here; its own bundle adjustment has no such term, and moved the cameras of an exact rig by 0.6 pixels in the median
-(docs/calibration.md).
+Matches leave some degrees of freedom undetermined: the position, orientation and scale of the rig. Others, such as a
+slight bend of a camera ring, are nearly undetermined. Here, a Cauchy loss pulls each camera towards its calibrated
+pose. Values that the matches do not determine are kept, and a camera that is far off does not pull the others along.
+pycolmap triangulates the points. Its own bundle adjustment has no such term, and moved the cameras of an exact rig by
+0.6 pixels in the median (docs/calibration.md).
 """
 
 from __future__ import annotations
@@ -23,26 +23,26 @@ from scas4d_core.first_frame.points.triangulation import group_by_track, triangu
 from scas4d_core.posed_pictures import Float
 
 BOUNDS = (16.0, 6.0, 2.0)
-"""Pixels that a feature may miss its point by, round after round: the first takes in cameras that are far off, the last
-leaves out what is no match."""
+"""Maximum reprojection errors in pixels for successive rounds. The first includes cameras that are far off; the last
+excludes wrong matches."""
 NOISE = 0.5
-"""Pixels, scale of the Cauchy loss of features."""
+"""Scale of the Cauchy loss of features, in pixels."""
 MIN_PRIOR_SCALE = 0.5
-"""Pixels, least scale of the Cauchy loss that draws a camera to its calibration: turns, shifts and the focal length are
-weighed by how far they move what it sees. After the first round it is the rig's median, where that is larger."""
+"""Minimum scale, in pixels, of the Cauchy loss of the calibration prior. Rotation, translation and focal length are
+weighted by the image displacement that they cause. After the first round, the rig's median is used if it is larger."""
 MIN_ANGLE_DEG = 1.0
-"""Rays that meet under less say little about depth."""
+"""Minimum triangulation angle; rays at smaller angles hardly determine depth."""
 MAX_STEPS = 40
-"""Of Levenberg-Marquardt in a round."""
+"""Maximum number of Levenberg-Marquardt steps in a round."""
 MIN_RELATIVE_GAIN = 1e-5
-"""A step that lowers the loss by a smaller share is the last one."""
+"""Relative decrease of the loss below which a round ends."""
 
 Track = tuple[NDArray[np.intp], Float]
-"""Indices of cameras [n], each once, and the pixel [n, 2] in each."""
+"""Indices of distinct cameras [n], and the pixel [n, 2] in each."""
 
 
 def build_tracks(matches: Matches) -> list[Track]:
-    """Features that match from camera to camera, a track each; those with two features in one picture are left out."""
+    """Returns tracks of matching features; tracks with two features in one image are left out."""
     label, offsets = matches.tracks()
     owner = np.repeat(np.arange(len(matches.pixels)), np.diff(offsets))
     pixels = np.concatenate(matches.pixels) if len(owner) else np.zeros((0, 2))
@@ -56,13 +56,14 @@ def build_tracks(matches: Matches) -> list[Track]:
 def bundle_adjust(
     cameras: Sequence[Camera], tracks: Sequence[Track], *, focal: bool = False, seed: int = 0
 ) -> list[Camera]:
-    """The cameras brought to agree with the tracks, in the world as calibrated; those that see none stay as they are.
+    """Returns the cameras adjusted to agree with the tracks, in the calibrated world; cameras without tracks are
+    unchanged.
 
     Args:
         cameras: of the tracks.
         tracks: features of one point each, some of them wrong.
-        focal: each camera's focal length is adjusted too; the ratio of fx and fy stays.
-        seed: of RANSAC.
+        focal: whether to adjust each camera's focal length too; the ratio of fx and fy is fixed.
+        seed: for RANSAC.
     """
     current, trust = list(cameras), MIN_PRIOR_SCALE
     for bound in BOUNDS:
@@ -76,7 +77,7 @@ def bundle_adjust(
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Features of points: index of the camera and of the point of each [M], and its pixel [M, 2]."""
+    """Features of points: the camera and point index of each [M], and its pixel [M, 2]."""
 
     camera: NDArray[np.intp]
     point: NDArray[np.intp]
@@ -86,7 +87,7 @@ class Observations:
 def _triangulate_tracks(
     cameras: Sequence[Camera], tracks: Sequence[Track], bound: float, seed: int
 ) -> tuple[Observations, Float]:
-    """The right features of each track that gives a point, and the points [P, 3] (LO-RANSAC, pycolmap)."""
+    """Triangulates tracks (LO-RANSAC, pycolmap); returns the inlier features and the points [P, 3]."""
     point_of = triangulator(cameras, angle=MIN_ANGLE_DEG, error=bound, trials=100, seed=seed)
     points, owner, pixels = [], [], []
     for who, uv in tracks:
@@ -113,7 +114,7 @@ class _BundleAdjustment:
         self.count = len(given)
 
     def solve(self, cameras: list[Camera], points: Float) -> list[Camera]:
-        """The cameras after the last step that lowers the loss."""
+        """Returns the cameras after the last step that lowers the loss."""
         depth = self._depths(cameras, points)
         damping, loss = 1e-3, self._loss(cameras, points, depth)
         for _ in range(MAX_STEPS):
@@ -130,12 +131,12 @@ class _BundleAdjustment:
         return cameras
 
     def median_prior_distance(self, cameras: list[Camera], points: Float) -> float:
-        """Median distance of the cameras that see something from their calibration, pixels."""
+        """Returns the median distance in pixels of the observing cameras from their calibration."""
         pulls = np.linalg.norm(self._prior_residuals(cameras, self._depths(cameras, points))[0], axis=1)
         return float(np.median(pulls[np.unique(self.seen.camera)]))
 
     def _depths(self, cameras: Sequence[Camera], points: Float) -> Float:
-        """[V] median depth of what each camera sees; 1 where nothing."""
+        """Returns the [V] median depth of each camera's points; 1 if it has none."""
         depths = np.ones(self.count)
         for index, camera in enumerate(cameras):
             own = points[self.seen.point[self.seen.camera == index]]
@@ -144,7 +145,7 @@ class _BundleAdjustment:
         return depths
 
     def _residuals(self, cameras: Sequence[Camera], points: Float) -> tuple[Float, Float, Float]:
-        """Misses of all features [M, 2] in pixels, and their derivatives by the camera [M, 2, 6 or 7] and point."""
+        """Returns the reprojection errors [M, 2] and their derivatives by camera [M, 2, 6 or 7] and by point."""
         seen = self.seen
         rotation = np.array([c.rotation for c in cameras])[seen.camera]
         shift = np.array([c.translation for c in cameras])[seen.camera]
@@ -157,19 +158,19 @@ class _BundleAdjustment:
             by_place[:, 0, 0], by_place[:, 1, 1] = lens[:, 0] / z, lens[:, 1] / z
             by_place[:, :, 2] = -offset / z[:, None]
         miss = offset + lens[:, 2:] - seen.pixel
-        miss[z <= 0] = np.inf  # behind the camera: no such step is taken
+        miss[z <= 0] = np.inf  # behind the camera: such a step is rejected
         columns = [by_place @ -_cross(place), by_place, *([offset[:, :, None]] if self.focal else [])]
         return miss, np.concatenate(columns, axis=2), by_place @ rotation
 
     def _prior_residuals(self, cameras: Sequence[Camera], depth: Float) -> tuple[Float, Float]:
-        """Distances of each camera from its calibration [V, 6 or 7] in pixels, and the pixels of a unit of each."""
+        """Returns each camera's distance from its calibration [V, 6 or 7] in pixels, and the pixels per unit."""
         rows, units = np.zeros((self.count, self.size)), np.zeros((self.count, self.size))
         for index, (before, now) in enumerate(zip(self.given, cameras, strict=True)):
             units[index, :3], units[index, 3:6] = now.fx, now.fx / depth[index]
             rows[index, :3] = Rotation.from_matrix(now.rotation @ before.rotation.T).as_rotvec()
             rows[index, 3:6] = -now.rotation @ (now.centre - before.centre)
             if self.focal:
-                units[index, 6] = now.width / 4  # a typical distance of what it sees from the middle of its picture
+                units[index, 6] = now.width / 4  # a typical distance from the image centre
                 rows[index, 6] = np.log(now.fx / before.fx)
         return rows * units, units
 
@@ -179,7 +180,7 @@ class _BundleAdjustment:
         return float(np.log1p(miss).sum() + np.log1p(pull).sum())
 
     def _step(self, cameras: Sequence[Camera], points: Float, depth: Float, damping: float) -> tuple[Float, Float]:
-        """Moves of the cameras [V, 6 or 7] and shifts of the points [P, 3]."""
+        """Returns the camera updates [V, 6 or 7] and the point updates [P, 3]."""
         seen, size, count = self.seen, self.size, len(points)
         miss, by_camera, by_point = self._residuals(cameras, points)
         weight = 1 / (1 + (miss**2).sum(1) / NOISE**2) / NOISE**2
@@ -216,7 +217,7 @@ class _BundleAdjustment:
 
 
 def _sparse(blocks: Float, seen: Observations, cameras: int, points: int) -> csr_array:
-    """Blocks [M, s, 3] at (camera, point) as one matrix [s · cameras, 3 · points]."""
+    """Assembles blocks [M, s, 3] at (camera, point) into a matrix [s · cameras, 3 · points]."""
     size = blocks.shape[1]
     rows = np.broadcast_to(size * seen.camera[:, None, None] + np.arange(size)[:, None], blocks.shape)
     columns = np.broadcast_to(3 * seen.point[:, None, None] + np.arange(3), blocks.shape)
@@ -224,14 +225,16 @@ def _sparse(blocks: Float, seen: Observations, cameras: int, points: int) -> csr
 
 
 def _cross(vectors: Float) -> Float:
-    """[M, 3, 3] with [v] w = v × w."""
+    """Returns [M, 3, 3] cross-product matrices: [v] w = v × w."""
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
 
 
 def _apply_step(camera: Camera, move: Float) -> Camera:
-    """The camera turned about its axes, shifted along them, and its focal length multiplied by e to the last number."""
+    """Returns the camera rotated about and translated along its axes; the last value scales the focal length by its
+    exponential.
+    """
     turn = Rotation.from_rotvec(move[:3]).as_matrix()
     pose, intrinsics = np.eye(4), camera.intrinsics.copy()
     pose[:3, :3], pose[:3, 3] = turn @ camera.rotation, turn @ camera.translation + move[3:6]

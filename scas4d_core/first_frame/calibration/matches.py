@@ -1,7 +1,8 @@
-"""SIFT matches between neighbouring cameras by appearance alone: a faulty calibration cannot hide itself in them.
+"""SIFT matches between neighbouring cameras by appearance only, so that calibration errors do not bias them.
 
-The matches from which points are made (``points/triangulation.py``) lie within two pixels of their epipolar lines, by
-the calibration as given. These here are searched in whole pictures: they are fewer, and say how far off it is.
+The matches for the initial points (``points/triangulation.py``) lie within two pixels of their epipolar lines in the
+given calibration. The matches here are searched in whole images. They are fewer, but they show the size of a
+calibration error.
 """
 
 from __future__ import annotations
@@ -24,29 +25,30 @@ from scas4d_core.first_frame.points.triangulation import (
 from scas4d_core.posed_pictures import Float, PosedPicture
 
 LONGEST_SIDE = 800
-"""Pixels; larger pictures are made smaller before features are found: they would show smaller faults, at seconds a
-camera."""
+"""Maximum image side, in pixels; larger images are downscaled before feature detection. Full size would reveal smaller
+errors but takes seconds per camera."""
 FEATURES, CONTRAST = 2048, 0.0067
-"""Features of a picture at most, and COLMAP's least contrast: of `basketball` half as many as points are made from, of
-which as many match. Where the pictures are of one size they are some of those that points are made from, bit by bit in
-50 of 51 pictures; but which, pycolmap does not say: it gives keypoints without their contrast. So features are found
-twice, at up to 1.0 s of the processor for `robot`, 3.0 s for `basketball`."""
+"""Maximum number of features per image, and COLMAP's contrast threshold. On `basketball` this gives half as many
+features as for the initial points, but as many of them match. For images of the same size, they are a bit-identical
+subset of the features for the initial points in 50 of 51 images. Which subset is unknown, because pycolmap returns
+keypoints without their contrast. Features are therefore detected twice, at up to 1.0 s of CPU time for `robot` and 3.0
+s for `basketball`."""
 NEIGHBOURS = 6
-"""Cameras that look most like a camera and are matched with it: pictures taken farther apart hardly match."""
+"""Number of nearest cameras that each camera is matched with; more distant views hardly match."""
 HELD_OUT_EVERY = 5
-"""Every so many tracks are held out, to test with."""
+"""Every how many tracks one is held out for testing."""
 
 Pair = tuple[int, int]
 
 
 @dataclass(frozen=True, eq=False)
 class Matches:
-    """Features of the pictures of one moment, and those that look alike from camera to camera.
+    """Features of the images of one frame, and the matches between cameras.
 
     Attributes:
-        cameras: as given, of the size at which features were found.
-        scale: by camera, how many pixels of its picture one of these is, at least 1.
-        pixels: by camera, [K, 2] of its features. pairs: [M, 2] features that match, by indices of two cameras.
+        cameras: as given, at the size at which features were detected.
+        scale: by camera, size of such a pixel in pixels of its image, at least 1.
+        pixels: by camera, [K, 2] features. pairs: [M, 2] indices of matching features, by pair of camera indices.
     """
 
     cameras: tuple[Camera, ...]
@@ -55,25 +57,25 @@ class Matches:
     pairs: dict[Pair, NDArray[np.intp]]
 
     def with_cameras(self, cameras: Sequence[Camera]) -> Matches:
-        """The same features, of the rig in another calibration; cameras are of the size of these."""
+        """Returns the same features for a different calibration; the cameras must have the same image sizes."""
         return replace(self, cameras=tuple(cameras))
 
     def without(self, left_out: Collection[int]) -> Matches:
-        """The matches between all other cameras."""
+        """Returns the matches without those of some cameras."""
         pairs = {pair: rows for pair, rows in self.pairs.items() if not set(pair) & set(left_out)}
         return replace(self, pairs=pairs)
 
     def tracks(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """The track of each feature, those of all cameras in a row, and the first place of each camera in it."""
+        """Returns the track number of each feature, concatenated over cameras, and each camera's offset."""
         offsets = np.concatenate([[0], np.cumsum([len(uv) for uv in self.pixels])])
         edges = [rows + offsets[list(pair)] for pair, rows in self.pairs.items()]
         all_edges = np.concatenate(edges) if edges else np.zeros((0, 2), np.intp)
         return label_tracks(all_edges, int(offsets[-1])), offsets
 
     def split(self) -> tuple[Matches, Matches]:
-        """Those to learn from, and those held out: no feature is in both."""
+        """Splits the matches into a training set and a held-out set without common features."""
         track, offsets = self.tracks()
-        # Tracks are numbered by their first features: counted among those that match, both halves have all cameras.
+        # Counting only tracks with matches, in order of their first features, gives both sets matches of all cameras.
         matched = np.concatenate(
             [np.zeros(0, np.intp), *(track[r + offsets[list(p)]][:, 0] for p, r in self.pairs.items())]
         )
@@ -85,10 +87,10 @@ class Matches:
 
 
 def match_by_appearance(views: Sequence[PosedPicture]) -> Matches:
-    """Matches SIFT features of each camera with those of its neighbours in direction and place.
+    """Matches the SIFT features of each camera with those of its neighbours in direction and position.
 
     Args:
-        views: of one moment, of two cameras or more.
+        views: of one frame, from at least two cameras.
     """
     small = [_downscale(view) for view in views]
     feature_sets = extract_features(small, most=FEATURES, contrast=CONTRAST)
@@ -109,7 +111,7 @@ def _downscale(view: PosedPicture) -> PosedPicture:
 
 
 def neighbour_pairs(rig: Rig) -> list[Pair]:
-    """Pairs of cameras worth matching: each with the ``NEIGHBOURS`` that are nearest in direction and place.
+    """Returns pairs of cameras worth matching: each with its ``NEIGHBOURS`` nearest in direction and position.
 
     >>> lens = [[100, 0, 32], [0, 100, 24], [0, 0, 1]]
     >>> row = [np.eye(4) for _ in range(9)]
@@ -134,14 +136,14 @@ def neighbour_pairs(rig: Rig) -> list[Pair]:
 
 
 def _mutual_matches(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.intp]:
-    """[M, 2] rows of two sets of unit descriptors that are each other's nearest, and much nearer than any other."""
+    """Returns [M, 2] rows of mutual nearest neighbours of unit descriptors that pass the ratio test."""
     if min(len(first), len(second)) < 2:
         return np.zeros((0, 2), np.intp)
     return mutual_best(descriptor_distances(first, second))
 
 
 def epipolar_distances(matches: Matches, pair: Pair) -> Float:
-    """[M] pixels by which the matches of a pair miss each other's epipolar lines: the larger distance of the two."""
+    """Returns the [M] epipolar distances of a pair's matches in pixels: the larger of the two images."""
     (a, b), rows = pair, matches.pairs[pair]
     first, second = (np.pad(matches.pixels[v][rows[:, k]], ((0, 0), (0, 1)), constant_values=1.0)
                      for k, v in enumerate((a, b)))  # fmt: skip

@@ -1,4 +1,4 @@
-"""Measures the calibration of a rig on the pictures of frame 0, and refines it where that is asked for."""
+"""Checks the calibration of a rig with the images of frame 0, and refines it on request."""
 
 from __future__ import annotations
 
@@ -20,20 +20,21 @@ from scas4d_core.progress import Progress
 from scas4d_core.settings import StaticSettings
 
 MIN_CAMERAS = 3
-"""Cameras at least: of two, either could be off."""
+"""Minimum number of cameras; with two, either could be off."""
 STANDARD_ERRORS = 2.0
-"""Standard errors by which the loss of matches held out has to fall."""
+"""Number of standard errors by which the loss of held-out matches must decrease."""
 MIN_HELD_OUT = 20
-"""Matches held out, of fewer of which a standard error says little."""
+"""Minimum number of held-out matches for a meaningful standard error."""
 
 
 def calibrate_first_frame(
     rig: Rig, frame: Frame, settings: StaticSettings, on_progress: Callable[[Progress], None], *, measured: bool
 ) -> CalibrationReport | None:
-    """``check_calibration`` of frame 0, refined where the settings ask for it.
+    """Runs ``check_calibration`` on frame 0, with refinement if the settings request it.
 
     Args:
-        rig: as given, at the size of the frame's pictures. measured: also where no refining is asked for; else None.
+        rig: as given, at the size of the frame's images. measured: whether to check the calibration even if no
+            refinement is requested. If false, the result is None in this case.
     """
     if not (measured or settings.refine_calibration):
         return None
@@ -44,11 +45,11 @@ def calibrate_first_frame(
 
 
 def check_calibration(rig: Rig, images: Mapping[str, NDArray[np.uint8]], *, refine: bool) -> CalibrationReport | None:
-    """Measures how far the pictures are off the calibration; None where fewer than two cameras can be compared.
+    """Measures the calibration error in the images; returns None if fewer than two cameras have an image.
 
     Args:
-        rig: in the user's world, at the size of the pictures. images: [H, W, 3] uint8 of one moment, by camera name.
-        refine: poses are refined, and kept where matches that were held out say that they are better.
+        rig: in the user's world, at image size. images: [H, W, 3] uint8 of one frame, by camera name.
+        refine: whether to refine poses; the result is kept only if held-out matches improve.
 
     >>> from scas4d_core.captures import open_capture
     >>> capture = open_capture("samples/robot")
@@ -58,7 +59,7 @@ def check_calibration(rig: Rig, images: Mapping[str, NDArray[np.uint8]], *, refi
     """
     try:
         views = collect_views(rig, images, {})
-    except InitialPointsError:  # one picture, or of another size, which is refused in words elsewhere
+    except InitialPointsError:  # one image, or a wrong size, which is rejected elsewhere
         return None
     matches = match_by_appearance(views)
     cameras, off = measure_residuals(matches)
@@ -74,7 +75,7 @@ def check_calibration(rig: Rig, images: Mapping[str, NDArray[np.uint8]], *, refi
 
 
 def _describe_faults(cameras: Mapping[str, CameraResidual], off: Sequence[str], matches: Matches) -> list[str]:
-    """Sentences on what is off, for people."""
+    """Returns sentences for people that describe the calibration errors."""
     known = {name: fit.pixels for name, fit in cameras.items() if np.isfinite(fit.pixels)}
     if not known:
         return []
@@ -95,10 +96,10 @@ def _describe_faults(cameras: Mapping[str, CameraResidual], off: Sequence[str], 
 
 
 def refine_rig(rig: Rig, matches: Matches) -> Refinement:
-    """Poses of a rig that agree better with the pictures, if matches that were held out say so.
+    """Refines the poses of a rig; the result is accepted only if held-out matches improve.
 
     Args:
-        rig: as given, of the user's world. matches: of its cameras' pictures of one moment.
+        rig: as given, in the user's world. matches: from its cameras' images of one frame.
     """
     learnt, held = matches.split()
     fits = list(measure_residuals(matches)[0].values())
@@ -130,10 +131,10 @@ def _not_refined(reason: str) -> Refinement:
 
 @dataclass(frozen=True, eq=False)
 class _HeldOutTest:
-    """A rig against another one on matches that neither has learnt from.
+    """A comparison of two calibrations on held-out matches.
 
     Attributes:
-        cameras: of the rig. losses: [M] by how much the loss of each match fell. before, after: see ``Refinement``.
+        cameras: of the new rig. losses: [M] decrease of the loss of each match. before, after: see ``Refinement``.
     """
 
     cameras: list[Camera]
@@ -143,7 +144,7 @@ class _HeldOutTest:
 
     @classmethod
     def of(cls, held: Matches, given: Sequence[Camera], found: list[Camera]) -> _HeldOutTest:
-        """Matches that are far off in both are wrong, and say nothing."""
+        """Compares two calibrations on held-out matches, without matches that are far off in both, which are wrong."""
         pairs = list(held.pairs)
         before, after = (
             np.concatenate([np.zeros(0), *(epipolar_distances(held.with_cameras(rig), pair) for pair in pairs)])
@@ -156,7 +157,7 @@ class _HeldOutTest:
 
     @property
     def is_better(self) -> bool:
-        """True where the loss has fallen by more than chance."""
+        """True if the loss has decreased significantly."""
         count = len(self.losses)
         return (
             count >= MIN_HELD_OUT
@@ -189,6 +190,6 @@ def _refinement(rig: Rig, matches: Matches, test: _HeldOutTest, fixed: Sequence[
 
 
 def _pose_change(given: Camera, found: Camera) -> tuple[float, float]:
-    """Degrees by which a camera was turned, and the distance by which its centre was moved."""
+    """Returns the rotation in degrees and the distance by which a camera has moved."""
     turn = Rotation.from_matrix(found.rotation @ given.rotation.T).magnitude()
     return float(np.degrees(turn)), float(np.linalg.norm(found.centre - given.centre))

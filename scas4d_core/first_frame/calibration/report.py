@@ -1,4 +1,4 @@
-"""The calibration in the report of frame 0, and the refined rig read from it. Numpy only."""
+"""Calibration results in the report of frame 0, and the refined rig read from it. NumPy only."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from scas4d_core.cameras import Camera, Rig
 
 @dataclass(frozen=True)
 class CameraResidual:
-    """Distance of a camera's matches from the calibration.
+    """Calibration error of a camera according to its matches.
 
     Attributes:
-        pixels: median distance from the epipolar lines, in pixels of the camera's pictures; NaN where too few matches
-            determine it. matches: how many are right, about.
+        pixels: median epipolar distance, in pixels of the camera's images; NaN if too few matches determine it.
+        matches: approximate number of correct matches.
     """
 
     pixels: float
@@ -30,9 +30,11 @@ class RefinedCamera:
     """A camera after refinement.
 
     Attributes:
-        rotation_deg: degrees. translation: of its centre, in the user's unit. focal: times its focal length as given.
-        before, after: its residual, pixels; NaN with too few matches. fixed: left as given for want of matches.
-        pose: [4][4] world to camera, the user's world.
+        rotation_deg: rotation, in degrees. translation: displacement of the centre, in the user's unit. focal: factor
+            on the given focal length.
+        before, after: residual in pixels; NaN with too few matches. fixed: whether it was kept as given because it had
+            too few matches.
+        pose: [4][4] world to camera, in the user's world.
     """
 
     rotation_deg: float
@@ -46,13 +48,13 @@ class RefinedCamera:
 
 @dataclass(frozen=True)
 class Refinement:
-    """The outcome of refining a calibration.
+    """The result of refining a calibration.
 
     Attributes:
-        accepted: the scene has the refined rig. text: for people, why or why not.
-        before, after: distance from the epipolar lines, pixels, at which a match has the mean loss of those held out.
-        matches: held out.
-        cameras: by name; none where it was not accepted.
+        accepted: whether the scene uses the refined rig. text: the reason, as text for people.
+        before, after: epipolar distance in pixels that corresponds to the mean loss of held-out matches.
+        matches: number of held-out matches.
+        cameras: refined cameras by name; empty if not accepted.
     """
 
     accepted: bool
@@ -63,19 +65,19 @@ class Refinement:
     cameras: dict[str, RefinedCamera] = field(default_factory=dict)
 
     def apply_to(self, camera: Camera) -> Camera:
-        """The camera, of any size, as it was refined."""
+        """Returns the refined version of a camera of any size."""
         refined_camera = self.cameras.get(camera.name)
         return camera if refined_camera is None else _with_pose(camera, refined_camera.pose, refined_camera.focal)
 
 
 @dataclass(frozen=True)
 class CalibrationReport:
-    """The calibration against the pictures of frame 0.
+    """The calibration compared with the images of frame 0.
 
     Attributes:
-        cameras: residual of each as it was given, by name. miscalibrated: names of those that are clearly off.
-        warnings: what a person should know, a sentence each; of the refined rig where there is one.
-        refined: where that was asked for.
+        cameras: residual of each camera as given, by name. miscalibrated: names of cameras that are clearly off.
+        warnings: sentences for people; about the refined rig if there is one.
+        refined: result of the refinement; None if not requested.
     """
 
     cameras: dict[str, CameraResidual]
@@ -85,10 +87,10 @@ class CalibrationReport:
 
 
 def effective_rig(rig: Rig, record: Mapping[str, Any]) -> Rig:
-    """The rig that a scene was begun with: with refined cameras where frame 0 has accepted them.
+    """Returns the rig that a scene uses: with refined cameras if frame 0 accepted a refinement.
 
     Args:
-        rig: as given, of any size, or of some of its cameras. record: of frame 0, as ``History.report`` gives it.
+        rig: as given, of any size, or some of its cameras. record: report of frame 0, as from ``History.report``.
 
     >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
     >>> pose = np.eye(4)

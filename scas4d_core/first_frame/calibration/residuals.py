@@ -1,4 +1,4 @@
-"""Epipolar residual of each camera, in pixels: how far the pictures of frame 0 are off the calibration."""
+"""Epipolar residual of each camera in pixels: how far the calibration is off in the images of frame 0."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ from scas4d_core.first_frame.calibration.report import CameraResidual
 from scas4d_core.posed_pictures import Float
 
 NEAR, FAR = 16.0, 80.0
-"""Pixels. Nearer to their epipolar lines than the first are right matches, and some wrong ones; between the two are
-wrong ones, which look alike anywhere in the picture: so many of them are taken off for each pixel."""
+"""Epipolar distances in pixels. Matches below the first are correct except for some chance matches. Matches between the
+two are wrong and uniformly distributed, so their density per pixel is subtracted."""
 MIN_INLIERS = 30
-"""Right matches of a camera, below which nothing is claimed."""
+"""Minimum number of correct matches of a camera for an estimate."""
 MIN_INLIER_SHARE = 0.5
-"""Share of the matches nearer than ``NEAR`` that have to be right: else their distances are those of chance."""
+"""Minimum share of correct matches among those nearer than ``NEAR``; otherwise the distances are due to chance."""
 MAX_RESIDUAL, MAX_TIMES_MEDIAN = 0.9, 2.0
-"""Pixels at which features were found, and times the median of the rig, above which a camera is off. Right captures
-have 0.1 to 0.6, up to 1.6 times the median; a camera turned by two pixels has 0.9 to 2.2 (docs/calibration.md)."""
+"""Residual in pixels at the size of feature detection, and multiple of the rig's median, above which a camera is off.
+Correct captures have 0.1 to 0.6, up to 1.6 times the median; a camera rotated by two pixels has 0.9 to 2.2
+(docs/calibration.md)."""
 
 
 class ResidualEstimate(NamedTuple):
-    """Distances of right matches: their median, what it is at least (two standard errors), and how many they are."""
+    """Distances of correct matches: their median, its lower bound (two standard errors), and their number."""
 
     median: float
     lower_bound: float
@@ -33,10 +34,10 @@ class ResidualEstimate(NamedTuple):
 
 
 def estimate_residual(distances: Float) -> ResidualEstimate:
-    """Median distance of right matches, the density of wrong ones taken off.
+    """Estimates the median distance of correct matches by subtracting the density of wrong ones.
 
     Args:
-        distances: [M] pixels from epipolar lines, of right and wrong matches.
+        distances: [M] epipolar distances in pixels, of correct and wrong matches.
 
     >>> right, wrong = np.linspace(0, 1, 101), np.linspace(0, 80, 81)
     >>> estimate_residual(np.concatenate([right, wrong]))
@@ -54,10 +55,11 @@ def estimate_residual(distances: Float) -> ResidualEstimate:
 
 
 def measure_residuals(matches: Matches) -> tuple[dict[str, CameraResidual], list[str]]:
-    """The residual of each camera against those that are not off themselves, by name; and the names of those off.
+    """Returns each camera's residual relative to correct cameras, by name, and the names of cameras that are off.
 
-    A camera that is off spoils the residuals of its neighbours. So the worst one is taken out, and the others are
-    measured again without it, as long as one is far worse than most. Where most are off it cannot be decided which.
+    A camera that is off increases the residuals of its neighbours. The worst camera is therefore removed, and the
+    others are measured again, while one is far worse than most. If most cameras are off, the faulty ones cannot be
+    identified.
     """
     measured = [(pair, epipolar_distances(matches, pair)) for pair in matches.pairs]
     off: list[int] = []
@@ -84,6 +86,6 @@ def measure_residuals(matches: Matches) -> tuple[dict[str, CameraResidual], list
 
 
 def _of_camera(index: int, measured: Sequence[tuple[Pair, Float]], off: Sequence[int]) -> ResidualEstimate:
-    """``estimate_residual`` a camera's matches with those cameras that are not off."""
+    """Returns ``estimate_residual`` of a camera's matches with cameras that are not off."""
     own = [distances for pair, distances in measured if index in pair and not {*pair} - {index} & {*off}]
     return estimate_residual(np.concatenate([*own, np.zeros(0)]))

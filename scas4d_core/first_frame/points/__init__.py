@@ -1,1 +1,1 @@
-"""Initial points from the pictures of one moment: triangulation, visual hull, stereo, planes."""
+"""Initial points from the images of one frame: triangulation, visual hull, stereo and planes."""

@@ -1,4 +1,4 @@
-"""Points on which cameras agree: features, stereo, the hull of the masks, and the surfaces that they support."""
+"""Points that cameras agree on: features, stereo, the visual hull, and surfaces that they support."""
 
 from __future__ import annotations
 
@@ -38,24 +38,26 @@ from scas4d_core.posed_pictures import (
 )
 
 OnProgress = Callable[[str, int, int], None]
-"""Called with a stage, the steps done and the steps in all."""
+"""Called with a stage, the completed steps and the total steps."""
 
 REFUTING_VIOLATIONS = 2
-"""Cameras looking through an unconfirmed point that refute it: one depth may be wrong."""
+"""Number of cameras seeing through an unconfirmed point that reject it; a single depth may be wrong."""
 REFUTING_MASKS = 1
-"""Masks speaking against a point that refute it: one is enough, for all masks agree on the hull behind the point."""
+"""Number of masks contradicting a point that reject it; one is sufficient, because all masks support the hull."""
 
 
 @dataclass(frozen=True, eq=False)
 class PointSearch:
-    """Settings of a search for points.
+    """Inputs and settings of a point search.
 
     Attributes:
-        labelled: views with the masks that were given, if any. views: the same, or with the silhouettes before a
-            backdrop. backdrop: true where the masks of ``views`` are those silhouettes.
-        min_views: cameras that must agree on a point. stereo: whether there is dense stereo. iterations: its rounds.
-        tracks: of features. max_points: kept at most. radius: of the rig, world units. seed: of every random choice.
-        limit: of the time of frame 0.
+        labelled: views with the given masks, if any. views: the same, or with silhouettes in front of a backdrop.
+            backdrop: whether the masks of ``views`` are such silhouettes.
+        min_views: number of cameras that must agree on a point. stereo: whether to use dense stereo. iterations: of
+            stereo.
+        tracks: of features. max_points: maximum number of points. radius: of the rig, in world units. seed: of every
+            random choice.
+        limit: time limit of frame 0.
     """
 
     labelled: Sequence[PosedPicture]
@@ -72,10 +74,10 @@ class PointSearch:
 
 
 def find_agreeing_points(search: PointSearch, on_progress: OnProgress) -> InitialPoints:
-    """Points on which ``search.min_views`` cameras agree.
+    """Finds points on which ``search.min_views`` cameras agree.
 
     Raises:
-        InitialPointsError: there is none.
+        InitialPointsError: there are none.
     """
     views, plain, min_views, seed = search.views, search.backdrop, search.min_views, search.seed
     middle = look_at_point(views)
@@ -85,7 +87,7 @@ def find_agreeing_points(search: PointSearch, on_progress: OnProgress) -> Initia
     on_progress("hull", 0, 1)
     hull = carve(views, misses=0.0 if plain else MISSES, min_views=min_views)
     supports: list[Support] = []
-    # Two cameras meet somewhere on an epipolar line by chance: of such points there are planes everywhere.
+    # Two cameras agree by chance somewhere on an epipolar line, so planes through such points are unreliable.
     if not plain and min_views > 2 and len(triangulated.positions) >= 10:
         standing = triangulated.positions[~_in_foreground(views, triangulated)]
         supports = fit_surfaces(
@@ -106,7 +108,7 @@ def find_agreeing_points(search: PointSearch, on_progress: OnProgress) -> Initia
     solid = _free_hull(hull, maps, min_views)
     walls = np.zeros((0, 3))
     if supports:
-        # One sample for about every four pixels of stereo's pictures is as dense as the thinning below needs.
+        # One sample per about four pixels of the stereo images is dense enough for the thinning below.
         stride = max(2, max(view.camera.width for view in views) // 160)
         samples = sample_surfaces(views, supports, stride, search.radius)
         samples, _ = average_per_cell(samples, 2.0 * SPACING * pixel)
@@ -117,7 +119,7 @@ def find_agreeing_points(search: PointSearch, on_progress: OnProgress) -> Initia
 
 
 def _in_foreground(views: Sequence[PosedPicture], triangulated: Triangulation) -> Bool:
-    """[P] true where most of the cameras that saw a triangulated point have it in their mask."""
+    """Returns [P] true if most cameras that saw a triangulated point have it in their mask."""
     points = triangulated.positions
     said, yes = np.zeros(len(points)), np.zeros(len(points))
     for view, seen in zip(views, triangulated.views.T, strict=True):
@@ -138,7 +140,7 @@ def _stereo(
     middle: Float,
     on_progress: OnProgress,
 ) -> list[DepthMap]:
-    """Depth maps of all pictures, halved; the search starts from hull, surfaces and triangulated points."""
+    """Returns depth maps of all downscaled images; hull, surfaces and triangulated points initialize the search."""
     views, plain = search.views, search.backdrop
     effort = plan_stereo(views, middle, search.iterations, search.limit)
     if effort is None:
@@ -160,7 +162,7 @@ def _stereo(
             depth = np.concatenate([depth, prior[prior > 0][::16]])
         if len(depth) < 10:
             depth = np.array([0.05, 2.0]) * float(np.linalg.norm(camera.centre - middle))
-        # Features do not reach the ends of the scene, a hull does.
+        # Features do not extend to the limits of the scene, but a hull does.
         low, high = (0.9, 1.1) if plain else (0.6, 1.3)
         ranges.append((low * float(np.percentile(depth, 1)), high * float(np.percentile(depth, 99))))
         if len(hull_surface):
@@ -185,7 +187,7 @@ def _stereo(
 
 
 def _free_hull(hull: VisualHull, maps: Sequence[DepthMap], min_views: int) -> Float:
-    """[P, 3] surface of the hull without the space that cameras look through."""
+    """Returns the [P, 3] surface of the hull without the space that cameras see through."""
     if len(hull.cells) == 0:
         return np.zeros((0, 3))
     solid = count_violations(maps, hull.centres, min_views, margin=0.01) < REFUTING_VIOLATIONS

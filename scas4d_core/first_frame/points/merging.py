@@ -1,4 +1,4 @@
-"""Merges candidates for initial points: thins, colours and labels them, drops those that the pictures contradict."""
+"""Merges candidate initial points: thins, colours and labels them, and drops those that the images contradict."""
 
 from __future__ import annotations
 
@@ -20,12 +20,11 @@ from scas4d_core.posed_pictures import (
 )
 
 SPACING = 1.5
-"""Distance of neighbouring points, pixels at the middle of the stage; twice that on the background."""
+"""Spacing of neighbouring points, in pixels at the scene centre; twice that on the background."""
 COLOUR_SPREAD = 0.12
-"""Median deviation of the cameras' colours (0…1) above which a point that stereo has not confirmed is in the wrong
-place."""
+"""Median deviation of the cameras' colours (0…1) above which a point that stereo has not confirmed is misplaced."""
 CROWD = 4
-"""Stereo points that the 27 cells about one must hold: true surfaces are seen by many pixels, strays by few."""
+"""Minimum number of stereo points in the 27 cells around a point: many pixels see true surfaces, few see outliers."""
 
 
 def merge_candidates(
@@ -37,20 +36,20 @@ def merge_candidates(
     stereo: bool,
     max_points: int,
 ) -> InitialPoints:
-    """Thins, colours and labels the candidates, and drops those that the pictures contradict.
+    """Thins, colours and labels the candidates, and drops those that the images contradict.
 
-    ``sources``: points that cameras agree on, points of the hull, points of fitted surfaces; a later source counts only
-    where no earlier one has a point.
+    ``sources``: points that cameras agree on, hull points, and points of fitted surfaces. A later source is used only
+    if no earlier one has a point nearby.
     """
     fine = SPACING * pixel
-    # Cameras that must see a point and agree on its colour: none once more, where stereo or features agree already;
-    # two for the hull, which all masks support; one for a wall that is known from elsewhere.
+    # Minimum number of cameras that see a point and agree on its colour: none for points that stereo or features have
+    # confirmed, two for the hull, which all masks support, and one for walls that other points support.
     needed_by = (0, 2, 1)
     points, needed = np.zeros((0, 3)), np.zeros(0, dtype=np.intp)
     for source, (candidates, views_needed) in enumerate(zip(sources, needed_by, strict=True)):
         new, sizes = average_per_cell(candidates, fine)
         if source == 0 and stereo and len(new):
-            # Features are few and checked; the hull and the walls cover those that lie near no point of stereo.
+            # Features are few and verified; hull and walls cover those that have no stereo points nearby.
             crowd = np.asarray(cKDTree(candidates).query_ball_point(new, 1.5 * fine, return_length=True))
             new = new[(crowd >= CROWD) | (sizes >= CROWD)]
         elif len(points) and len(new):
@@ -65,12 +64,12 @@ def merge_candidates(
     visible = visible_from(views, points, fine)
     foreground = labelled_share(labelled, points, visible)
     if plain:
-        # A point that projects to the plain background there lies beside an outline, and has none of its colour.
+        # A point that projects to the plain background is next to an outline, and the background is not its colour.
         for row, view in zip(visible, views, strict=True):
             column, line, _, _ = pixels_inside(view.camera, points)
             row &= np.asarray(view.mask)[line, column]
     elif foreground is not None:
-        # A person in front of a wall is no sample of the wall's colour, nor the wall of the person's.
+        # Pixels of a person in front of a wall do not show the wall's colour, and vice versa.
         for row, view in zip(visible, views, strict=True):
             if view.mask is not None:
                 column, line, _, _ = pixels_inside(view.camera, points)
@@ -98,7 +97,7 @@ def merge_candidates(
 
 
 def labelled_share(views: Sequence[PosedPicture], points: Float, visible: Bool) -> NDArray[np.float32] | None:
-    """[P] share of the cameras that may see each point whose mask holds it; None without masks."""
+    """Returns the [P] share of the cameras that may see a point whose masks contain it; None without masks."""
     said, yes = np.zeros(len(points)), np.zeros(len(points))
     for row, view in zip(visible, views, strict=True):
         if view.mask is None:
@@ -112,7 +111,7 @@ def labelled_share(views: Sequence[PosedPicture], points: Float, visible: Bool) 
 
 
 def pick_one_per_cell(points: Float, cell: float) -> NDArray[np.intp]:
-    """Index of one point for each cubic cell, the nearest to the mean of the cell's points: that spreads evenly."""
+    """Returns one point index per cubic cell, nearest to the mean of its points, for an even distribution."""
     where, count = _cells(points, cell)
     means = np.stack([np.bincount(where, points[:, axis]) for axis in range(3)], axis=-1) / count[:, None]
     order = np.lexsort((((points - means[where]) ** 2).sum(-1), where))
@@ -121,7 +120,7 @@ def pick_one_per_cell(points: Float, cell: float) -> NDArray[np.intp]:
 
 
 def average_per_cell(points: Float, cell: float) -> tuple[Float, NDArray[np.intp]]:
-    """Means [Q, 3] of the points in each cubic cell of edge ``cell``, and the number of points in each [Q]."""
+    """Returns means [Q, 3] of the points in each cubic cell with edge ``cell``, and the number of points [Q]."""
     if len(points) == 0:
         return points.reshape(-1, 3), np.zeros(0, dtype=np.intp)
     where, count = _cells(points, cell)
@@ -130,11 +129,11 @@ def average_per_cell(points: Float, cell: float) -> tuple[Float, NDArray[np.intp
 
 
 def _cells(points: Float, cell: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Index [P] of the cubic cell of each point, in the order of x, y and z, and the number of points in each cell."""
+    """Returns the cell index [P] of each point, in x, y, z order, and the number of points per cell."""
     cells = np.floor(points / cell).astype(np.int64)
     cells -= cells.min(axis=0)
     size = cells.max(axis=0) + 1
-    if float(size[0]) * float(size[1]) * float(size[2]) < 2**62:  # one number a cell sorts ten times faster than three
+    if float(size[0]) * float(size[1]) * float(size[2]) < 2**62:  # sorting one number is ten times faster than three
         cells = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
     _, where, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     return where.ravel(), count

@@ -1,8 +1,9 @@
-"""PatchMatch stereo: depth and normal of every pixel of one picture against several neighbours. Numba.
+"""PatchMatch stereo: depth and normal of every pixel of one image, matched against several neighbours. Numba.
 
-Each pixel holds a small plane; planes that match well spread to the pixels around and are refined by random steps.
-After Bleyer, Rhemann & Rother 2011 (slanted planes) and Galliani, Lasinger & Schindler 2015 (red–black order, several
-views). The match is the weighted normalized cross-correlation of COLMAP (Schönberger et al. 2016).
+Each pixel holds a small plane. Planes that match well propagate to neighbouring pixels and are refined by random
+perturbation. After Bleyer, Rhemann & Rother 2011 (slanted planes) and Galliani, Lasinger & Schindler 2015 (red–black
+order, several views). The matching cost is the weighted normalized cross-correlation of COLMAP (Schönberger et al.
+2016).
 """
 
 from __future__ import annotations
@@ -15,22 +16,22 @@ from numba import prange
 from scas4d_core.kernels.jit import inline, kernel, parallel_kernel
 
 REACH = 2
-"""Samples on either side of the centre of a patch: 5 × 5 of them,"""
+"""Number of samples on either side of the centre of a patch: 5 × 5 in total."""
 STEP = 2
-"""two pixels apart: a window of 9 pixels at the cost of 25 samples."""
+"""Spacing of the samples in pixels: a window of 9 pixels at the cost of 25 samples."""
 TEXTURE = 0.012
-"""Standard deviation of a patch (0…1), below which a match means nothing: three steps of an 8-bit picture."""
+"""Minimum standard deviation of a patch (0…1) for a meaningful match: three steps of an 8-bit image."""
 NO_MATCH = 2.0
-"""Cost of a patch that cannot be compared; the cost of one that can is 1 − NCC, between 0 and 2."""
+"""Cost of a patch that cannot be compared; otherwise the cost is 1 − NCC, between 0 and 2."""
 ROUNDED = 1e-6
-"""By how much the cost of a perfect match may be below 0, for want of digits."""
+"""Amount by which rounding may make the cost of a perfect match negative."""
 
 _SAMPLES = (2 * REACH + 1) ** 2
 
 
 @inline
 def _random(key: int, draw: int) -> float:
-    """A number in [0, 1) that depends on its arguments alone, whatever thread asks (splitmix64)."""
+    """Returns a number in [0, 1) that depends only on the arguments, not on the thread (splitmix64)."""
     z = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(draw) * np.uint64(0xD1B54A32D192ED03)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -44,16 +45,17 @@ def _cost(
     nx: float, ny: float, nz: float, inverse: Any, rays: Any, inverses: Any, others: Any, sizes: Any, shifts: Any,
     best: int, enough: float,
 ) -> float:  # fmt: skip
-    """1 − NCC, mean over the ``best`` best neighbours; NO_MATCH where fewer see the patch, or it is over ``enough``.
+    """Returns 1 − NCC, the mean over the ``best`` best neighbours.
 
-    ``rays`` [V, samples, 3]: see ``_rays``; ``inverses`` [samples]: scratch.
+    The result is NO_MATCH if fewer neighbours see the patch or the cost exceeds ``enough``. ``rays`` [V, samples, 3]:
+    see ``_rays``; ``inverses`` [samples]: scratch buffer.
     """
     rx, ry = inverse[0] * x + inverse[1], inverse[2] * y + inverse[3]
     reach = depth * (nx * rx + ny * ry + nz)  # n · X of the plane's centre
     low0, low1, low2, low3 = NO_MATCH, NO_MATCH, NO_MATCH, NO_MATCH
     if abs(reach) < 1e-9:
         return NO_MATCH
-    # Pixel (a, b) of the reference lies at the inverse depth (n · ray) / reach, linear in a and b.
+    # The inverse depth at reference pixel (a, b) is (n · ray) / reach, linear in a and b.
     k = 0
     for j in range(-REACH, REACH + 1):
         qy = inverse[2] * (y + j * STEP) + inverse[3]
@@ -68,7 +70,7 @@ def _cost(
     for v in range(count):
         t = shifts[v]
         height, width = sizes[v]
-        # Its image is M ray + T · (inverse depth), linear too (the homography of the plane).
+        # The projection is M ray + T · (inverse depth), also linear (the homography of the plane).
         sum_w, sum_i, sum_ii, sum_ri = 0.0, 0.0, 0.0, 0.0
         inside = True
         for k in range(_SAMPLES):
@@ -105,7 +107,7 @@ def _cost(
                     low2, low3 = cost, low2
                 elif cost < low3:
                     low3 = cost
-        # The rest cannot make up for what the best so far lack, were they perfect.
+        # Early exit: even with perfect remaining neighbours, the mean would exceed ``enough``.
         sure = best - (count - 1 - v)
         least = low0 if sure == 1 else low0 + low1 if sure == 2 else low0 + low1 + low2 if sure == 3 else 0.0
         if sure >= 1 and v < count - 1 and least - ROUNDED >= best * enough:
@@ -119,7 +121,7 @@ def _cost(
 
 @inline
 def _rays(x: float, y: float, inverse: Any, matrices: Any, rays: Any) -> None:
-    """Fills [V, samples, 3]: the rays of the samples about a pixel, as each neighbour's M turns them."""
+    """Fills [V, samples, 3] with the rays of the samples around a pixel, transformed by each neighbour's M."""
     for v in range(matrices.shape[0]):
         m = matrices[v]
         k = 0
@@ -134,7 +136,7 @@ def _rays(x: float, y: float, inverse: Any, matrices: Any, rays: Any) -> None:
 
 @kernel
 def _patch(image: Any, x: int, y: int, patch: Any, weight: Any) -> tuple[float, float]:
-    """Fill the samples about a pixel and their weights (near in value counts more); mean and deviation."""
+    """Fills the samples around a pixel and their bilateral weights; returns mean and standard deviation."""
     height, width = image.shape
     middle = image[y, x]
     sum_w, sum_i, sum_ii = 0.0, 0.0, 0.0
@@ -159,7 +161,7 @@ def _sweep(
     image: Any, active: Any, prior: Any, depth: Any, normal: Any, cost: Any, inverse: Any, others: Any, sizes: Any,
     matrices: Any, shifts: Any, near: float, far: float, round_: int, colour: int, best: int, seed: int,
 ) -> None:  # fmt: skip
-    """One round over the pixels of one colour of the chequerboard; round 0 only gives each pixel its first plane."""
+    """Runs one round over the pixels of one checkerboard colour; round 0 only initializes each pixel's plane."""
     height, width = image.shape
     for y in prange(height):
         patch, weight, inverses = np.empty(_SAMPLES), np.empty(_SAMPLES), np.empty(_SAMPLES)
@@ -194,7 +196,7 @@ def _sweep(
                     b = y + (span if side == 2 else -span if side == 3 else 0)
                     if a < 0 or b < 0 or a >= width or b >= height or cost[b, a] >= NO_MATCH:
                         continue
-                    # The neighbour's plane, met by this pixel's ray.
+                    # The neighbour's plane, intersected with this pixel's ray.
                     tx, ty, tz = normal[b, a, 0], normal[b, a, 1], normal[b, a, 2]
                     there = tx * (inverse[0] * (a + 0.5) + inverse[1]) + ty * (inverse[2] * (b + 0.5) + inverse[3]) + tz
                     here = tx * (inverse[0] * px + inverse[1]) + ty * (inverse[2] * py + inverse[3]) + tz
@@ -229,25 +231,25 @@ def patch_match(
     image: Any, active: Any, prior: Any, inverse: Any, others: Any, sizes: Any, matrices: Any, shifts: Any,
     *, near: float, far: float, iterations: int, best: int, seed: int,
 ) -> tuple[Any, Any, Any]:  # fmt: skip
-    """Depth of each pixel of one picture.
+    """Computes the depth of each pixel of one image.
 
     Args:
-        image: [H, W] float32 grey in 0…1.
-        active: [H, W] bool, pixels that are wanted.
-        prior: [H, W] float64 depth to try first, 0 where unknown.
+        image: [H, W] float32 grayscale in 0…1.
+        active: [H, W] bool, pixels to compute.
+        prior: [H, W] float64 depth to try first, 0 if unknown.
         inverse: [4] float64, (1/fx, −cx/fx, 1/fy, −cy/fy).
-        others: [V, H', W'] float32 neighbours' pictures, each in the upper left corner of its plane.
-        sizes: [V, 2] int64, height and width of each neighbour's picture.
-        matrices: [V, 3, 3] float64, K' R of each neighbour, R from the reference's axes.
+        others: [V, H', W'] float32 images of the neighbours, each in the upper left corner of its plane.
+        sizes: [V, 2] int64, height and width of each neighbour's image.
+        matrices: [V, 3, 3] float64, K' R of each neighbour, with R from the reference's axes.
         shifts: [V, 3] float64, K' t of each neighbour.
-        near: depth at which to begin, world units.
-        far: depth at which to end.
-        iterations: rounds.
-        best: 1 to 3, how many neighbours must match well.
-        seed: of the random planes.
+        near: minimum depth, in world units.
+        far: maximum depth.
+        iterations: number of rounds.
+        best: 1 to 3, number of neighbours that must match well.
+        seed: for the random planes.
 
     Returns:
-        depth [H, W] float64 (0 where there is none), normals [H, W, 3] in camera axes, cost [H, W] 1 − NCC.
+        depth [H, W] float64 (0 if there is none), normals [H, W, 3] in camera axes, cost [H, W] 1 − NCC.
     """
     height, width = image.shape
     depth, cost = np.zeros((height, width)), np.full((height, width), NO_MATCH)

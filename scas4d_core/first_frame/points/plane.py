@@ -1,4 +1,4 @@
-"""The plane on which pictures agree: a floor or a table that cameras see from sides too different for stereo."""
+"""The plane on which images agree: a floor or table seen from directions that differ too much for stereo."""
 
 from __future__ import annotations
 
@@ -25,37 +25,37 @@ from scas4d_core.posed_pictures import (
 Planes = NDArray[np.float32]
 
 CELLS = 48
-"""Cells along the side of the square in which a plane is looked for; it is as wide as most pictures at the middle."""
+"""Number of cells along the side of the search square, which is as wide as most images at the scene centre."""
 MAX_CELLS = 160
-"""Cells along it in which its points are taken at most."""
+"""Maximum number of cells along the side when points are sampled."""
 REACH = 1.5
-"""Farthest plane that is tried, half squares from the middle of the stage."""
+"""Maximum offset of a plane from the scene centre, in half squares."""
 OFFSETS = 37
-"""Places tried along a normal: two cells apart."""
+"""Number of offsets tried along a normal, two cells apart."""
 TILT, TILTS = 0.2, 5
-"""Largest tilt about either axis of the square, radians, and how many are tried."""
+"""Maximum tilt about either axis of the square, in radians, and number of tilts per axis."""
 ROUNDS = 6
-"""Of refinement, each in steps smaller by ``SHRINK``."""
+"""Number of refinement rounds, each with steps reduced by ``SHRINK``."""
 SHRINK = 1.7
 UNLIKE = 0.8
-"""Largest cosine between two normals that are both worth trying."""
+"""Maximum cosine between two normals that are both tried."""
 PATCH = 7
-"""Side, in cells, of the patches that are compared."""
+"""Side of the compared patches, in cells."""
 TEXTURE = 4.0
-"""Standard deviation, grey levels, below which a patch says nothing."""
+"""Minimum standard deviation, in gray levels, of a textured patch."""
 ALIKE, HALF_ALIKE = 0.6, 0.3
-"""Correlation of two cameras' patches from which they agree on a cell, and from which it counts for the plane."""
+"""Correlation of two cameras' patches above which they agree on a cell, and above which it counts for the plane."""
 PAIRS = 2
-"""Pairs of cameras that must agree on a cell, so at least three cameras."""
+"""Minimum number of camera pairs that agree on a cell, and therefore at least three cameras."""
 BEYOND_CHANCE = 1.8
-"""Agreement on a plane, as a multiple of that of mirrored pictures, which agree by chance alone: 2.2 to 4.7 where
-there is a floor or a table (six rigs), 0.9 to 1.6 where there is none (three)."""
+"""Minimum score of a plane as a multiple of the score of mirrored images, which agree only by chance. The ratio is 2.2
+to 4.7 with a floor or table (six rigs), and 0.9 to 1.6 without (three)."""
 MIN_CELLS = 40
-"""Cells on which cameras agree, for a plane to be believed."""
+"""Minimum number of agreeing cells of a valid plane."""
 MAX_VIEWS = 6
-"""Views that are compared: of more, some, evenly chosen."""
+"""Maximum number of compared views, evenly selected."""
 CLOSED = 15
-"""Cells across of a gap between agreeing cells that belongs to the plane all the same."""
+"""Width, in cells, of gaps between agreeing cells that are filled."""
 
 NO_PLANE = "images: cameras agree on no plane; start from a point cloud"
 
@@ -65,7 +65,7 @@ class Plane:
     """A square piece of a plane.
 
     Attributes:
-        middle: [3] world. normal: [3] of unit length. half: half of its side, world units.
+        middle: [3] centre in the world. normal: [3] unit vector. half: half of the side, in world units.
     """
 
     middle: Float
@@ -73,7 +73,7 @@ class Plane:
     half: float
 
     def cells(self, count: int) -> Float:
-        """[count, count, 3] centres of the cells, world.
+        """Returns the [count, count, 3] centres of the cells, in the world.
 
         >>> Plane(np.zeros(3), np.array([0.0, 0.0, 1.0]), 2.0).cells(2).shape
         (2, 2, 3)
@@ -85,21 +85,21 @@ class Plane:
 
 
 def plane_points(labelled: Sequence[PosedPicture]) -> InitialPoints:
-    """Points of the plane on which most pictures agree: its agreeing cells, and the gaps between these.
+    """Returns points of the plane on which most images agree, including small gaps between agreeing cells.
 
-    A plane is known from two angles and an offset, so it can be tried: laid on it, the pictures of cameras that stand
-    far apart show the same, undistorted (plane sweeping, Collins 1996). Patches are compared by correlation, so
-    exposures may differ.
+    A plane has only two angles and an offset, so planes can be tried exhaustively (plane sweeping, Collins 1996).
+    Projected onto the correct plane, images from very different directions look the same. Patches are compared by
+    correlation, so exposures may differ.
 
     Args:
-        labelled: views, with masks if these were given.
+        labelled: views, with masks if available.
 
     Raises:
-        InitialPointsError: pictures agree on no plane.
+        InitialPointsError: the images agree on no plane.
 
     >>> from scas4d_core.cameras import Camera
     >>> texture = np.random.default_rng(0).integers(0, 255, (100, 100, 1), np.uint8).repeat(3, axis=2)
-    >>> def looking_down(x):  # from two metres above, at the origin of a floor of tiles of six centimetres
+    >>> def looking_down(x):  # from a height of two metres, towards the origin of a floor with tiles of six centimetres
     ...     back = np.array([x, 0, 2]) / np.hypot(x, 2)
     ...     rotation = np.array([np.cross([0, 1, 0], -back), [0, 1, 0], -back])
     ...     pose = np.eye(4)
@@ -129,10 +129,10 @@ def plane_points(labelled: Sequence[PosedPicture]) -> InitialPoints:
 
 
 def agreed_plane(views: Sequence[PosedPicture]) -> Plane:
-    """The plane on which pictures agree most: level, parallel to the ring of cameras, or facing them.
+    """Returns the plane on which images agree most: horizontal, parallel to the camera ring, or facing the cameras.
 
     Raises:
-        InitialPointsError: they agree on none, or hardly more than mirrored pictures do.
+        InitialPointsError: the agreement is hardly above that of mirrored images.
     """
     candidates = [(_best(views, start), start) for start in _starts(views)]
     (score, plane), start = max(candidates, key=lambda one: one[0][0])
@@ -144,14 +144,14 @@ def agreed_plane(views: Sequence[PosedPicture]) -> Plane:
 
 
 def _agreed_cells(views: Sequence[PosedPicture], plane: Plane, count: int) -> Bool:
-    """[count, count] the cells of a plane on which enough pairs of cameras agree."""
+    """Returns [count, count] true for cells on which enough pairs of cameras agree."""
     pairs = _agreement(views, _smooth(views, plane, count), plane.cells(count)[None])[1][0]
     agreed: Bool = pairs >= min(PAIRS, len(views) - 1)
     return agreed
 
 
 def _starts(views: Sequence[PosedPicture]) -> list[Plane]:
-    """Planes through the middle of the stage about which to search, their normals unlike."""
+    """Returns start planes through the scene centre with sufficiently different normals."""
     middle = look_at_point(views)
     centres = np.array([view.camera.centre for view in views])
     up = -np.mean([view.camera.rotation[1] for view in views], axis=0)
@@ -162,7 +162,7 @@ def _starts(views: Sequence[PosedPicture]) -> list[Plane]:
     chosen: list[Plane] = []
     for normal in (up, ring, facing):
         length = float(np.linalg.norm(normal))
-        if length < 0.3:  # the cameras have no common up, or do not look in one direction
+        if length < 0.3:  # the cameras have no common up or viewing direction
             continue
         if all(abs(normal @ other.normal) < UNLIKE * length for other in chosen):
             chosen.append(Plane(middle, normal / length, half))
@@ -170,7 +170,7 @@ def _starts(views: Sequence[PosedPicture]) -> list[Plane]:
 
 
 def _best(views: Sequence[PosedPicture], start: Plane, refine: bool = True) -> tuple[float, Plane]:
-    """The score of the best plane about a start, and that plane."""
+    """Returns the score of the best plane near a start plane, and the plane."""
     smooth = _smooth(views, start, CELLS)
 
     def scores_of(moves: Float) -> Float:
@@ -196,21 +196,21 @@ def _best(views: Sequence[PosedPicture], start: Plane, refine: bool = True) -> t
 
 
 def _moved(start: Plane, move: Float) -> Plane:
-    """``start`` moved along its normal by ``move[0]`` half squares, its normal tilted by ``move[1:]``."""
+    """Returns ``start`` offset by ``move[0]`` half squares along its normal and tilted by ``move[1:]``."""
     first, second = _axes(start.normal)
     normal = start.normal + move[1] * first + move[2] * second
     return Plane(start.middle + move[0] * start.half * start.normal, normal / np.linalg.norm(normal), start.half)
 
 
 def _axes(normal: Float) -> tuple[Float, Float]:
-    """Two unit vectors across a normal and each other."""
+    """Returns two unit vectors that are orthogonal to the normal and to each other."""
     first = np.cross(normal, np.eye(3)[int(np.abs(normal).argmin())])
     first /= np.linalg.norm(first)
     return first, np.cross(normal, first)
 
 
 def _smooth(views: Sequence[PosedPicture], plane: Plane, count: int) -> list[Planes]:
-    """Grey pictures without what is finer than a cell."""
+    """Returns grayscale images, low-pass filtered to the cell size."""
     cell = 2 * plane.half / count / pixel_size_at(views, plane.middle)
     return [gaussian_filter(view.image.mean(axis=2, dtype=np.float32), max(0.5, cell / 2)) for view in views]
 
@@ -218,13 +218,13 @@ def _smooth(views: Sequence[PosedPicture], plane: Plane, count: int) -> list[Pla
 def _agreement(
     views: Sequence[PosedPicture], smooth: Sequence[Planes], points: Float
 ) -> tuple[Float, NDArray[np.intp]]:
-    """Agreement of pictures on planes.
+    """Measures the agreement of images on planes.
 
     Args:
-        points: [T, C, C, 3] cells of each plane, world.
+        points: [T, C, C, 3] cells of each plane, in the world.
 
     Returns:
-        [T] sums of correlations beyond ``HALF_ALIKE``; [T, C, C] pairs of cameras that agree on a cell.
+        [T] sums of correlations above ``HALF_ALIKE``; [T, C, C] numbers of camera pairs that agree on a cell.
     """
     laid = [_warp_to_plane(view, picture, points) for view, picture in zip(views, smooth, strict=True)]
     scores, pairs = np.zeros(len(points)), np.zeros(points.shape[:3], np.intp)
@@ -241,7 +241,7 @@ def _agreement(
 
 
 def _warp_to_plane(view: PosedPicture, picture: Planes, points: Float) -> tuple[Planes, Planes, Planes, Bool]:
-    """A picture on planes: [T, C, C] values, their means and deviations over patches, and which have texture."""
+    """Returns an image warped to planes: [T, C, C] values, patch means, patch deviations, and a texture mask."""
     uv, depth = view.camera.project(points.reshape(-1, 3))
     height, width = picture.shape
     with np.errstate(invalid="ignore"):
@@ -261,6 +261,6 @@ def _warp_to_plane(view: PosedPicture, picture: Planes, points: Float) -> tuple[
 
 
 def _box(values: Planes) -> Planes:
-    """Means over patches of each plane."""
+    """Returns the patch means of each plane."""
     means: Planes = uniform_filter(values, (1, PATCH, PATCH), mode="nearest")
     return means

@@ -1,4 +1,4 @@
-"""The backdrop of a scene, and silhouettes of what stands before it, read off the pictures alone."""
+"""The backdrop colour of a scene and the silhouettes in front of it, from the images only."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from scipy.ndimage import label
 from scas4d_core.posed_pictures import Bool, PosedPicture
 
 TOLERANCE = 8
-"""Difference from the background, of 255 in any channel, that still counts as background: above resampling and mild
-compression noise."""
+"""Difference from the background, in levels of 255 in any channel, that still counts as background: above resampling
+and mild compression noise."""
 PLAIN_BORDER = 0.95
-"""Share of the border of every picture in one colour from which the background counts as plain."""
+"""Minimum share of one colour on the border of every image for the background to count as plain."""
 SMALL_HOLE = 12
-"""Pixels: background islands up to this size inside the object are dark texture, not holes."""
+"""Maximum size, in pixels, of background islands inside an object that are dark texture and not holes."""
 
 PLAIN = 0.2
-"""Share of all pixels that have one colour, from which it is that of a plain backdrop; most cameras have half of it."""
+"""Minimum share of all pixels in one colour for a plain backdrop; most cameras must have half of it."""
 SAME = 0.05
-"""Of pixels that have exactly one colour, from which it was painted behind a rendered or cut-out thing. Rooms whose
-colours are quantized have up to 0.03."""
+"""Minimum share of pixels in exactly one colour for a synthetic background. Quantized images of rooms have up to
+0.03."""
 ALIKE = 8
-"""Levels of 255 by which the pixels of one colour may differ: noise, and the traces of JPEG."""
+"""Tolerance, in levels of 255, for pixels of one colour: noise and JPEG artefacts."""
 PIXEL_STRIDE = 4
-"""Pixels, between those that are looked at."""
+"""Spacing of the sampled pixels."""
 
 
 def _border(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -35,10 +35,10 @@ def _border(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def backdrop(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64] | None:
-    """Colour [3], in levels of 255, of a plain backdrop that a good part of the pictures shows; None where none does.
+    """Returns the colour [3], in levels of 255, of a plain backdrop in many of the images; None if there is none.
 
     Args:
-        images: [H, W, 3] each, wider and higher than ``PIXEL_STRIDE`` pixels.
+        images: [H, W, 3] each, larger than ``PIXEL_STRIDE`` pixels on both sides.
     """
     pixels = [_sampled(image) for image in images]
     everyone = np.concatenate(pixels)
@@ -54,7 +54,7 @@ def backdrop(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64] | None:
 
 
 def mean_colour(images: Sequence[NDArray[np.uint8]]) -> NDArray[np.float64]:
-    """[3] mean of all pictures, in levels of 255."""
+    """Returns the [3] mean colour of all images, in levels of 255."""
     mean: NDArray[np.float64] = np.concatenate([_sampled(image) for image in images]).mean(axis=0)
     return mean
 
@@ -68,12 +68,14 @@ def _alike(pixels: NDArray[np.uint8], colour: NDArray[np.float64], levels: int) 
 
 
 def _is_backdrop(of_it: list[Bool], share: float) -> bool:
-    """True where so many pixels are of a backdrop, and half as many in most cameras; ``of_it``: by camera."""
+    """Returns true if enough pixels show the backdrop overall, and half that share in most cameras; ``of_it``: by
+    camera.
+    """
     return bool(np.concatenate(of_it).mean() >= share and np.median([some.mean() for some in of_it]) >= share / 2)
 
 
 def plain_background(views: Sequence[PosedPicture]) -> NDArray[np.uint8] | None:
-    """Colour [3] uint8 that the borders of all pictures share; None where they do not."""
+    """Returns the colour [3] uint8 that the borders of all images share; None if they differ."""
     borders = [_border(view.image) for view in views]
     colour = np.median(np.concatenate(borders), axis=0)
     for border in borders:
@@ -85,7 +87,9 @@ def plain_background(views: Sequence[PosedPicture]) -> NDArray[np.uint8] | None:
 
 
 def silhouette(image: NDArray[np.uint8], background: NDArray[np.uint8]) -> Bool:
-    """[H, W] bool, true where the picture differs from the background or is a small island of it within the object."""
+    """Returns [H, W] true for pixels that differ from the background, and for small background islands inside the
+    object.
+    """
     other = np.abs(image.astype(np.int16) - background.astype(np.int16)).max(axis=-1) > TOLERANCE
     islands, count = label(~other)
     sizes = np.bincount(islands.ravel(), minlength=count + 1)
@@ -96,5 +100,5 @@ def silhouette(image: NDArray[np.uint8], background: NDArray[np.uint8]) -> Bool:
 
 
 def with_silhouettes(views: Sequence[PosedPicture], background: NDArray[np.uint8]) -> list[PosedPicture]:
-    """The views with the silhouette as their mask."""
+    """Returns the views with silhouettes as their masks."""
     return [replace(view, mask=silhouette(view.image, background)) for view in views]

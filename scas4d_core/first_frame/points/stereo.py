@@ -1,4 +1,4 @@
-"""Dense points by stereo, kept only where the depths of several cameras meet and no camera looks through them."""
+"""Dense stereo points, kept only if the depths of several cameras agree and few cameras see through them."""
 
 from __future__ import annotations
 
@@ -15,35 +15,37 @@ from scas4d_core.first_frame.time_limit import STEREO, TimeLimit
 from scas4d_core.posed_pictures import Bool, Float, PosedPicture, halved, pixels_inside
 
 WIDTH = 320
-"""Pixels: wider pictures are halved until they are not."""
+"""Maximum image width, in pixels; wider images are halved repeatedly."""
 PACE_WIDTH = 80
-"""The same of those on which the pace is measured: a thirtieth of the work on one picture."""
+"""Image width for measuring the pace: a thirtieth of the work on one image."""
 PLANES_FIRST, PLANES_EACH = 3, 12
-"""Planes that each pixel tries at first, and in a round (``patch_match``)."""
+"""Number of planes that each pixel tries initially and in each round (``patch_match``)."""
 NEIGHBOURS = 4
-"""Other cameras that each picture is compared with."""
+"""Number of other cameras that each image is compared with."""
 MIN_NEIGHBOURS = 2
-"""A picture with fewer of them is compared with none: a match in a single one is often wrong."""
+"""Minimum number of neighbours of an image; a match in a single one is often wrong."""
 ITERATIONS = 4
-"""Rounds of propagation and refinement."""
+"""Number of rounds of propagation and refinement."""
 MAX_COST = 0.35
-"""1 − NCC of a match that is believed (before the cameras are compared)."""
+"""Maximum cost 1 − NCC of an accepted match, before cameras are compared."""
 REPROJECTION = 1.0
-"""Pixels from a point to where another camera's depth sends it back."""
+"""Maximum reprojection error, in pixels, of a point via another camera's depth."""
 DEPTH_AGREEMENT = 0.01
-"""Relative difference of two cameras' depths of one point."""
+"""Maximum relative difference between two cameras' depths of one point."""
 MIN_ANGLE_DEG, MAX_ANGLE_DEG = 4.0, 50.0
-"""Between the axes' rays to the middle of the scene: below, depth is vague; above, patches look different."""
+"""Limits on the angle between two cameras' rays to the scene centre: below, depth is uncertain; above, patches look
+different.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """Depths of one picture by stereo.
+    """Stereo depths of one image.
 
     Attributes:
-        view: camera and picture, at the size that stereo worked at.
-        depth: [H, W] along z, world units, 0 where unknown.
-        agreeing: [H, W] other cameras whose depth agrees.
+        view: camera and image, at the size used for stereo.
+        depth: [H, W] along z, in world units, 0 if unknown.
+        agreeing: [H, W] number of other cameras whose depth agrees.
     """
 
     view: PosedPicture
@@ -51,24 +53,24 @@ class DepthMap:
     agreeing: NDArray[np.intp]
 
     def trusted(self, others: int) -> Float:
-        """The depth where at least ``others`` other cameras agree, else 0."""
+        """Returns the depth at pixels on which at least ``others`` other cameras agree, and 0 elsewhere."""
         result: Float = np.where(self.agreeing >= others, self.depth, 0.0)
         return result
 
 
 @dataclass(frozen=True)
 class StereoBudget:
-    """Effort of stereo: pictures no wider than ``width`` pixels, and rounds of propagation and refinement."""
+    """Effort of stereo: maximum image width in pixels, and rounds of propagation and refinement."""
 
     width: int
     iterations: int
 
 
 def plan_stereo(views: Sequence[PosedPicture], middle: Float, iterations: int, limit: TimeLimit) -> StereoBudget | None:
-    """The effort that there is time for, by the pace on pictures of a few pixels; None: not even for the least.
+    """Selects the effort that the time allows, from the pace on tiny images; None if there is no time for stereo.
 
     Args:
-        views: at full size. middle: see ``depth_maps``. iterations: wanted. limit: of the time of frame 0.
+        views: at full size. middle: see ``depth_maps``. iterations: requested rounds. limit: time limit of frame 0.
     """
     efforts = [
         StereoBudget(width, rounds) for width in (WIDTH, WIDTH // 2) for rounds in (iterations, -(-iterations // 2))
@@ -101,7 +103,7 @@ def plan_stereo(views: Sequence[PosedPicture], middle: Float, iterations: int, l
 
 
 def load_stereo() -> None:
-    """Loads the kernel, or compiles it where nobody has: in seconds that are no measure of the pace."""
+    """Loads or compiles the kernel, so that this time does not distort the measured pace."""
     grey, planes = np.zeros((16, 16), np.float32), np.zeros((1, 16, 16), np.float32)
     patch_match(
         grey, np.ones((16, 16), bool), np.zeros((16, 16)), np.ones(4), planes, np.full((1, 2), 16), np.eye(3)[None],
@@ -110,7 +112,7 @@ def load_stereo() -> None:
 
 
 def _pixels(view: PosedPicture, width: int) -> int:
-    """Pixels of a view once it is ``halved``."""
+    """Returns the number of pixels of a view after ``halved``."""
     columns, rows = view.camera.width, view.camera.height
     while columns > width:
         columns, rows = columns // 2, rows // 2
@@ -118,7 +120,7 @@ def _pixels(view: PosedPicture, width: int) -> int:
 
 
 def neighbours_of(views: Sequence[PosedPicture], index: int, middle: Float, count: int) -> list[int]:
-    """Indices of the views to compare one with: nearest in angle about ``middle`` [3], but not too near."""
+    """Returns the views to compare one with: nearest in angle about ``middle`` [3], above a minimum angle."""
     rays = np.array([view.camera.centre - middle for view in views])
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
     angle = np.degrees(np.arccos(np.clip(rays @ rays[index], -1, 1)))
@@ -139,18 +141,18 @@ def depth_maps(
     fewest: int = MIN_NEIGHBOURS,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[DepthMap]:
-    """PatchMatch of every view against its neighbours, then the comparison of all depths.
+    """Runs PatchMatch on every view with its neighbours, then compares all depths.
 
     Args:
-        views: all of one size or not; see ``halved``.
-        ranges: (near, far) of each view, world units.
-        priors: [H, W] depth of each view to try first, 0 where unknown.
-        active: [H, W] pixels wanted of each view.
-        middle: [3] about which angles between cameras are measured.
+        views: of equal or different sizes; see ``halved``.
+        ranges: (near, far) of each view, in world units.
+        priors: [H, W] depth of each view to try first, 0 if unknown.
+        active: [H, W] pixels to compute in each view.
+        middle: [3] scene centre, about which angles between cameras are measured.
         iterations: rounds of PatchMatch.
-        seed: of the random planes.
-        hull: of the masks: depths of masked pixels that lie outside it are false.
-        fewest: neighbours that a picture needs.
+        seed: for the random planes.
+        hull: of the masks; depths of masked pixels outside of it are rejected.
+        fewest: minimum number of neighbours of an image.
         progress: called with (views done, views).
     """
     greys = [_grey(view) for view in views]
@@ -167,7 +169,7 @@ def depth_maps(
 
 
 def _grey(view: PosedPicture) -> NDArray[np.float32]:
-    """[H, W] luma in 0…1."""
+    """Returns [H, W] luma in 0…1."""
     weights = np.array([0.299, 0.587, 0.114], np.float32)
     return np.ascontiguousarray(view.image.astype(np.float32) @ weights / np.float32(255))
 
@@ -184,7 +186,7 @@ def _match(
     fewest: int,
     seed: int,
 ) -> Float:
-    """[H, W] depth of one view by its match with its neighbours, 0 where none is believed; see ``depth_maps``."""
+    """Returns the [H, W] depth of one view, 0 for unreliable matches; see ``depth_maps``."""
     chosen = neighbours_of(views, index, middle, NEIGHBOURS)
     camera = views[index].camera
     if len(chosen) < fewest:
@@ -213,7 +215,7 @@ def _match(
 
 
 def _pad_pictures(pictures: Sequence[NDArray[np.float32]]) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Pictures as planes [V, H, W] of the largest size, each in the upper left corner, and their sizes [V, 2]."""
+    """Pads images to planes [V, H, W] of the largest size, each in the upper left corner; also returns sizes [V, 2]."""
     sizes = np.array([picture.shape for picture in pictures], np.int64)
     planes = np.zeros((len(pictures), *sizes.max(axis=0)), np.float32)
     for plane, picture in zip(planes, pictures, strict=True):
@@ -222,7 +224,7 @@ def _pad_pictures(pictures: Sequence[NDArray[np.float32]]) -> tuple[NDArray[np.f
 
 
 def _confine(view: PosedPicture, depth: Float, hull: VisualHull) -> None:
-    """Clears, in place, the depths of masked pixels that lie off the hull: there is no foreground."""
+    """Clears, in place, depths of masked pixels that are not near the hull, because no foreground is there."""
     rows, columns = np.nonzero((depth > 0) & np.asarray(view.mask))
     if len(rows) == 0:
         return
@@ -232,7 +234,7 @@ def _confine(view: PosedPicture, depth: Float, hull: VisualHull) -> None:
 
 
 def _agreement(views: Sequence[PosedPicture], depths: Sequence[Float], index: int) -> NDArray[np.intp]:
-    """[H, W] number of other cameras whose depth sends a pixel's point back to it."""
+    """Returns the [H, W] number of other cameras whose depth maps a pixel's point back to it."""
     camera, depth = views[index].camera, depths[index]
     rows, columns = np.nonzero(depth > 0)
     uv = np.stack([columns + 0.5, rows + 0.5], axis=-1)
@@ -254,10 +256,10 @@ def _agreement(views: Sequence[PosedPicture], depths: Sequence[Float], index: in
 
 
 def fused_points(maps: Sequence[DepthMap], min_views: int, max_violations: float = 0.5) -> Float:
-    """[P, 3] points of all depth maps on which ``min_views`` cameras agree and through which few look.
+    """Returns [P, 3] points of all depth maps on which ``min_views`` cameras agree and that few see through.
 
-    A camera whose trusted depth lies clearly behind a point looks through it. A point is a floater if the cameras that
-    look through it are more than ``max_violations`` times those that agree on it (after Merrell et al. 2007).
+    A camera sees through a point if its trusted depth is clearly behind the point. A point is a floater if the cameras
+    that see through it are more than ``max_violations`` times those that agree on it (after Merrell et al. 2007).
     """
     fused = [np.zeros((0, 3))]
     for index, one in enumerate(maps):
@@ -272,9 +274,10 @@ def fused_points(maps: Sequence[DepthMap], min_views: int, max_violations: float
 def count_violations(
     maps: Sequence[DepthMap], points: Float, min_views: int, margin: float = 0.03, skip: int = -1
 ) -> NDArray[np.intp]:
-    """[P] cameras whose trusted depth lies more than ``margin`` (relative) behind each point [P, 3].
+    """Returns the [P] number of cameras whose trusted depth is more than ``margin`` (relative) behind each point [P,
+    3].
 
-    All 3 × 3 pixels about the point must say so: at an outline, the pixel beside it looks past the point.
+    All 3 × 3 pixels around the point must agree, because at an outline the adjacent pixel sees past the point.
     """
     through = np.zeros(len(points), dtype=np.intp)
     for index, one in enumerate(maps):

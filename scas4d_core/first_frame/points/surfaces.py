@@ -1,7 +1,7 @@
-"""Large smooth surfaces (walls, floors, domes) as planes and spheres, where the triangulated points support them.
+"""Large smooth surfaces (walls, floors, domes) as planes and spheres that triangulated points support.
 
-Smooth walls give few features, and stereo on them finds floaters. A plane or sphere through many triangulated points
-gives the wall between them. Fitted by RANSAC (Fischler & Bolles 1981), refined by least squares.
+Smooth walls have few features, and stereo produces floaters on them. A plane or sphere through many triangulated points
+gives the wall between them. The fit uses RANSAC (Fischler & Bolles 1981), refined by least squares.
 """
 
 from __future__ import annotations
@@ -17,55 +17,55 @@ from scipy.spatial import cKDTree
 from scas4d_core.posed_pictures import Bool, Float, PosedPicture
 
 MAX_SURFACES = 3
-"""Planes and spheres fitted to the triangulated points: walls, floor and a dome are rarely more."""
+"""Maximum number of planes and spheres; walls, floor and a dome are rarely more."""
 TOLERANCE = 0.012
-"""Distance of an inlier from a fitted surface, in radii of the rig."""
+"""Maximum distance of an inlier from a fitted surface, in rig radii."""
 TRIALS = 1500
 MIN_SHARE = 0.1
-"""Share of the triangulated points that a surface must explain."""
+"""Minimum share of the triangulated points that a surface explains."""
 MIN_INLIERS = 30
 CAMERA_SLACK = 1.25
-"""A dome holds all cameras within this many radii: they are often mounted in it."""
+"""Maximum distance of a camera from the centre of a dome, in dome radii; cameras are often mounted in it."""
 MAX_BEHIND = 0.15
-"""Share of the triangulated points that may lie behind a surface: a wall of a room has next to nothing behind it."""
+"""Maximum share of the triangulated points behind a surface; almost nothing is behind a wall of a room."""
 MAX_RADIUS = 2.0
-"""Radius of a dome in radii of the rig; a larger one is a wall, and a plane says that with less freedom."""
+"""Maximum radius of a dome, in rig radii; a larger one is a wall, which a plane describes with fewer parameters."""
 GAP_PLANE = 0.5
 GAP_SPHERE = 1.5
-"""Radii of the rig from a sample of the surface to the nearest triangulated point on it, at most."""
+"""Maximum distance, in rig radii, from a surface sample to the nearest triangulated point on the surface."""
 
 
 class Surface(Protocol):
-    """A surface seen from within the room it bounds."""
+    """A surface seen from inside the room that it bounds."""
 
     def offsets(self, points: Float) -> Float:
-        """[P] signed distance of points [P, 3] along ``normals``."""
+        """Returns the [P] signed distances of points [P, 3] along ``normals``."""
 
     def normals(self, points: Float) -> Float:
-        """[P, 3] unit normals where the points are nearest."""
+        """Returns [P, 3] unit normals at the nearest surface points."""
 
     def hit(self, origin: Float, directions: Float) -> Float:
-        """[R] ray parameter at which rays meet the surface from within the room; infinity where they do not."""
+        """Returns the [R] ray parameters of the intersections from inside the room; infinity if there is none."""
 
 
 @dataclass(frozen=True, eq=False)
 class PatchPlane:
-    """normal · x = offset, |normal| = 1."""
+    """A plane normal · x = offset with |normal| = 1."""
 
     normal: Float
     offset: float
 
     def offsets(self, points: Float) -> Float:
-        """[P] signed distance."""
+        """Returns the [P] signed distances."""
         result: Float = points @ self.normal - self.offset
         return result
 
     def normals(self, points: Float) -> Float:
-        """[P, 3] the normal."""
+        """Returns the normal for each point, [P, 3]."""
         return np.broadcast_to(self.normal, points.shape)
 
     def hit(self, origin: Float, directions: Float) -> Float:
-        """[R] ray parameter, infinity where the ray leads away."""
+        """Returns the [R] ray parameters; infinity if the ray points away."""
         with np.errstate(divide="ignore", invalid="ignore"):
             along = (self.offset - origin @ self.normal) / (directions @ self.normal)
         result: Float = np.where(along > 0, along, np.inf)
@@ -74,24 +74,24 @@ class PatchPlane:
 
 @dataclass(frozen=True, eq=False)
 class Sphere:
-    """A dome about the cameras; rays meet its far side."""
+    """A dome around the cameras; rays intersect its far side."""
 
     centre: Float
     radius: float
 
     def offsets(self, points: Float) -> Float:
-        """[P] signed distance, positive outside."""
+        """Returns the [P] signed distances, positive outside."""
         result: Float = np.linalg.norm(points - self.centre, axis=-1) - self.radius
         return result
 
     def normals(self, points: Float) -> Float:
-        """[P, 3] outward."""
+        """Returns the [P, 3] outward normals."""
         outward = points - self.centre
         result: Float = outward / np.maximum(np.linalg.norm(outward, axis=-1, keepdims=True), 1e-12)
         return result
 
     def hit(self, origin: Float, directions: Float) -> Float:
-        """[R] ray parameter of the far hit, infinity where the ray passes by."""
+        """Returns the [R] ray parameters of the far intersections; infinity if the ray misses the sphere."""
         offset = origin - self.centre
         a = (directions**2).sum(-1)
         b = directions @ offset
@@ -104,14 +104,14 @@ class Sphere:
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """A surface and the points [S, 3] that lie on it."""
+    """A surface and its inlier points [S, 3]."""
 
     surface: Surface
     points: Float
 
 
 def fit_plane(points: Float) -> PatchPlane | None:
-    """Least-squares plane of points [P, 3], P ≥ 3; None where they are collinear."""
+    """Returns the least-squares plane of points [P, 3], P ≥ 3; None if they are collinear."""
     middle = points.mean(0)
     _, values, axes = np.linalg.svd(points - middle, full_matrices=False)
     if len(points) < 3 or values[1] < 1e-9 * max(values[0], 1e-300):
@@ -121,7 +121,10 @@ def fit_plane(points: Float) -> PatchPlane | None:
 
 
 def fit_sphere(points: Float) -> Sphere | None:
-    """Sphere of points [P, 3], P ≥ 4: |x|² = 2 x·c + (r² − |c|²), linear in c; None where they are coplanar."""
+    """Returns the sphere of points [P, 3], P ≥ 4; None if they are coplanar.
+
+    It solves |x|² = 2 x·c + (r² − |c|²), which is linear in c.
+    """
     middle = points.mean(0)
     local = points - middle
     matrix = np.hstack([2.0 * local, np.ones((len(points), 1))])
@@ -135,14 +138,14 @@ def fit_sphere(points: Float) -> Sphere | None:
 def fit_surfaces(
     points: Float, centres: Float, tolerance: float, *, most: int = MAX_SURFACES, seed: int = 0
 ) -> list[Support]:
-    """Planes and spheres that bound the room of the cameras, the best supported first.
+    """Returns planes and spheres that bound the cameras' room, with the best supported first.
 
     Args:
-        points: [P, 3] triangulated, without the foreground where it is known.
+        points: [P, 3] triangulated, without the foreground if it is known.
         centres: [V, 3] camera centres: all on one side of a plane, all within ``CAMERA_SLACK`` radii of a sphere.
-        tolerance: distance of an inlier, world units.
-        most: surfaces at most.
-        seed: of the samples.
+        tolerance: maximum distance of an inlier, in world units.
+        most: maximum number of surfaces.
+        seed: for the RANSAC samples.
     """
     rng = np.random.default_rng(seed)
     rest = points
@@ -172,13 +175,13 @@ def fit_surfaces(
         if on.sum() < needed:
             break
         supports.append(Support(best, rest[on]))
-        # Points close to a surface that was found support no second one beside it.
+        # Points close to this surface must not support a second, nearly identical one.
         rest = rest[np.abs(best.offsets(rest)) > 2.0 * tolerance]
     return supports
 
 
 def _bounds(surface: Surface, points: Float, centres: Float, tolerance: float) -> bool:
-    """True where the cameras are on one side of the surface and nearly all the points on the same."""
+    """Returns true if the cameras and nearly all points are on the same side of the surface."""
     cameras, behind = surface.offsets(centres), surface.offsets(points)
     if isinstance(surface, Sphere):
         reach = np.linalg.norm(centres - surface.centre, axis=1).max()
@@ -215,10 +218,10 @@ def _refined(surface: Surface, near: Float, tolerance: float) -> Surface | None:
 
 
 def surface_depth(view: PosedPicture, supports: Sequence[Support], uv: Float) -> tuple[Float, Float]:
-    """First intersections of the rays through pixels [R, 2] with the surfaces.
+    """Returns the first intersections of the rays through pixels [R, 2] with the surfaces.
 
     Returns:
-        points [R, 3] (NaN where no surface is met) and depths along z [R] (infinity there).
+        points [R, 3] (NaN if there is no intersection) and depths along z [R] (infinity in this case).
     """
     camera = view.camera
     ones = np.ones(len(uv))
@@ -233,14 +236,14 @@ def surface_depth(view: PosedPicture, supports: Sequence[Support], uv: Float) ->
 
 
 def sample_surfaces(views: Sequence[PosedPicture], supports: Sequence[Support], stride: int, scale: float) -> Float:
-    """[P, 3] points of the surfaces that the cameras see, one for each ``stride``-th pixel outside the masks.
+    """Returns [P, 3] surface points that the cameras see, one per ``stride``-th pixel outside the masks.
 
     Args:
-        views: of the cameras; masked pixels show something else.
+        views: of the cameras; masked pixels show other objects.
         supports: fitted surfaces.
-        stride: pixels.
-        scale: radius of the rig: samples far from every triangulated point of the surface (``GAP_…``) are left out,
-            unless they lie within a dome that was found.
+        stride: in pixels.
+        scale: radius of the rig. Samples far from every triangulated point of the surface (``GAP_…``) are left out,
+            unless they lie within a fitted dome.
     """
     if not supports:
         return np.zeros((0, 3))
@@ -273,16 +276,17 @@ def sample_surfaces(views: Sequence[PosedPicture], supports: Sequence[Support], 
 
 
 def snap_to_points(points: Float, supports: Sequence[Support], seen: Float, reach: float) -> Float:
-    """Moves samples along the normal of their surface to the measured points about them.
+    """Moves samples along the surface normal to the measured points around them.
 
-    A dome is made of panels and a floor is not quite flat: the measured offsets are averaged over the neighbours of
+    Domes consist of panels, and floors are not quite flat. The measured offsets are averaged over the neighbours of
     each sample, with the fitted surface itself as one more measurement.
 
     Args:
         points: [P, 3] on the surfaces.
         supports: fitted surfaces.
         seen: [M, 3] measured points.
-        reach: world units; measured points farther from the sample count little; farther from the surface, not at all.
+        reach: in world units; measured points farther from the sample have little weight, and points farther from the
+            surface have none.
     """
     if len(points) == 0 or len(seen) == 0:
         return points

@@ -1,4 +1,4 @@
-"""Surroundings: what each camera sees beyond the stage, painted far behind it."""
+"""Surroundings: the image content beyond the scene, placed far behind it as coloured points."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from scas4d_core.captures.frame import InitialPoints
 from scas4d_core.posed_pictures import Bool, Float, PosedPicture, look_at_point
 
 ACROSS = 40
-"""Points along the longer side of a picture; the fit refines them."""
+"""Number of points along the longer side of an image; the fit refines them."""
 BEHIND = 2.0
-"""Distance at which they lie behind the middle of the stage, times the largest distance of a camera to the middle."""
+"""Distance of the points behind the scene centre, relative to the largest distance of a camera from the centre."""
 STAGE = 1.5
-"""Radius of the stage, times the same distance: all cameras and what they share lie within, surroundings beyond."""
+"""Radius of the stage relative to the same distance; it contains all cameras and the shared volume."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """The ball that holds the cameras and what they share.
+    """The ball that contains the cameras and the shared volume.
 
     Attributes:
-        middle: [3] world. radius: world units.
+        middle: [3] centre in the world. radius: in world units.
     """
 
     middle: Float
@@ -32,11 +32,11 @@ class Stage:
 
     @classmethod
     def of(cls, views: Sequence[PosedPicture], distances: Sequence[float]) -> Stage:
-        """Of cameras with these distances to what they look at, world units."""
+        """Returns the stage of cameras with the given distances to what they look at, in world units."""
         return cls(look_at_point(views), STAGE * max(distances))
 
     def holds(self, points: NDArray[np.floating]) -> Bool:
-        """[P] which points [P, 3] are on the stage.
+        """Returns [P] true for points [P, 3] on the stage.
 
         >>> Stage(np.zeros(3), 2.0).holds(np.array([[1.0, 0, 0], [3.0, 0, 0]]))
         array([ True, False])
@@ -46,18 +46,18 @@ class Stage:
 
 
 def surroundings(views: Sequence[PosedPicture], distances: Sequence[float]) -> InitialPoints:
-    """Points far behind the stage, on the rays of each camera's own pixels.
+    """Returns points far behind the scene on the rays of each camera's pixels.
 
-    Where a few cameras stand far apart, most of what one sees no other does: walls, and the room behind. Its depth
-    is not known. Near by it would hide the stage from the other cameras; so far off hardly another camera has it in
-    its picture, and one that has sees it as a backdrop.
+    If a few cameras are far apart, most of what one camera sees is invisible to the others, such as walls and the room
+    behind. Its depth is unknown. Nearby points would hide the scene from the other cameras. Points this far away are
+    rarely in another camera's image, and look like a backdrop if they are.
 
     Args:
-        views: with pictures; pixels in a mask show the stage, and get no point.
-        distances: of each camera to the middle of the stage, world units.
+        views: with images; masked pixels show the scene and get no point.
+        distances: of each camera to the scene centre, in world units.
 
     Returns:
-        Points with their pixel's colour; with masks they are labelled as background.
+        Points with the colours of their pixels; labelled as background if there are masks.
 
     >>> from scas4d_core.cameras import Camera
     >>> camera = Camera("a", np.array([[40.0, 0, 20], [0, 40, 20], [0, 0, 1]]), np.eye(4), 40, 40)

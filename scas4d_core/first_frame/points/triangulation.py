@@ -1,7 +1,7 @@
 """Triangulates SIFT features that several calibrated cameras see (known poses, pycolmap).
 
-The poses are known, so matches are searched along their epipolar line only: far fewer wrong candidates pass the ratio
-test than in a search over the whole picture, and wide baselines keep their matches.
+Because the poses are known, matches are searched only along epipolar lines. Compared with a search over the whole
+image, far fewer wrong candidates pass the ratio test, and wide baselines keep their matches.
 """
 
 from __future__ import annotations
@@ -20,30 +20,30 @@ from scas4d_core.first_frame.time_limit import FEATURES, MATCHES, TimeLimit
 from scas4d_core.posed_pictures import Bool, Float, PosedPicture, halved
 
 RATIO = 0.8
-"""Best over second-best descriptor distance among the candidates on the epipolar line (Lowe 2004, section 7.1)."""
+"""Maximum ratio of best to second-best descriptor distance on the epipolar line (Lowe 2004, section 7.1)."""
 MAX_DESCRIPTOR_DISTANCE = 0.7
-"""COLMAP's bound on the distance of two unit descriptors."""
+"""COLMAP's maximum distance between two unit descriptors."""
 MAX_FEATURES = 4096
-"""SIFT features a picture; matching costs their product for each pair."""
+"""Maximum number of SIFT features per image; matching a pair costs the product of their numbers."""
 EPIPOLAR_ERROR = 2.0
-"""Pixels that a match may lie off its epipolar line, and the bound of the reprojection error; residuals of a
-calibration are near 0.5."""
+"""Maximum epipolar distance of a match and maximum reprojection error, in pixels; calibration residuals are near
+0.5."""
 FEW_PAIRS = 10
-"""Pairs of pictures that are matched in any case, and by which the pace is measured."""
+"""Minimum number of matched image pairs, which also measure the pace."""
 FAINT_CONTRAST = 0.0017
-"""A quarter of COLMAP's: smooth walls have little, and the known poses throw wrong matches out."""
+"""A quarter of COLMAP's threshold: smooth walls have low contrast, and known poses reject wrong matches."""
 MIN_ANGLE_DEG = 2.0
-"""Rays that meet under less say little about depth."""
+"""Minimum triangulation angle; rays at smaller angles hardly determine depth."""
 
 
 @dataclass(frozen=True, eq=False)
 class Triangulation:
-    """Triangulated points, and the views that saw them.
+    """Triangulated points and the views that see them.
 
     Attributes:
-        positions: [P, 3] float64 world.
+        positions: [P, 3] float64 in the world.
         views: [P, V] bool, the inlier views of each point.
-        error: [P] mean reprojection error, pixels.
+        error: [P] mean reprojection error in pixels.
     """
 
     positions: Float
@@ -58,11 +58,11 @@ def extract_features(
     most: int = MAX_FEATURES,
     contrast: float = FAINT_CONTRAST,
 ) -> list[tuple[Float, NDArray[np.float32]]]:
-    """SIFT of every view: keypoints [K, 2] (pixel centres at +0.5, as in COLMAP) and unit descriptors [K, 128].
+    """Extracts SIFT keypoints [K, 2] (pixel centres at +0.5, as in COLMAP) and unit descriptors [K, 128] of every view.
 
     Args:
-        limit: of the time of frame 0; where it is short, features of all pictures are those of half or less their size.
-        most: features a picture, the largest. contrast: least difference of Gaussians, pictures in 0…1.
+        limit: time limit of frame 0; if time is short, the images are downscaled to a half or less.
+        most: maximum features per image, largest first. contrast: minimum difference of Gaussians, for images in 0…1.
     """
     import pycolmap
 
@@ -72,7 +72,7 @@ def extract_features(
     options.sift.max_num_features = most
     options.sift.peak_threshold = contrast
     level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = max(level, 1)  # COLMAP logs a line for each picture otherwise
+    pycolmap.logging.minloglevel = max(level, 1)  # otherwise COLMAP logs a line per image
     try:
         sift = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
         return _all_features(views, sift.extract_from_float32_array, limit or TimeLimit(None))
@@ -83,7 +83,7 @@ def extract_features(
 def _all_features(
     views: Sequence[PosedPicture], extract: Callable[[NDArray[np.float32]], Any], limit: TimeLimit
 ) -> list[tuple[Float, NDArray[np.float32]]]:
-    """``extract_features`` by a function that takes grey pictures; the first picture measures the pace."""
+    """Runs ``extract_features`` with a function for grayscale images; the first image measures the pace."""
     features_by_view: list[tuple[Float, NDArray[np.float32]]] = []
     size, began, divisor = [view.camera.width * view.camera.height for view in views], limit.clock(), 1
     for view in views:
@@ -101,7 +101,7 @@ def _all_features(
 def _features(
     view: PosedPicture, extract: Callable[[NDArray[np.float32]], Any], divisor: int
 ) -> tuple[Float, NDArray[np.float32]]:
-    """Features of a view, of a size of 1/``divisor``; a power of two."""
+    """Returns the features of a view, downscaled by ``divisor``, which is a power of two."""
     image = view.image if divisor == 1 else halved(view, -(-view.camera.width // divisor)).image
     grey = image.astype(np.float32) @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
     keypoints, raw = extract(np.ascontiguousarray(grey / np.float32(255)))
@@ -111,7 +111,7 @@ def _features(
 
 
 def fundamental_matrix(first: Camera, second: Camera) -> Float:
-    """[3, 3] F with x₂ᵀ F x₁ = 0 for pixels x₁, x₂ (Hartley & Zisserman 2004, equation 9.1 with known poses)."""
+    """Returns [3, 3] F with x₂ᵀ F x₁ = 0 for pixels x₁, x₂ (Hartley & Zisserman 2004, equation 9.1)."""
     rotation = second.rotation @ first.rotation.T
     x, y, z = second.translation - rotation @ first.translation
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -123,7 +123,7 @@ def guided_matches(
     first: tuple[Camera, Float, NDArray[np.float32]],
     second: tuple[Camera, Float, NDArray[np.float32]],
 ) -> NDArray[np.intp]:
-    """[M, 2] mutually best pairs of features within ``EPIPOLAR_ERROR`` pixels of each other's epipolar lines."""
+    """Returns [M, 2] mutual best matches of features within ``EPIPOLAR_ERROR`` pixels of the epipolar lines."""
     (camera_a, uv_a, descriptors_a), (camera_b, uv_b, descriptors_b) = first, second
     if len(uv_a) == 0 or len(uv_b) == 0:
         return np.zeros((0, 2), dtype=np.intp)
@@ -139,18 +139,18 @@ def guided_matches(
 
 
 def descriptor_distances(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.float32]:
-    """[A, B] distances of unit descriptors."""
+    """Returns the [A, B] distances between unit descriptors."""
     distances: NDArray[np.float32] = np.sqrt(np.maximum(2.0 - 2.0 * (first @ second.T), 0.0))
     return distances
 
 
 def mutual_best(distance: NDArray[np.float32]) -> NDArray[np.intp]:
-    """[M, 2] rows and columns that are each other's nearest, and much nearer than any other (Lowe's ratio).
+    """Returns [M, 2] rows and columns of mutual nearest neighbours that pass Lowe's ratio test.
 
     Args:
-        distance: [A, B] of descriptors; neither A nor B is 0.
+        distance: [A, B] between descriptors; A and B are at least 1.
 
-    >>> mutual_best(np.float32([[0.1, 0.6, 0.6], [0.6, 0.5, 0.51]])).tolist()  # the second row has two alike
+    >>> mutual_best(np.float32([[0.1, 0.6, 0.6], [0.6, 0.5, 0.51]])).tolist()  # the second row is ambiguous
     [[0, 0]]
     """
     best_b, best_a = distance.argmin(1), distance.argmin(0)
@@ -160,7 +160,7 @@ def mutual_best(distance: NDArray[np.float32]) -> NDArray[np.intp]:
     def runner_up(block: NDArray[np.float32]) -> NDArray[np.float32]:
         return np.partition(block, 1, axis=1)[:, 1] if block.shape[1] > 1 else np.full(len(block), 2.0, np.float32)
 
-    # Few features have a mutual partner, and only of these the second best is asked for.
+    # Few features have a mutual partner, so the second best is computed only for these.
     good = np.flatnonzero((best_a[best_b] == rows) & (value < MAX_DESCRIPTOR_DISTANCE))
     good = good[value[good] < RATIO * runner_up(distance[good])]
     good = good[value[good] < RATIO * runner_up(distance[:, best_b[good]].T)]
@@ -169,10 +169,10 @@ def mutual_best(distance: NDArray[np.float32]) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, eq=False)
 class FeatureTracks:
-    """SIFT features of all views, and those that match from view to view.
+    """SIFT features of all views, and tracks of matching features.
 
     Attributes:
-        pixels: [F, 2] of all features. owner: [F] index of the view of each. groups: indices of features, one a track.
+        pixels: [F, 2] of all features. owner: [F] view index of each. groups: feature indices of each track.
     """
 
     pixels: Float
@@ -181,10 +181,10 @@ class FeatureTracks:
 
 
 def match_tracks(views: Sequence[PosedPicture], limit: TimeLimit | None = None) -> FeatureTracks:
-    """Matches SIFT features over all pairs of views; masks do not matter.
+    """Matches SIFT features over all pairs of views; masks are ignored.
 
     Args:
-        limit: of the time of frame 0; where it is short, pairs that look in different directions are left out.
+        limit: time limit of frame 0; if time is short, pairs with different viewing directions are left out.
     """
     limit = limit or TimeLimit(None)
     features_by_view = extract_features(views, limit)
@@ -201,7 +201,7 @@ def match_tracks(views: Sequence[PosedPicture], limit: TimeLimit | None = None) 
 
 
 def label_tracks(edges: NDArray[np.intp], count: int) -> NDArray[np.intp]:
-    """[F] the track of each of ``count`` features, of which those of an edge [E, 2] are in one.
+    """Returns the [F] track of each of ``count`` features; the two features of an edge [E, 2] share a track.
 
     >>> label_tracks(np.array([[0, 3], [3, 1]]), 4).tolist()
     [0, 0, 1, 0]
@@ -211,7 +211,7 @@ def label_tracks(edges: NDArray[np.intp], count: int) -> NDArray[np.intp]:
 
 
 def group_by_track(track: NDArray[np.intp]) -> list[NDArray[np.intp]]:
-    """Indices of the features of each track, in the order of the tracks' numbers.
+    """Returns the feature indices of each track, in the order of track numbers.
 
     >>> [group.tolist() for group in group_by_track(np.array([0, 0, 1, 0]))]
     [[0, 1, 3], [2]]
@@ -223,7 +223,7 @@ def group_by_track(track: NDArray[np.intp]) -> list[NDArray[np.intp]]:
 def _affordable_pairs(
     found: Sequence[tuple[Camera, Float, NDArray[np.float32]]], limit: TimeLimit
 ) -> list[tuple[int, int]]:
-    """Pairs of views that there is time to match: all, or those that look in like directions."""
+    """Returns the pairs of views that there is time to match: all, or those with similar viewing directions."""
     pairs = [(a, b) for a in range(len(found)) for b in range(a + 1, len(found))]
     if not limit.bounded or len(pairs) <= FEW_PAIRS:
         return pairs
@@ -244,14 +244,15 @@ def _affordable_pairs(
 def triangulator(
     cameras: Sequence[Camera], *, angle: float, error: float, trials: int, seed: int
 ) -> Callable[[NDArray[np.intp], Float], tuple[Float, Bool] | None]:
-    """A function that finds the point of one track (LO-RANSAC, pycolmap), poses fixed.
+    """Returns a function that triangulates one track with fixed poses (LO-RANSAC, pycolmap).
 
     Args:
-        cameras: calibrated. angle: degrees that rays have to meet under. error: bound of reprojection, pixels.
-        trials: of RANSAC at most. seed: of it.
+        cameras: calibrated. angle: minimum triangulation angle, in degrees. error: maximum reprojection error, in
+            pixels.
+        trials: maximum number of RANSAC trials. seed: for RANSAC.
 
     Returns:
-        Of cameras' indices [n] and the pixel [n, 2] in each: the point [3] and which features are right [n], or None.
+        A function of camera indices [n] and pixels [n, 2] that returns the point [3] and inliers [n], or None.
     """
     import pycolmap
 
@@ -280,13 +281,13 @@ def triangulator(
 def triangulate(
     views: Sequence[PosedPicture], tracks: FeatureTracks | None = None, *, min_views: int = 3, seed: int = 0
 ) -> Triangulation:
-    """Triangulates each track of features robustly (LO-RANSAC), poses fixed.
+    """Triangulates each feature track robustly (LO-RANSAC), with fixed poses.
 
     Args:
-        views: pictures of one moment.
-        tracks: ``match_tracks`` of them, where that is known already.
-        min_views: inlier views a point needs.
-        seed: of RANSAC.
+        views: images of one frame.
+        tracks: result of ``match_tracks``, if it is already known.
+        min_views: minimum number of inlier views of a point.
+        seed: for RANSAC.
     """
     tracks = tracks or match_tracks(views)
     pixels, owner = tracks.pixels, tracks.owner

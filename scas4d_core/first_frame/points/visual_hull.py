@@ -1,6 +1,6 @@
-"""The visual hull: the largest shape whose silhouettes are the masks (Laurentini 1994), by an octree of voxels.
+"""The visual hull, the largest shape with the masks as silhouettes (Laurentini 1994), as an octree of voxels.
 
-A camera has no say about voxels outside its picture; a voxel counts only where ``min_views`` cameras see it.
+Cameras are ignored for voxels outside their image; a voxel counts only if ``min_views`` cameras see it.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from scas4d_core.posed_pictures import (
 )
 
 SEEN_SHARE = 0.35
-"""Share of the masked cameras that must see a voxel: at the edges of the stage few do, and ghosts stay uncarved."""
+"""Minimum share of the masked cameras that see a voxel: at the edges of the scene, few cameras would leave ghosts."""
 VOXEL_PIXELS = 1.5
-"""Edge of the smallest voxel, at most, in pixels at the middle of the stage."""
+"""Maximum edge of the smallest voxel, in pixels at the scene centre."""
 MISSES = 0.05
-"""Share of the cameras whose given mask may miss a voxel: automatic masks are ragged. Silhouettes read off a plain
-background are exact and get none."""
+"""Share of the cameras whose given masks may miss a voxel, because automatic masks are ragged. Silhouettes in front of
+a plain background are exact and use 0."""
 COARSE = 32
-"""Voxels along an edge of the first, coarsest grid."""
+"""Number of voxels along an edge of the first, coarsest grid."""
 MAX_VOXELS = 4_000_000
-"""Bound on memory: a level that would hold more is not entered."""
+"""Maximum number of voxels in a level, to bound memory; refinement stops before it is exceeded."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +40,9 @@ class VisualHull:
     """Voxels inside the silhouettes of all cameras that see them.
 
     Attributes:
-        cells: [M, 3] integer indices on the grid.
+        cells: [M, 3] integer grid indices.
         origin: [3] centre of the voxel with index 0.
-        voxel: edge, world units.
+        voxel: edge length, in world units.
     """
 
     cells: NDArray[np.int64]
@@ -51,7 +51,7 @@ class VisualHull:
 
     @property
     def centres(self) -> Float:
-        """[M, 3] centres of the voxels in the world."""
+        """[M, 3] voxel centres in the world."""
         result: Float = self.origin + self.cells * self.voxel
         return result
 
@@ -61,7 +61,7 @@ class VisualHull:
         return len(self.cells) * self.voxel**3
 
     def is_near(self, points: Float) -> Bool:
-        """[P] true for points [P, 3] within the hull or nearer to it than two voxels (and some a little farther)."""
+        """Returns [P] true for points [P, 3] inside the hull or within two voxels of it (some slightly farther)."""
         low, size, strides, keys = self._surroundings
         at = np.floor((points - self.origin) / self.voxel + 0.5).astype(np.int64) // 2
         near = ((at > low) & (at < low + size - 1)).all(axis=1)
@@ -71,9 +71,9 @@ class VisualHull:
 
     @cached_property
     def _surroundings(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """Of a grid twice as coarse: lowest cell, size, strides, and keys in order of the cells in or beside the hull.
+        """A grid at half resolution: lowest cell, size, strides, and sorted keys of the cells in or next to the hull.
 
-        It is made once: stereo asks of every picture, and the hull may have millions of voxels.
+        It is cached, because stereo uses it for every image and the hull may have millions of voxels.
         """
         halved = self.cells // 2
         low = halved.min(0) - 2
@@ -85,7 +85,7 @@ class VisualHull:
         return low, size, strides, keys
 
     def surface(self) -> Bool:
-        """[M] true for voxels with at least one of their six neighbours empty."""
+        """Returns [M] true for voxels with at least one empty neighbour among the six."""
         if len(self.cells) == 0:
             return np.zeros(0, dtype=bool)
         low = self.cells.min(0) - 1
@@ -101,7 +101,9 @@ class VisualHull:
 
 
 def pixel_size_at(views: Sequence[PosedPicture], point: Float) -> float:
-    """World units across one pixel at ``point`` [3], median over the cameras that have it in front (1 without any)."""
+    """Returns the size of a pixel at ``point`` [3] in world units, median over cameras that have it in front; 1 if
+    none.
+    """
     sizes = [
         float(view.camera.project(point)[1]) / view.camera.fx for view in views if view.camera.project(point)[1] > 0
     ]
@@ -111,14 +113,14 @@ def pixel_size_at(views: Sequence[PosedPicture], point: Float) -> float:
 def carve(
     views: Sequence[PosedPicture], *, voxel_pixels: float = VOXEL_PIXELS, misses: float = 0.0, min_views: int = 3
 ) -> VisualHull:
-    """Carves the hull of the masks.
+    """Carves the visual hull of the masks.
 
     Args:
         views: those without a mask are ignored.
-        voxel_pixels: edge of the smallest voxel, in pixels at the middle of the stage (halved from the coarsest until
-            it is no larger).
+        voxel_pixels: maximum edge of the smallest voxel, in pixels at the scene centre; voxels are halved until it is
+            reached.
         misses: share of the cameras seeing a voxel whose mask may miss it.
-        min_views: cameras that must see a voxel, and at least ``SEEN_SHARE`` of those with a mask.
+        min_views: minimum number of cameras that see a voxel; also at least ``SEEN_SHARE`` of the masked cameras.
     """
     masked = [view for view in views if view.mask is not None]
     middle = look_at_point(views)
@@ -145,17 +147,16 @@ def carve(
 def count_contradictions(
     views: Sequence[PosedPicture], hull: VisualHull, points: Float, misses: float
 ) -> NDArray[np.intp]:
-    """[P] number of masks that contradict each point [P, 3].
+    """Returns the [P] number of masks that contradict each point [P, 3].
 
-    A point within the silhouettes is foreground, and no mask contradicts it. Any other is background: it must not lie
-    before the hull in a camera that sees foreground there. Stereo makes such points beside outlines, where a patch
-    covers both.
+    A point within the silhouettes is foreground and is not contradicted. Any other point is background and must not lie
+    in front of the hull at a foreground pixel. Stereo produces such points next to outlines, where a patch covers both.
 
     Args:
         views: those without a mask are ignored.
         hull: of the masks.
-        points: world.
-        misses: share of the masks that may miss a point of the foreground.
+        points: in the world.
+        misses: share of the masks that may miss a foreground point.
     """
     surface = hull.centres[hull.surface()]
     against, missed, seen = (np.zeros(len(points), dtype=np.intp) for _ in range(3))
@@ -172,7 +173,7 @@ def count_contradictions(
 
 
 def _distance(mask: Bool) -> Float:
-    """[H, W] pixels to the nearest pixel of the silhouette; infinity where the picture has none."""
+    """Returns the [H, W] distance in pixels to the nearest silhouette pixel; infinity if there is none."""
     if not mask.any():
         return np.full(mask.shape, np.inf)
     result: Float = distance_transform_edt(~mask)
@@ -188,16 +189,17 @@ def _inside_silhouettes(
     min_views: int,
     last: bool,
 ) -> Bool:
-    """[M] true for voxels that no more than a share ``misses`` of their cameras see off the silhouette."""
+    """Returns [M] true for voxels that at most a share ``misses`` of their cameras see outside the silhouette."""
     missed = np.zeros(len(centres), dtype=np.int32)
     seen = np.zeros(len(centres), dtype=np.int32)
     may_see = np.zeros(len(centres), dtype=np.int32)
     for view, distance in zip(views, distances, strict=True):
         camera = view.camera
         column, line, depth, inside = pixels_inside(camera, centres)
-        # Before the last level a cell stays if any part of it may be in the silhouette: its half diagonal and a pixel.
-        # On the last its centre decides, to within half a voxel and half the diagonal of a pixel: masks are sampled at
-        # pixel centres, and where many of them must all agree, every rounding would take something away.
+        # Before the last level, a cell is kept if any part of it may be in the silhouette: the slack is its half
+        # diagonal plus a pixel. On the last level its centre decides, with a slack of half a voxel plus half a pixel
+        # diagonal: masks are sampled at pixel centres, and if all of many masks had to agree exactly, every rounding
+        # error would carve the hull.
         half = 0.5 * voxel if last else 0.5 * np.sqrt(3.0) * voxel
         slack = camera.fx * half / np.maximum(depth, 1e-9) + (0.71 if last else 1.5)
         judged = inside & (depth > half)

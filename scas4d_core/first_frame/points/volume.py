@@ -1,4 +1,4 @@
-"""Points of the volume that cameras share: the last way to a cloud, where nothing is confirmed."""
+"""Points in the volume that cameras share: the last resort for initial points, without confirmation."""
 
 from __future__ import annotations
 
@@ -18,27 +18,27 @@ from scas4d_core.posed_pictures import (
 )
 
 SAMPLES = 60_000
-"""Points drawn: about one for four pixels of stereo's pictures."""
+"""Number of sampled points: about one per four pixels of the stereo images."""
 KEPT = 0.25
-"""Share of them that stay: those whose colour differs least from camera to camera are refuted least."""
+"""Share of the points that are kept: those whose colour differs least between cameras."""
 NEAR, FAR = 0.3, 1.7
-"""Depths between which points are drawn, times the distance of the camera to the middle of the stage."""
+"""Range of sampled depths, relative to the distance of the camera from the scene centre."""
 FEW = 10
-"""Points whose median depth is believed."""
+"""Minimum number of points for a reliable median depth."""
 
 
 def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], seed: int) -> InitialPoints:
-    """Points along the rays of all pixels, those on whose colour the cameras that might see them differ least.
+    """Samples points along pixel rays and keeps those whose colour differs least between cameras.
 
-    No point of these is known to lie on a surface; the fit of frame 0 moves, removes and adds.
+    The points are not known to lie on surfaces; the fit of frame 0 moves, removes and adds Gaussians.
 
     Args:
-        views: with pictures; points are in the masks of all that have one.
-        distances: of each camera to the middle of the stage, world units.
-        seed: of the samples.
+        views: with images; points lie in all masks.
+        distances: of each camera to the scene centre, in world units.
+        seed: for the samples.
 
     Raises:
-        InitialPointsError: no two cameras look at one place.
+        InitialPointsError: no two cameras look at the same place.
 
     >>> from scas4d_core.cameras import Camera
     >>> def seen(x):
@@ -60,7 +60,7 @@ def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], see
     points = np.concatenate(drawn)
     inside, free = np.stack([_seen(view, points) for view in views], axis=1)
     points, inside = points[~free.any(axis=0)], inside[:, ~free.any(axis=0)]
-    # Three cameras that agree by chance are rarer than two.
+    # Three cameras agree by chance less often than two.
     for needed in (3, 2):
         shared = inside.sum(axis=0) >= needed
         if shared.sum() >= KEPT * each:
@@ -72,24 +72,24 @@ def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], see
         )
     seen = observe(views, points[shared], inside[:, shared])
     best = np.argsort(seen.spread, kind="stable")[: int(KEPT * shared.sum())]
-    # Points off any mask are gone, so those that are left are in all that see them.
+    # Points outside any mask have been removed, so the rest lie in the masks of all cameras that see them.
     masked = any(view.mask is not None for view in views)
     labels = np.ones(len(best), np.float32) if masked else None
     return InitialPoints(points[shared][best], seen.colours[best], labels)
 
 
 def _seen(view: PosedPicture, points: Float) -> tuple[Bool, Bool]:
-    """[P] twice: whether a view's picture holds a point, and whether that pixel is off its mask."""
+    """Returns two [P] arrays: whether the image contains a point, and whether that pixel is outside the mask."""
     column, line, _, inside = pixels_inside(view.camera, points)
     return inside, inside & ~view.mask[line, column] if view.mask is not None else np.zeros_like(inside)
 
 
 def stage_distances(views: Sequence[PosedPicture], known: Float, radius: float) -> list[float]:
-    """Distance of each camera to what it looks at: to known points, else to where the optical axes meet.
+    """Returns each camera's distance to the scene: to known points, or else to the intersection of the optical axes.
 
     Args:
-        views: of the cameras. known: [P, 3] triangulated points, or none. radius: of the rig, the distance where all
-            cameras look in one direction.
+        views: of the cameras. known: [P, 3] triangulated points, may be empty. radius: of the rig; the distance if the
+            viewing directions are parallel.
     """
     middle = look_at_point(views)
     distances = []

@@ -54,12 +54,12 @@ export class ClusterView {
     if (this.dialog.open) this.timer = setTimeout(() => this.look(), LOOK_MS);
   }
 
-  show({ nodes, waiting, answers }) {
+  show({ nodes, waiting, head_responds: headResponds }) {
     const alive = nodes.filter((one) => one.alive).length;
     const lost = nodes.length > alive ? `, ${nodes.length - alive} lost` : "";
     const late = waiting.filter((one) => one.seconds >= STARTS_S).length;
     const waits = late ? `${counted(late, "process waits", "processes wait")} for a node.` : "No process waits for a node.";
-    const silent = answers ? "" : "The head of the cluster does not answer; the nodes are those of its last answer. ";
+    const silent = headResponds ? "" : "The head of the cluster does not answer; the nodes are those of its last answer. ";
     this.say(`${silent}${counted(alive, "node")} alive${lost}. ${waits}`);
     const order = (one) => `${one.alive ? 1 : 0}${one.host}`;
     this.fill($("cluster-nodes"), [...nodes].sort((a, b) => order(a).localeCompare(order(b))), (one) => this.card(one));
@@ -77,15 +77,15 @@ export class ClusterView {
     if (focused) (list.querySelector(`[data-scene="${CSS.escape(focused)}"]`) ?? $("cluster-close")).focus();
   }
 
-  card({ id, host, labels, alive, cpus, cpus_taken: cpusTaken, memory_mb: memory, memory_taken_mb: memoryTaken, scenes }) {
+  card({ id, host, labels, alive, cpus, cpus_reserved: cpusReserved, memory_mb: memory, memory_reserved_mb: memoryReserved, scenes }) {
     const words = Object.entries(labels).map(([name, value]) => `${name}=${value}`).join(" · ");
     const card = node("li", {}, node("h3", { title: id }, host, " ",
       node("span", { class: "chip", "data-state": alive ? "ready" : "failed" }, alive ? "alive" : "lost")));
     if (words) card.append(node("p", { class: "labels" }, words));
     if (!alive) return card;
     if (cpus) {
-      card.append(share("CPUs", cpusTaken, cpus, `${number.format(cpusTaken)} of ${number.format(cpus)}`),
-        share("Memory", memoryTaken, memory, `${gigabytes(memoryTaken)} of ${gigabytes(memory)} GB`));
+      card.append(share("CPUs", cpusReserved, cpus, `${number.format(cpusReserved)} of ${number.format(cpus)}`),
+        share("Memory", memoryReserved, memory, `${gigabytes(memoryReserved)} of ${gigabytes(memory)} GB`));
     } else card.append(node("p", { class: "small" }, "No CPUs for scenes."));
     if (scenes.length) card.append(node("ul", { class: "row", "aria-label": `Scenes on ${host}` }, ...scenes.map((scene) => node("li", {}, this.button(scene)))));
     return card;

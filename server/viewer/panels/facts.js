@@ -65,7 +65,7 @@ export function showEffects(list, words, effects) {
   const [usual, idle] = [rest(true), rest(false)];
   words.textContent = [
     ...(usual.length ? [`In every update: ${usual.join(", ")}.`] : []),
-    ...(idle.length ? [`Not called for: ${idle.join(", ")}.`] : []),
+    ...(idle.length ? [`Not needed here: ${idle.join(", ")}.`] : []),
   ].join(" ");
 }
 
@@ -82,7 +82,7 @@ export function showQueue(box, words, status) {
 }
 
 /** When a camera takes its pictures, where it is clearly out of step: a lasting fault, which the scene's warnings name. */
-const outOfStep = (one) => (one?.off ? `, whose pictures are taken ${Math.abs(one.frames).toFixed(2)} frames ${one.frames > 0 ? "after" : "before"} the others'` : "");
+const outOfStep = (one) => (one?.out_of_step ? `, whose pictures are taken ${Math.abs(one.frames).toFixed(2)} frames ${one.frames > 0 ? "after" : "before"} the others'` : "");
 
 /** Evidence of the alarms about a camera; they are made where the frame was reconstructed, and only shown here. */
 export const complaints = (name, report) => (report?.alarms ?? []).filter((one) => one.camera === name).map((one) => one.evidence);
@@ -91,7 +91,7 @@ const IN_THE_REASON = ["frame_rejected", "frame_in_part"];
 
 /** Alarms in sentences, but for those that the reason of the frame states already. */
 function sentences(report) {
-  return (report?.alarms ?? []).filter((one) => !IN_THE_REASON.includes(one.what)).map((one) => {
+  return (report?.alarms ?? []).filter((one) => !IN_THE_REASON.includes(one.kind)).map((one) => {
     const words = one.camera === null ? called(one.evidence) : `Camera ${one.camera}: ${one.evidence}`;
     return words.endsWith("?") ? words : `${words}.`;
   });

@@ -56,7 +56,7 @@ export class PartList {
       row.querySelector("button").setAttribute("aria-pressed", String(this.isAlone(label)));
     }
     const { size } = this.hidden;
-    if (!this.labels.length) this.words.textContent = "No parts are known yet.";
+    if (!this.labels.length) this.words.textContent = "No parts yet.";
     else this.words.textContent = size ? `${size} of ${this.labels.length} hidden.` : "All parts are shown.";
   }
 }

@@ -1,4 +1,4 @@
-// The trade-off panel: error over milliseconds a frame, and the budget.
+// The trade-off panel: error over milliseconds per frame, and the budget.
 
 import { element, step } from "./charts.js";
 import { call, scenePath } from "../service.js";
@@ -112,7 +112,7 @@ export class Tradeoff {
 
   show(model, budget) {
     this.model = model;
-    Object.assign(this, { asked: budget.asked, effective: budget.effective, since: budget.since });
+    Object.assign(this, { requested: budget.requested, effective: budget.effective, since: budget.since });
     if (!this.moving) this.place();
     this.draw();
     const replay = model.replay;
@@ -174,7 +174,7 @@ export class Tradeoff {
     this.$("budget-effect").textContent = effective ? this.effect() : "";
     if (!effective) return words.textContent = "";
     const own = effective.budget_ms === null ? `${effective.iterations} iterations a frame` : `as many iterations as fit into ${spoken(effective.budget_ms)}`;
-    const now = `Now: ${own}${this.asked.iterations === null && this.asked.budget_ms === null ? ", as the scene was created" : `, from frame ${this.since} on`}.`;
+    const now = `Now: ${own}${this.requested.iterations === null && this.requested.budget_ms === null ? ", as the scene was created" : `, from frame ${this.since} on`}.`;
     const model = this.model?.model;
     let then = "";
     if (this.moving && model) {
@@ -187,7 +187,7 @@ export class Tradeoff {
 
   /** The kind of budget that holds: time or iterations; empty if it is the scene's own. */
   get effectiveKind() {
-    return this.effective.budget_ms !== null ? "budget_ms" : this.asked.iterations !== null ? "iterations" : "";
+    return this.effective.budget_ms !== null ? "budget_ms" : this.requested.iterations !== null ? "iterations" : "";
   }
 
   /** The effect of the last change: the frames since, compared with those before. */
@@ -216,12 +216,12 @@ export class Tradeoff {
   async put() {
     const { scene, opened } = this;
     this.putting = true;
-    const body = { ...this.asked, iterations: null, budget_ms: null };
+    const body = { ...this.requested, iterations: null, budget_ms: null };
     if (this.kind) body[this.kind] = this.value;
     try {
       const budget = await call("PUT", `${scenePath(scene)}/budget`, body);
       if (this.opened !== opened) return;
-      Object.assign(this, { asked: budget.asked, effective: budget.effective, since: budget.since });
+      Object.assign(this, { requested: budget.requested, effective: budget.effective, since: budget.since });
       this.rest();
     } catch (error) {
       this.moving = false;
@@ -239,7 +239,7 @@ export class Tradeoff {
     try {
       const model = await (running ? call("DELETE", path) : call("POST", path, { iterations: REPLAYED }));
       if (this.opened !== opened) return;
-      this.show(model, { asked: this.asked, effective: this.effective, since: this.since });
+      this.show(model, { requested: this.requested, effective: this.effective, since: this.since });
     } catch (error) {
       this.say(error.message, true);
     }
@@ -260,7 +260,7 @@ export class Tradeoff {
     // Settings without validation have no probe views: then the PSNR stands for the accuracy.
     const by = points.some((point) => point.error !== null) ? "error" : "psnr";
     const known = points.filter((point) => point[by] !== null);
-    this.$("tradeoff-unit").textContent = by === "error" ? "error against time a frame" : "PSNR against time a frame";
+    this.$("tradeoff-unit").textContent = by === "error" ? "error against time a frame" : "PSNR against time per frame";
     this.$("tradeoff-key").hidden = !known.length;
     if (!clientWidth) return;
     svg.setAttribute("viewBox", `0 0 ${clientWidth} ${clientHeight}`);

@@ -27,7 +27,7 @@ let [dirty, movedAt, tick, pictures] = [true, -Infinity, 0, 0];
 // Opening.
 
 async function open() {
-  if (!Splats.possible()) return fail("This browser cannot draw it", "It has no WebGL2 in workers. Take a newer Firefox, Chrome, Edge or Safari 17.");
+  if (!Splats.possible()) return fail("This browser cannot draw it", "It has no WebGL2 in workers. Use a newer Firefox, Chrome, Edge or Safari 17.");
   const source = new Blob([$("worker").textContent], { type: "text/javascript" });
   const worker = new Worker(URL.createObjectURL(source));
   splats = new Splats($("picture"), worker, { ready, frames, drawn, picked, track, failed, trails: () => draw(true) }, Infinity);
@@ -37,7 +37,7 @@ async function open() {
   } catch (error) {
     return fail("The file cannot be read", error.message);
   }
-  if (!files) fail("Nothing is in this file", "Export it again: scas4d export SOURCE --player OUT.html");
+  if (!files) fail("This file is empty", "Export it again: scas4d export SOURCE --player OUT.html");
 }
 
 function ready({ floats }) {
@@ -184,7 +184,7 @@ function click(event) {
 }
 
 function picked({ row, id, part, at }) {
-  say(row < 0 ? "There is nothing at that place: click what is there" : "");
+  say(row < 0 ? "There is nothing at that point: click a surface" : "");
   if (row < 0) return;
   followed = { row, positions: new Map(), at };
   $("followed").hidden = false;

@@ -18,7 +18,7 @@ from client.cli.changes import parse_changes
 from client.cli.commands import frame_line, out_of_step
 from client.cli.main import app
 from client.errors import ServiceError
-from client.pictures import coloured, comparison, psnr
+from client.pictures import colour_labels, comparison, psnr
 from client.rig import push
 from client.sdk import Client
 from client.wire import FrameReportModel, part_colour
@@ -215,11 +215,11 @@ def test_a_budget_is_told_set_and_taken_back(service):
             assert "fit into 500 ms a frame, or fewer: stop gain 0.02" in said(
                 "--milliseconds", "500", "--stop-gain", "0.02"
             )
-            assert client.budget(scene).asked.budget_ms == 500
+            assert client.budget(scene).requested.budget_ms == 500
             assert said("--iterations", "50").startswith("50 iterations a frame")
-            assert said("--as-made") == made
-            refused = scas4d("budget", scene, "--as-made", "--iterations", "5", "--url", service.url)
-            assert (refused.returncode, "leave it out" in refused.stderr) == (1, True)
+            assert said("--reset") == made
+            refused = scas4d("budget", scene, "--reset", "--iterations", "5", "--url", service.url)
+            assert (refused.returncode, "leave one out" in refused.stderr) == (1, True)
         finally:
             client.delete_scene(scene)
 
@@ -232,7 +232,7 @@ def test_a_scene_begins_again(service, tmp_path):
 
     np.savez(tmp_path / "cloud.npz", positions=np.zeros((4, 3)), colours=np.zeros((4, 3)))
     np.savez(tmp_path / "bare.npz", positions=np.zeros((4, 3)))
-    with Client(service.url, patience=HANG_S) as client:
+    with Client(service.url, busy_timeout=HANG_S) as client:
         scene = client.create_scene(make_rig(2)).id
         try:
             for index in range(2):
@@ -313,16 +313,16 @@ def test_pictures():
     assert side[0, [0, 3, 6], 0].tolist() == [0, 100, 255]
     assert psnr(truth, render) == pytest.approx(20 * np.log10(2.55))
     assert psnr(truth, truth) == float("inf")
-    colours = coloured(np.array([[0, 1, 8]], np.uint8))
+    colours = colour_labels(np.array([[0, 1, 8]], np.uint8))
     assert colours[0, 0].tolist() == [0, 0, 0]
     assert [tuple(colour) for colour in colours[0, 1:].tolist()] == [part_colour(0), part_colour(7)]
 
 
 def test_the_line_of_a_frame_names_alarms_that_it_does_not_tell_already():
     alarms = [
-        {"what": "camera_colours", "camera": "c1", "evidence": "its colours are off"},
-        {"what": "light", "evidence": "the pictures are brighter"},
-        {"what": "camera_left_out", "camera": "c2", "evidence": "left out of this frame: dark"},
+        {"kind": "camera_colours", "camera": "c1", "evidence": "its colours are off"},
+        {"kind": "light", "evidence": "the pictures are brighter"},
+        {"kind": "camera_left_out", "camera": "c2", "evidence": "left out of this frame: dark"},
     ]
     report = {"scene": "s", "index": 3, "time": 0.1, "state": "committed", "dropped_cameras": {"c2": "dark"}}
     line = frame_line(FrameReportModel.model_validate({**report, "alarms": alarms}))
@@ -331,7 +331,9 @@ def test_the_line_of_a_frame_names_alarms_that_it_does_not_tell_already():
 
 
 def test_the_line_of_a_frame_names_a_camera_out_of_step_once():
-    timing = {name: {"frames": way, "error": 0.02, "off": abs(way) > 0.2} for name, way in (("c1", -0.4), ("c2", 0.1))}
+    timing = {
+        name: {"frames": way, "error": 0.02, "out_of_step": abs(way) > 0.2} for name, way in (("c1", -0.4), ("c2", 0.1))
+    }
     report = {"scene": "s", "index": 3, "time": 0.1, "state": "committed", "timing": timing}
     model = FrameReportModel.model_validate(report)
     assert frame_line(model) == "frame 3: committed  camera c1: out of step by -0.40 frames"

@@ -14,7 +14,7 @@ from PIL import Image
 from running import HEIGHT, WIDTH
 from waiting import HANG_S
 
-from client.cli.demo import _unready, running_service
+from client.cli.demo import _compile_progress, running_service
 from client.errors import ServiceError
 from client.sdk import Client
 from client.wire.service import ProblemDetails
@@ -87,10 +87,13 @@ def test_it_waits_for_what_will_be_ready_without_anybodys_doing(said, tmp_path, 
 
     monkeypatch.setattr(Client, "ready", not_ready)
     if said:
-        assert _unready("http://127.0.0.1:1", tmp_path) == (said.get("kernels_compiled", 0), said.get("kernels", 1))
+        assert _compile_progress("http://127.0.0.1:1", tmp_path) == (
+            said.get("kernels_compiled", 0),
+            said.get("kernels", 1),
+        )
     else:
         with pytest.raises(RuntimeError, match="cannot become ready: 503: not yet"):
-            _unready("http://127.0.0.1:1", tmp_path)
+            _compile_progress("http://127.0.0.1:1", tmp_path)
 
 
 def test_another_demo_takes_the_place_of_the_one_before(capture_folder, tmp_path):

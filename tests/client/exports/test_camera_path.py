@@ -11,7 +11,7 @@ import pytest
 from export_cases.blob import make_rig
 from scipy.spatial.transform import Rotation
 
-from client.exports.video.camera_path import by_keys, orbit
+from client.exports.video.camera_path import key_pose_path, orbit_path
 from client.exports.video.rig_view import RigView
 from scas4d_core.cameras import Camera, Rig
 from scas4d_core.errors import InputError
@@ -24,7 +24,7 @@ def keyed(tmp_path, document, frames=None):
     file = tmp_path / "keys.json"
     file.write_text(document if isinstance(document, str) else json.dumps(document))
     rig = make_rig()
-    return by_keys(file, rig, SIZE, frames or {3: 0.0, 5: 0.25, 8: 1.0}, rig["front"])
+    return key_pose_path(file, rig, SIZE, frames or {3: 0.0, 5: 0.25, 8: 1.0}, rig["front"])
 
 
 def placed(time, position, look_at=(0, 0, 0), **more):
@@ -102,7 +102,7 @@ def test_up_may_be_given_and_one_key_is_enough(tmp_path):
         ({"keys": [{"frame": 4, "position": [0, 0, 1], "look_at": [0, 0, 0]}]}, r"keys\[0\].frame 4 is not shown"),
         (
             {"keys": [{"time": 0, "world_to_camera": np.diag([2.0, 1, 1, 1]).tolist()}]},
-            r"keys\[0\].world_to_camera: .* is no rotation",
+            r"keys\[0\].world_to_camera: .* is not a rotation",
         ),
         ({"keys": [placed(0, (0, 0, 1), field_of_view=190)]}, r"keys\[0\].field_of_view 190: .* less than or equal"),
         ({"up": [0, 0, 0], "keys": [placed(0, (0, 0, 1))]}, "up is zero"),
@@ -116,7 +116,7 @@ def test_faults_of_a_file_name_their_field(tmp_path, document, said):
 def test_an_orbit_keeps_its_distance_and_its_target():
     rig = make_rig()
     view = RigView.of(rig)
-    path = orbit(rig, rig["side"], SIZE, turn=45.0)
+    path = orbit_path(rig, rig["side"], SIZE, turn=45.0)
     assert path(0.0).centre == pytest.approx(rig["side"].centre)
     assert path(8.0).centre == pytest.approx(rig["side"].centre)
     for time in np.linspace(0, 8, 9):
@@ -134,4 +134,4 @@ def test_rigs_that_tell_no_point():
     assert RigView.of(one).target == pytest.approx([0, 0, 2])
     above = np.eye(4)
     above[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]  # looks along −y, which it takes for up
-    assert np.isfinite(orbit(Rig((Camera("a", LENS, above, 64, 48),)), one["a"], SIZE, 30)(1.0).centre).all()
+    assert np.isfinite(orbit_path(Rig((Camera("a", LENS, above, 64, 48),)), one["a"], SIZE, 30)(1.0).centre).all()

@@ -7,7 +7,7 @@ import pytest
 from export_cases.blob import BLOB, FRAMES, RATE, WORLD, centre, make_rig
 from typer.testing import CliRunner
 
-from client.cli.extras import remedy
+from client.cli.extras import install_hint
 from client.cli.main import app
 from client.exports.recording import make_recording
 from client.wire import part_colour
@@ -82,7 +82,7 @@ def test_points_by_part_have_the_colour_of_their_class(source, tmp_path):
 def test_faults_and_a_package_that_is_missing(source, tmp_path):
     with pytest.raises(InputError, match=r"ends in '.mp4'; give a name that ends in .rrd"):
         made(source, tmp_path / "a.mp4")
-    said = remedy(ModuleNotFoundError("No module named 'rerun'", name="rerun"))
+    said = install_hint(ModuleNotFoundError("No module named 'rerun'", name="rerun"))
     assert said is not None
     assert said.endswith("pip install -e '.[rerun]'")
     assert not list(tmp_path.iterdir())

@@ -117,7 +117,7 @@ def test_speed_rate_length_and_size(source, tmp_path):
 
 
 def test_states_between_frames(source, tmp_path):
-    options = VideoOptions(path="camera", fps=20, between=True)
+    options = VideoOptions(path="camera", fps=20, interpolate=True)
     shown = read(made(source, tmp_path / "a.mp4", options))[0]
     column, row = pixel_of(1.5)
     reds = shown[3, row].astype(int) @ [1, -1, -1]
@@ -125,7 +125,7 @@ def test_states_between_frames(source, tmp_path):
 
 
 def test_an_orbit_begins_at_a_camera_and_turns_to_its_right(source, tmp_path):
-    options = VideoOptions(camera="side", turn=np.degrees(0.6) / 0.4)
+    options = VideoOptions(camera="side", orbit_speed=np.degrees(0.6) / 0.4)
     shown = read(made(source, tmp_path / "a.mp4", options))[0]
     # The second camera stands to the left of the first.
     for frame, camera in ((0, "side"), (FRAMES - 1, "front")):
@@ -167,7 +167,7 @@ def test_parts_have_their_colours(source, tmp_path):
 def test_the_true_picture_is_at_the_right(source, tmp_path, true_capture, camera):
     """Of a training camera, and of one that was held out."""
     options = VideoOptions(path="camera", camera=camera, fps=20, size=(160, 60))
-    shown = read(made(source, tmp_path / "a.mp4", options, beside=true_capture))[0]
+    shown = read(made(source, tmp_path / "a.mp4", options, compared=true_capture))[0]
     assert shown.shape[1:] == (60, 320, 3)
     for number, frame in ((0, 0), (2, 1), (7, 3), (8, 4)):  # of two that are as near the earlier
         true = shown[number, :, 160:].astype(int)
@@ -185,7 +185,7 @@ def test_a_background_that_is_asked_for(source, tmp_path):
 
 
 def test_a_scene_of_the_service(service, tmp_path):
-    with Client(service.url, patience=HANG_S) as client:
+    with Client(service.url, busy_timeout=HANG_S) as client:
         scene = client.create_scene(a_rig()).id
         try:
             for index in range(2):
@@ -210,7 +210,7 @@ def test_tracks_of_what_stands_are_refused(tmp_path):
 
 
 def test_a_moment_from_all_around(source, tmp_path):
-    options = VideoOptions(seconds=0.4, turn=900.0)
+    options = VideoOptions(seconds=0.4, orbit_speed=900.0)
     shown = read(made(source, tmp_path / "a.mp4", options, frames="2"))[0]
     assert len(shown) == 4
     assert len({picture.tobytes() for picture in shown}) == 4
@@ -225,12 +225,12 @@ def test_a_moment_from_all_around(source, tmp_path):
         ("a.mp4", VideoOptions(path="way.json"), {}, "path 'way.json' is no file; give orbit, camera, or a JSON file"),
         ("a.mp4", FRONT, {"frames": "7:9"}, "frames 7:9 are not in states; it has frames 0 to 4"),
         ("a.mp4", VideoOptions(fps=200, speed=1e-6), {}, "speed 1e-06 make 80000001 pictures; give --frames"),
-        ("a.mp4", VideoOptions(), {"beside": True}, "beside is given for path 'orbit'; give --path camera"),
-        ("a.mp4", VideoOptions(path="camera", between=True), {"beside": True}, "beside and between contradict"),
+        ("a.mp4", VideoOptions(), {"compared": True}, "compare is given for path 'orbit'; give --path camera"),
+        ("a.mp4", VideoOptions(path="camera", interpolate=True), {"compared": True}, "compare and interpolate exclude"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused_and_nothing_is_left(source, tmp_path, true_capture, out, options, more, said):
-    more = more | ({"beside": true_capture} if more.get("beside") else {})
+    more = more | ({"compared": true_capture} if more.get("compared") else {})
     with pytest.raises(InputError, match=said):
         made(source, tmp_path / out, options, **more)
     assert not list(tmp_path.iterdir())
@@ -238,7 +238,7 @@ def test_what_cannot_be_is_refused_and_nothing_is_left(source, tmp_path, true_ca
 
 def test_a_size_names_its_remedy():
     for wrong in ("640", "0x0", "640x480x3", "9999x9999", "-640x480"):
-        with pytest.raises(InputError, match="is no size of a picture; give WIDTHxHEIGHT, as 1280x720"):
+        with pytest.raises(InputError, match="is not a picture size; give WIDTHxHEIGHT, such as 1280x720"):
             picture_size(wrong)
 
 
@@ -252,4 +252,4 @@ def test_the_command(source, tmp_path):
     with Image.open(tmp_path / "a.webp") as file:
         assert (file.size, file.n_frames) == ((65, 49), FRAMES)
     done = CliRunner().invoke(app, [*arguments, "--size", "65"])
-    assert "size '65' is no size" in str(done.exception)
+    assert "size '65' is not a picture size" in str(done.exception)

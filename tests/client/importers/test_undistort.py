@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from lenses import HEIGHT, LENSES, WIDTH, camera, distorted, dot_at, painted, pose, seen
 
-from client.importers.extras import MissingExtra, load
+from client.importers.extras import MissingExtraError, load
 from client.importers.lens import MODELS, lens_camera
-from client.importers.undistort import Undistorter, straightened
+from client.importers.undistort import Undistorter, undistort_pixels
 from scas4d_core.captures import CaptureError
 
 pytest.importorskip("cv2")
@@ -61,7 +61,7 @@ def test_no_pixel_was_made_up_and_the_largest_such_picture_was_taken(model):
     assert (undistorter.camera.width, undistorter.camera.height) == (WIDTH, HEIGHT)
     ratio = undistorter.camera.fy / undistorter.camera.fx
     assert ratio == pytest.approx(lens.intrinsics[1, 1] / lens.intrinsics[0, 0])
-    if not lens.straight:
+    if not lens.is_pinhole:
         wider = np.diag([0.97, 0.97, 1]) @ undistorter.camera.intrinsics
         wider[:2, 2] = undistorter.camera.intrinsics[:2, 2] * 0.97 + [0.015 * WIDTH, 0.015 * HEIGHT]
         corners = np.array([[0.0, 0], [WIDTH / 2, 0], [WIDTH, 0], [0, HEIGHT / 2], [WIDTH, HEIGHT / 2]])
@@ -75,7 +75,7 @@ def test_no_pixel_was_made_up_and_the_largest_such_picture_was_taken(model):
 def test_rays_of_pixels_go_back_to_them(model):
     lens = camera(model)
     pixels = np.random.default_rng(1).uniform([0, 0], [WIDTH, HEIGHT], (200, 2))
-    rays = straightened(lens, pixels)
+    rays = undistort_pixels(lens, pixels)
     assert np.abs(distorted(model, LENSES[model], rays) - pixels).max() < 1e-3
 
 
@@ -140,7 +140,7 @@ def test_a_lens_that_turns_back_towards_the_corners_is_cut_and_says_so(model, ch
     lens, parameters = camera(model, **changes), LENSES[model] | changes
     undistorter = Undistorter(lens)
     corners = np.array([[0.0, 0], [WIDTH, 0], [WIDTH, HEIGHT], [0, HEIGHT]])
-    assert np.isnan(straightened(lens, corners)).all(axis=1).any(), "its polynomial reaches every corner"
+    assert np.isnan(undistort_pixels(lens, corners)).all(axis=1).any(), "its polynomial reaches every corner"
     # What it shows, it saw: towards the border of the pinhole, pixels of the lens go outwards without turning.
     pinhole = undistorter.camera
     x, y = np.linspace(0, WIDTH, 60), np.linspace(0, HEIGHT, 60)
@@ -155,7 +155,7 @@ def test_a_lens_that_turns_back_towards_the_corners_is_cut_and_says_so(model, ch
     assert undistorter.valid.all()
     # The share that is said to be lost, counted pixel by pixel.
     u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    back = straightened(lens, np.stack([u, v], -1).reshape(-1, 2))
+    back = undistort_pixels(lens, np.stack([u, v], -1).reshape(-1, 2))
     shown = back * pinhole.intrinsics.diagonal()[:2] + pinhole.intrinsics[:2, 2]
     lost = 1 - ((shown > 0) & (shown < [WIDTH, HEIGHT])).all(axis=1).mean()
     said = re.match(r"camera 'c0': its distortion turns back .*; (\d+)% of its picture is cut off", undistorter.remark)
@@ -208,5 +208,5 @@ def test_what_cannot_be_a_camera_is_named(model, changes, said):
 
 
 def test_a_missing_package_names_the_extra():
-    with pytest.raises(MissingExtra, match=r"opening boxes needs no_such_box.*pip install -e '\.\[importers\]'"):
+    with pytest.raises(MissingExtraError, match=r"opening boxes needs no_such_box.*pip install -e '\.\[importers\]'"):
         load("no_such_box", needed="opening boxes")

@@ -246,7 +246,7 @@ def test_faults_of_the_cloud_are_named(folder, data, message):
 
 def test_a_cloud_that_is_no_npz_is_named(folder):
     (folder / "init_pt_cld.npz").write_bytes(b"PK\3\4 damaged")
-    with pytest.raises(CaptureError, match=r"init_pt_cld\.npz: is no npz"):
+    with pytest.raises(CaptureError, match=r"init_pt_cld\.npz: is not an npz"):
         open_capture(folder)
     np.savez(folder / "init_pt_cld.npz", points=np.zeros((4, 7)))
     with pytest.raises(CaptureError, match=r"has no array .*needed: data"):

@@ -48,7 +48,7 @@ def test_a_file_cut_anywhere_is_gone_on_with_to_the_same_bytes(whole: Path, tmp_
 
 
 def test_what_has_no_state_or_is_whole_or_damaged_is_not_gone_on_with(whole: Path, tmp_path: Path) -> None:
-    with pytest.raises(FileError, match="begin another file"):
+    with pytest.raises(FileError, match="start another file"):
         CompactWriter.resume(whole)
     head = tmp_path / "head.s4d"
     CompactWriter(head, HEAD).close()

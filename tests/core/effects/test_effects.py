@@ -101,7 +101,7 @@ def test_a_scene_without_a_floor_has_no_floor_term() -> None:
             "effects.rigidity cannot be 'on': update.weights.rigidity is 0",
             "give it a weight above 0",
         ),
-        ({"effects": {"flour": "off"}}, "flour is no effect", "did you mean floor?"),
+        ({"effects": {"flour": "off"}}, "flour is not an effect", "did you mean floor?"),
         ({"effects": {"floor": "maybe"}}, "Input should be 'auto', 'on' or 'off'", ""),
     ],
 )

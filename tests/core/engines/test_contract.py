@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
 from collections.abc import Callable
 
 import numpy as np
@@ -22,6 +24,10 @@ from scas4d_core.update.schedule import Stopping
 from scas4d_core.update.view_factory import ViewFactory
 
 ENGINES: dict[str, Callable[[], UpdateEngine]] = {"cpu": CpuEngine, "torch": TorchEngine}
+if importlib.util.find_spec("warp") is not None:
+    from scas4d_core.engines.warp.engine import WarpEngine
+
+    ENGINES["warp"] = lambda: WarpEngine(os.environ.get("SCAS4D_WARP_DEVICE", "cpu"))
 TESTED = {name: made for name, made in ENGINES.items() if name != "torch"}
 """The engines that are compared with the reference; a new one is a line of ``ENGINES``."""
 PLANS = {**EFFECTS, "all together": TOGETHER}

@@ -115,7 +115,7 @@ def test_positions_take_as_many_bits_as_fit(tmp_path):
 
 def test_what_cannot_be_read(tmp_path):
     (tmp_path / "a.spz").write_bytes(b"hello")
-    with pytest.raises(InputError, match=r"a\.spz: no SPZ file"):
+    with pytest.raises(InputError, match=r"a\.spz: not an SPZ file"):
         read_spz(tmp_path / "a.spz")
     with pytest.raises(InputError, match="version 2 of SPZ is not written; give 3 or 4"):
         write_spz(tmp_path / "b.spz", corner.state(), corner.WORLD, version=2)

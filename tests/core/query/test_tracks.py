@@ -220,7 +220,7 @@ def test_tracks_of_ids_are_the_means():
     history, rest = rigid_history()
     tracks = tracks_of_ids(history, WORLD, np.array([30, 0]), [4, 2])
     np.testing.assert_allclose(tracks.positions, truth(rest[[10, 0]])[[4, 2]], atol=1e-4)
-    with pytest.raises(ValueError, match=r"ids \[31\] are no Gaussians"):
+    with pytest.raises(ValueError, match=r"ids \[31\] are not Gaussians"):
         tracks_of_ids(history, WORLD, np.array([31]), [0])
 
 

@@ -41,7 +41,7 @@ def past() -> Past:
 
 
 def kinds_of(found: Collection[Alarm]) -> list[tuple[str, str | None]]:
-    return [(alarm.what.value, alarm.camera) for alarm in found]
+    return [(alarm.kind.value, alarm.camera) for alarm in found]
 
 
 def in_a_row(past: Past, frames: int = 4, **changes: Any) -> list[list[tuple[str, str | None]]]:
@@ -150,7 +150,7 @@ def test_alarms_of_the_frame_are_no_cameras(past: Past) -> None:
 def test_a_camera_that_was_left_out_has_that_alarm_alone(past: Past) -> None:
     assert settled(past, offsets={**NONE, "c3": -20.0}, left_out=["c3"])[0] == []
     found = left_out_alarms(["a", "b", "c"], ["a", "b"], {"b": "it shows nothing"})
-    assert [(alarm.what, alarm.camera) for alarm in found] == [
+    assert [(alarm.kind, alarm.camera) for alarm in found] == [
         (AlarmKind.CAMERA_LEFT_OUT, "b"), (AlarmKind.CAMERA_LEFT_OUT, "c"),
     ]  # fmt: skip
     assert "it shows nothing" in found[0].evidence
@@ -192,7 +192,7 @@ def test_a_scene_raises_none_and_of_one_camera_in_another_colour_one(tmp_path: P
     assert ("camera_colours", "c3") in kinds_of(report.alarms)
     assert {alarm.camera for alarm in report.alarms} == {"c3"}
     record = report.record()["alarms"]
-    assert {"what": "camera_colours", "camera": "c3"}.items() <= record[-1].items()
+    assert {"kind": "camera_colours", "camera": "c3"}.items() <= record[-1].items()
     brighter = footage.frame(6)
     images = {name: (1.3 * np.asarray(image)).clip(0, 255).astype(np.uint8) for name, image in brighter.images.items()}
     report = scene.step(replace(brighter, images=images))

@@ -118,13 +118,13 @@ def test_frames_that_were_held_or_stood_are_told_as_they_are() -> None:
     dark = scene.step(sent(3, 0.02, True))
     outcomes = [report.outcome for report in (moved, again, dark)]
     assert outcomes == [FrameOutcome.UPDATED, FrameOutcome.UNCHANGED, FrameOutcome.REJECTED_UNUSABLE]
-    assert (moved.used, moved.kept) == (list(FOOTAGE.rig.names), "end")
-    assert (again.used, again.iterations, again.kept, again.exposure) == ([], 0, "previous", 1.0)
-    assert (dark.used, dark.iterations, dark.kept, dark.errors) == ([], 0, "previous", {})
+    assert (moved.used, moved.candidate) == (list(FOOTAGE.rig.names), "end")
+    assert (again.used, again.iterations, again.candidate, again.exposure) == ([], 0, "previous", 1.0)
+    assert (dark.used, dark.iterations, dark.candidate, dark.errors) == ([], 0, "previous", {})
     assert dark.exposure == pytest.approx(0.02, abs=0.01)
     upside_down = {name: image[::-1].copy() for name, image in sent(4, 1.2, True).images.items()}
     held = scene.step(replace(sent(4, 1.0, True), images=upside_down))
-    assert (held.used, held.kept, held.outcome) == ([], "previous", FrameOutcome.REJECTED_MISFIT)
+    assert (held.used, held.candidate, held.outcome) == ([], "previous", FrameOutcome.REJECTED_MISFIT)
     assert str(held.degraded).startswith("previous state kept: ")
     assert held.exposure > 1.0
     assert held.errors[Candidate.END] < held.errors[Candidate.PREVIOUS]

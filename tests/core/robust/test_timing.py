@@ -134,7 +134,7 @@ def test_who_is_clearly_off_is_named() -> None:
     wild = {0.0: 6, 0.6: 6}
     found = timing.timings(past_of({**steady, "near": {0.14: 6}, "late": {0.3: 6}, "early": {-0.4: 6}, "wild": wild}))
     assert found["wild"]["frames"] > OFF
-    assert {name for name, one in found.items() if one["off"]} == {"late", "early"}
+    assert {name for name, one in found.items() if one["out_of_step"]} == {"late", "early"}
     (told,) = timing_warnings(found)
     assert "'early' is early, 'late' is late;" in told  # no figures: they change from frame to frame, and it does not
     assert timing_warnings(None) == []

@@ -106,7 +106,7 @@ def test_a_report_is_part_of_the_commit(tmp_path, on_disk):
         history.save(tmp_path / "copy")
         assert History.load(tmp_path / "copy").report(3) == report
     for wrong in ({"loss": float("nan")}, {"array": np.zeros(3)}):
-        with pytest.raises(HistoryError, match=r"frame 5: the report is no JSON"):
+        with pytest.raises(HistoryError, match=r"frame 5: the report is not valid JSON"):
             history.append(5, 0.2, state(2), wrong)
     assert history.indices == [3, 4]
 

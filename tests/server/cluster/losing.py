@@ -16,7 +16,7 @@ class LosableCluster:
         self.events: list[str] = []
         self.lost = self.joined = False
         self.refuses = self.inits = self.looks_done = 0
-        monkeypatch.setattr(membership, "EVERY_S", 0.01)
+        monkeypatch.setattr(membership, "CHECK_S", 0.01)
         monkeypatch.setattr(membership, "own_node_is_lost", self._is_lost)
         monkeypatch.setattr(ray, "is_initialized", lambda: self.joined)
         monkeypatch.setattr(ray, "init", self._init)

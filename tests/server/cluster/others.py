@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from server.cluster.calls import THREADS, Calls
+from server.cluster.ray_calls import THREADS, RayCalls
 
 
 async def others_have_called() -> None:
     """Returns once more calls than there are threads, begun now by somebody who holds none back, are over."""
-    calls = Calls()
+    calls = RayCalls()
     try:
-        for call in [calls.asked(lambda: None) for _ in range(10 * THREADS)]:
+        for call in [calls.call(lambda: None) for _ in range(10 * THREADS)]:
             await call
     finally:
         calls.close()

@@ -12,13 +12,13 @@ from typing import Any
 import pytest
 from waiting import HANG_S, wait_for_soon
 
-from server.cluster.calls import THREADS, Calls
+from server.cluster.ray_calls import THREADS, RayCalls
 from tests.server.cluster.others import others_have_called
 
 
-def run(test: Callable[[Calls], Awaitable[None]]) -> None:
+def run(test: Callable[[RayCalls], Awaitable[None]]) -> None:
     async def all_of() -> None:
-        calls = Calls()
+        calls = RayCalls()
         try:
             await test(calls)
         finally:
@@ -28,32 +28,32 @@ def run(test: Callable[[Calls], Awaitable[None]]) -> None:
 
 
 def test_what_is_asked_while_calls_are_held_begins_later_and_takes_no_thread() -> None:
-    async def test(calls: Calls) -> None:
-        calls.hold()
-        waiting = [calls.asked(lambda: 1) for _ in range(10 * THREADS)]
+    async def test(calls: RayCalls) -> None:
+        calls.suspend()
+        waiting = [calls.call(lambda: 1) for _ in range(10 * THREADS)]
         await others_have_called()
-        assert await calls.over(0)
+        assert await calls.wait(0)
         assert not any(call.done() for call in waiting)
-        calls.go_on()
+        calls.resume()
         assert await asyncio.gather(*waiting) == [1] * len(waiting)
 
     run(test)
 
 
 def test_what_waits_for_a_thread_when_calls_are_held_begins_later() -> None:
-    async def test(calls: Calls) -> None:
+    async def test(calls: RayCalls) -> None:
         busy, called = threading.Event(), threading.Event()
-        on = [calls.asked(busy.wait, HANG_S) for _ in range(THREADS)]
-        queued = calls.asked(called.set)
-        await wait_for_soon(lambda: len(calls.begun) == THREADS + 1)
-        calls.hold()
-        assert not await calls.over(0)
+        on = [calls.call(busy.wait, HANG_S) for _ in range(THREADS)]
+        queued = calls.call(called.set)
+        await wait_for_soon(lambda: len(calls.running) == THREADS + 1)
+        calls.suspend()
+        assert not await calls.wait(0)
         busy.set()
         await asyncio.gather(*on)
-        assert await calls.over(HANG_S)
+        assert await calls.wait(HANG_S)
         await others_have_called()
         assert not called.is_set()
-        calls.go_on()
+        calls.resume()
         await queued
         assert called.is_set()
 
@@ -69,18 +69,18 @@ def test_a_fault_while_they_are_waited_for_is_told_to_who_has_asked_alone(
         waits.set()
         return concurrent.futures.wait(*given)
 
-    monkeypatch.setattr("server.cluster.calls.wait", wait)
+    monkeypatch.setattr("server.cluster.ray_calls.wait", wait)
 
-    async def test(calls: Calls) -> None:
+    async def test(calls: RayCalls) -> None:
         fails = threading.Event()
 
         def fail() -> None:
             fails.wait(HANG_S)
             raise ConnectionError("no head")
 
-        call = calls.asked(fail)
-        await wait_for_soon(lambda: calls.begun)
-        waiting = asyncio.ensure_future(calls.over(HANG_S))
+        call = calls.call(fail)
+        await wait_for_soon(lambda: calls.running)
+        waiting = asyncio.ensure_future(calls.wait(HANG_S))
         await wait_for_soon(waits.is_set)
         fails.set()
         assert await waiting
@@ -95,17 +95,17 @@ def test_a_fault_while_they_are_waited_for_is_told_to_who_has_asked_alone(
 def test_one_that_is_cancelled_before_it_begins_is_never_called() -> None:
     called: list[int] = []
 
-    async def test(calls: Calls) -> None:
-        calls.hold()
-        held = calls.asked(called.append, 1)
+    async def test(calls: RayCalls) -> None:
+        calls.suspend()
+        held = calls.call(called.append, 1)
         await asyncio.sleep(0)
         held.cancel()
-        calls.go_on()
-        await calls.asked(called.append, 2)
+        calls.resume()
+        await calls.call(called.append, 2)
         busy = threading.Event()
-        on = [calls.asked(busy.wait, HANG_S) for _ in range(THREADS)]
-        queued = calls.asked(called.append, 3)
-        await wait_for_soon(lambda: len(calls.begun) == THREADS + 1)
+        on = [calls.call(busy.wait, HANG_S) for _ in range(THREADS)]
+        queued = calls.call(called.append, 3)
+        await wait_for_soon(lambda: len(calls.running) == THREADS + 1)
         queued.cancel()
         await asyncio.sleep(0)
         busy.set()
@@ -117,25 +117,25 @@ def test_one_that_is_cancelled_before_it_begins_is_never_called() -> None:
 
 @pytest.mark.parametrize("cancelled", [False, True])
 def test_those_that_have_begun_are_waited_for_also_where_nobody_else_does(*, cancelled: bool) -> None:
-    async def test(calls: Calls) -> None:
+    async def test(calls: RayCalls) -> None:
         ends = threading.Event()
-        call = calls.asked(ends.wait, HANG_S)
-        await wait_for_soon(lambda: calls.begun and next(iter(calls.begun)).running())
+        call = calls.call(ends.wait, HANG_S)
+        await wait_for_soon(lambda: calls.running and next(iter(calls.running)).running())
         if cancelled:
             call.cancel()
             await asyncio.sleep(0)
-        calls.hold()
-        assert not await calls.over(0.05)
+        calls.suspend()
+        assert not await calls.wait(0.05)
         ends.set()
-        assert await calls.over(HANG_S)
-        assert await calls.over(0)
+        assert await calls.wait(HANG_S)
+        assert await calls.wait(0)
 
     run(test)
 
 
 def test_a_fault_reaches_who_has_asked() -> None:
-    async def test(calls: Calls) -> None:
+    async def test(calls: RayCalls) -> None:
         with pytest.raises(ZeroDivisionError):
-            await calls.asked(lambda: 1 // 0)
+            await calls.call(lambda: 1 // 0)
 
     run(test)

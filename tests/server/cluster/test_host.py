@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 from waiting import HANG_S
 
-from server.cluster import host, marks
-from server.cluster.host import Host, ProcessPriority
+from server.cluster import folder_marker, process_host
+from server.cluster.process_host import ProcessHost, ProcessPriority
 from server.messages import Stop
 
 
@@ -29,16 +29,16 @@ def manner(spec: Any, connection: Connection[Any, Any]) -> None:
 
 def test_a_process_runs_as_on_the_machine_of_its_service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ray's own are nicer than all else on the node, and have a thread of OpenMP for each CPU of the actor."""
-    monkeypatch.setattr(host, "_node_id", lambda: "here")
+    monkeypatch.setattr(process_host, "_node_id", lambda: "here")
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    marks.mark(tmp_path, "mine")
+    folder_marker.write_marker(tmp_path, "mine")
     nice = os.getpriority(os.PRIO_PROCESS, 0)
 
     async def run() -> Any:
         os.setpriority(os.PRIO_PROCESS, 0, nice + 3)  # of this thread alone
-        actor = Host(None, tmp_path, "mine", ProcessPriority("2", nice))
+        actor = ProcessHost(None, tmp_path, "mine", ProcessPriority("2", nice))
         await actor.start(manner, "scene")
-        found = await asyncio.wait_for(actor.take(), HANG_S)
+        found = await asyncio.wait_for(actor.receive(), HANG_S)
         await actor.stop(5)
         return found
 
@@ -49,18 +49,18 @@ def test_a_process_runs_as_on_the_machine_of_its_service(tmp_path: Path, monkeyp
 
 
 def test_messages_reach_the_process_in_order_from_the_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(host, "_node_id", lambda: "here")
+    monkeypatch.setattr(process_host, "_node_id", lambda: "here")
 
-    marks.mark(tmp_path, "mine")
+    folder_marker.write_marker(tmp_path, "mine")
 
     async def run() -> list[Any]:
-        actor, found = Host(None, tmp_path, "mine"), list[Any]()
+        actor, found = ProcessHost(None, tmp_path, "mine"), list[Any]()
         await actor.post(1, "b")
         await actor.post(0, "a")
         await actor.start(echo, "scene")
         await actor.post(2, "c")
         while len(found) < 3:
-            found += await asyncio.wait_for(actor.take(), HANG_S)
+            found += await asyncio.wait_for(actor.receive(), HANG_S)
         await actor.stop(5)
         return found
 
@@ -69,10 +69,10 @@ def test_messages_reach_the_process_in_order_from_the_first(tmp_path: Path, monk
 
 def test_a_node_with_a_folder_of_its_own_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """It joined later, and its folder at that path can be written to: what is committed there would be lost."""
-    monkeypatch.setattr(host, "_node_id", lambda: "here")
-    monkeypatch.setattr(marks, "SEEN_S", 0.1)
-    marks.mark(tmp_path, "another service")
-    started = asyncio.run(Host(None, tmp_path, "mine").start(echo, "scene"))
+    monkeypatch.setattr(process_host, "_node_id", lambda: "here")
+    monkeypatch.setattr(folder_marker, "VISIBLE_S", 0.1)
+    folder_marker.write_marker(tmp_path, "another service")
+    started = asyncio.run(ProcessHost(None, tmp_path, "mine").start(echo, "scene"))
     assert started.pid is None
     assert started.fault is not None
     assert started.fault.endswith(f"does not see the data folder {tmp_path}; mount it there")

@@ -10,9 +10,9 @@ from running import make_rig
 
 from client.wire import RigModel, SceneCreate
 from scas4d_core.settings import Settings
-from server.cluster.needs import needs_of
+from server.cluster.resource_needs import resource_needs
 from server.messages import ExportSpec, ReplaySpec, SceneSpec
-from server.processes import exporter, renderer, replayer, worker
+from server.processes import exporter, reader_process, replayer, worker
 from server.settings import ServerSettings
 from server.storage.layout import SceneFolder
 
@@ -68,16 +68,16 @@ def test_every_process_of_the_scene_asks_for_them(tmp_path: Path) -> None:
     scene = spec(tmp_path, {"rig": "stage-a", "disk": "fast"})
     export = ExportSpec(scene, tmp_path / "x.ply", "ply", 0, (0,))
     replay = ReplaySpec(scene, 0, 0, (), (5,))
-    runs = [(worker.main, scene), (renderer.views, scene), (renderer.bulk, scene)]
+    runs = [(worker.main, scene), (reader_process.run_view_reader, scene), (reader_process.run_bulk_reader, scene)]
     for entry, given in [*runs, (exporter.main, export), (replayer.main, replay)]:
-        needs = needs_of(entry, given, ServerSettings())
+        needs = resource_needs(entry, given, ServerSettings())
         assert needs is not None
-        assert needs.options()["label_selector"] == {"rig": "stage-a", "disk": "fast"}
-        assert needs.words().endswith(" GB of memory on a node with rig=stage-a, disk=fast")
+        assert needs.actor_options()["label_selector"] == {"rig": "stage-a", "disk": "fast"}
+        assert needs.describe().endswith(" GB of memory on a node with rig=stage-a, disk=fast")
 
 
 def test_a_scene_without_labels_runs_on_any_node(tmp_path: Path) -> None:
-    needs = needs_of(worker.main, spec(tmp_path, {}), ServerSettings())
+    needs = resource_needs(worker.main, spec(tmp_path, {}), ServerSettings())
     assert needs is not None
-    assert "label_selector" not in needs.options()
-    assert needs.words().endswith("GB of memory")
+    assert "label_selector" not in needs.actor_options()
+    assert needs.describe().endswith("GB of memory")

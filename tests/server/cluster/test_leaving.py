@@ -18,8 +18,8 @@ ray_placement = pytest.importorskip(
 )
 
 from server.cluster import membership  # noqa: E402
-from server.cluster.host import Started  # noqa: E402
-from server.cluster.needs import Needs  # noqa: E402
+from server.cluster.process_host import StartResult  # noqa: E402
+from server.cluster.resource_needs import ResourceNeeds  # noqa: E402
 from server.processes.placement import ProcessExit  # noqa: E402
 from server.settings import ServerSettings  # noqa: E402
 from tests.server.cluster.losing import LosableCluster  # noqa: E402
@@ -55,12 +55,12 @@ class Cluster(LosableCluster):
         self.exits: list[int] = []
         monkeypatch.setattr(ray_placement.ray, "kill", lambda actor: None)
         monkeypatch.setattr(membership.os, "_exit", self.exits.append)
-        for name in ("check_folder", "mark", "announced"):
+        for name in ("check_folder", "write_marker", "register_service"):
             monkeypatch.setattr(ray_placement, name, lambda *arguments: None)
         monkeypatch.setattr(ray_placement, "all_nodes", list)
-        monkeypatch.setattr(ray_placement, "needs_of", lambda *arguments: Needs("worker", "scene", 1, 1))
+        monkeypatch.setattr(ray_placement, "resource_needs", lambda *arguments: ResourceNeeds("worker", "scene", 1, 1))
         self.placement = ray_placement.RayPlacement(None, None, ServerSettings(data=Path("data")))
-        monkeypatch.setattr(self.placement, "host", self._host)
+        monkeypatch.setattr(self.placement, "create_actor", self._host)
         self.ends: list[ProcessExit] = []
 
     def _shutdown(self) -> None:
@@ -69,9 +69,9 @@ class Cluster(LosableCluster):
         self.may_leave.wait(HANG_S)
         super()._shutdown()
 
-    def _host(self, name: str, needs: Needs) -> Any:
+    def _host(self, name: str, needs: ResourceNeeds) -> Any:
         class Actor:
-            start = Method(lambda: Answer(Started("node", 4711)))
+            start = Method(lambda: Answer(StartResult("node", 4711)))
             post = take = stop = Method(self._never)
 
         return Actor()
@@ -123,7 +123,7 @@ def test_answers_are_kept_until_the_service_has_left_and_calls_are_made_afterwar
         cluster.may_leave.clear()
         cluster.lost = True
         assert await asyncio.to_thread(cluster.leaves.wait, HANG_S)
-        asked = cluster.placement.asked(called.append, 1)
+        asked = cluster.placement.call_ray(called.append, 1)
         await asyncio.wait_for(stopping, HANG_S)
         await others_have_called()
         gc.collect()
@@ -193,7 +193,7 @@ def test_what_ray_has_begun_is_waited_for_and_a_fault_of_one_scene_keeps_nobody(
         await cluster.started(fails)
         await cluster.started()
         begun = threading.Event()
-        call = cluster.placement.asked(lambda: begun.set() or over.wait(HANG_S))
+        call = cluster.placement.call_ray(lambda: begun.set() or over.wait(HANG_S))
         await wait_for_soon(begun.is_set)
         cluster.lost = True
         await wait_for_soon(lambda: cluster.ends)  # that it is lost is known
@@ -215,7 +215,7 @@ def test_a_service_that_cannot_give_up_what_it_has_lost_ends(cluster: Cluster, m
 
     async def test() -> None:
         with monkeypatch.context() as patch:
-            patch.setattr(cluster.placement, "_let_go", fails)
+            patch.setattr(cluster.placement, "_detach", fails)
             cluster.lost = True
             await wait_for_soon(lambda: cluster.exits)
 

@@ -35,7 +35,7 @@ def test_what_ran_is_given_up_first_and_the_service_is_announced_last(cluster: L
         cluster.events.append("announced")
 
     async def test() -> None:
-        keeping = asyncio.ensure_future(member.keep(give_up, announce))
+        keeping = asyncio.ensure_future(member.watch(give_up, announce))
         await wait_for_soon(lambda: cluster.looks_done > 3)
         assert cluster.events == ["joined"]  # nothing is lost
         cluster.refuses = 2
@@ -71,7 +71,7 @@ def test_a_silent_head_is_told_of_once_and_is_no_lost_node(
         pass
 
     async def test() -> None:
-        keeping = asyncio.ensure_future(member.keep(nothing, nothing))
+        keeping = asyncio.ensure_future(member.watch(nothing, nothing))
         await wait_for_soon(lambda: len(asked) == 2 and waits[2:] == [0.02, None])  # in vain, and it waits on
         assert member._thread._work_queue.empty()  # one question at a time
         answers.set()
@@ -107,7 +107,7 @@ def test_a_service_that_ray_does_not_let_join_again_ends(
 
     async def test() -> None:
         cluster.lost = True
-        keeping = asyncio.ensure_future(member.keep(nothing, nothing))
+        keeping = asyncio.ensure_future(member.watch(nothing, nothing))
         await wait_for_soon(lambda: ended)
         keeping.cancel()
 
@@ -131,7 +131,7 @@ def test_a_node_that_is_lost_before_the_service_is_announced_is_noticed(cluster:
 
     async def test() -> None:
         cluster.lost = True
-        keeping = asyncio.ensure_future(member.keep(lose, fails))
+        keeping = asyncio.ensure_future(member.watch(lose, fails))
         await wait_for_soon(lambda: cluster.events.count("joined") == 2)
         cluster.lost = True
         await wait_for_soon(lambda: cluster.events.count("joined") == 3)

@@ -17,7 +17,7 @@ from waiting import HANG_S, wait_for
 
 from client.wire import Cluster
 from server.processes import worker
-from server.storage.fencing import epoch_read, epochs
+from server.storage.fencing import current_epoch, epochs
 from server.storage.layout import DataFolder
 from studies.cluster.nodes import Nodes
 from studies.running.process import Service
@@ -86,7 +86,7 @@ def test_frames_are_committed_on_a_node_and_views_are_answered(service: Service,
     sent(service, scene, range(3))
     wait_for(lambda: committed(service, scene) == 3)
     assert node_of(service, nodes, scene)
-    assert epoch_read(states(service, scene)) == 0
+    assert current_epoch(states(service, scene)) == 0
     view = service.http.post(f"/v1/scenes/{scene}/render", json={"camera": "c0", "frame": 1})
     assert (view.status_code, view.headers["content-type"]) == (200, "image/png"), view.text
     found = cluster(service)
@@ -94,8 +94,8 @@ def test_frames_are_committed_on_a_node_and_views_are_answered(service: Service,
     assert len([node for node in found.nodes if node.alive]) == 3  # with the head, which has no room
     (here,) = [node for node in found.nodes if scene in node.scenes]
     assert here.cpus == 2
-    assert 1 <= here.cpus_taken <= 1.5
-    assert here.memory_taken_mb > 100
+    assert 1 <= here.cpus_reserved <= 1.5
+    assert here.memory_reserved_mb > 100
     told = service.http.get("/metrics").text
     assert f'scas4d_scene_node{{node="{here.id}",scene="{scene}"}} 1.0' in told
     assert f'scas4d_node_cpus{{host="{here.host}",node="{here.id}"}} 2.0' in told
@@ -122,7 +122,7 @@ def test_a_worker_that_dies_is_followed_by_one_of_the_next_epoch(service: Servic
     wait_for(lambda: service.status(scene).state == "updating")
     os.kill(pid, signal.SIGKILL)
     wait_for(lambda: committed(service, scene) == 4)
-    assert epoch_read(states(service, scene)) == 1
+    assert current_epoch(states(service, scene)) == 1
     assert service.status(scene).worker_deaths == 1
     assert service.deaths(scene) == 1
 
@@ -197,7 +197,7 @@ def test_scenes_are_found_again_after_the_service_was_killed(service: Service, s
     wait_for(lambda: service.http.get(f"/v1/scenes/{scene}").status_code == 200)
     sent(service, scene, range(3, 4))
     wait_for(lambda: committed(service, scene) == 4)
-    assert epoch_read(states(service, scene)) == 1
+    assert current_epoch(states(service, scene)) == 1
 
 
 def test_a_scene_waits_for_a_node_with_its_label_and_runs_there(service: Service, nodes: Nodes) -> None:

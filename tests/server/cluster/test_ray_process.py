@@ -18,16 +18,16 @@ ray_placement = pytest.importorskip(
 
 from ray.exceptions import RayActorError, RayError  # noqa: E402
 
-from server.cluster.calls import Calls  # noqa: E402
-from server.cluster.host import NodeGone, Started  # noqa: E402
-from server.cluster.needs import Needs  # noqa: E402
 from server.cluster.nodes import is_lost, own_node_is_lost  # noqa: E402
+from server.cluster.process_host import StartResult, UnexpectedExit  # noqa: E402
+from server.cluster.ray_calls import RayCalls  # noqa: E402
+from server.cluster.resource_needs import ResourceNeeds  # noqa: E402
 from server.processes.placement import ProcessExit  # noqa: E402
 from server.settings import ServerSettings  # noqa: E402
 from tests.server.cluster.others import others_have_called  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("default")
-NEEDS = Needs("worker", "scene", 1, 1)
+NEEDS = ResourceNeeds("worker", "scene", 1, 1)
 
 
 class Remote:
@@ -45,13 +45,13 @@ class FakeActor:
         self.begins.set()
         self.refuses: BaseException | None = None
         self.start, self.post = Remote(self._start), Remote(self._post)
-        self.take, self.stop = Remote(self._take), Remote(self._stop)
+        self.receive, self.stop = Remote(self._take), Remote(self._stop)
 
-    async def _start(self, entry: Any, spec: Any) -> Started:
+    async def _start(self, entry: Any, spec: Any) -> StartResult:
         await self.begins.wait()
         if self.refuses is not None:
             raise self.refuses
-        return Started("node-1", 4711)
+        return StartResult("node-1", 4711)
 
     async def _post(self, number: int, message: Any) -> None:
         self.posted.append((number, message))
@@ -68,15 +68,15 @@ class FakeActor:
 
 class FakePlacement:
     def __init__(self) -> None:
-        self.places: dict[str, Any] = {}
+        self.placed: dict[str, Any] = {}
         self.actor = FakeActor()
         self.may_make, self.makes = threading.Event(), threading.Event()
         self.may_make.set()
 
-    def asked(self, function: Callable[..., Any], *arguments: Any) -> asyncio.Future[Any]:
+    def call_ray(self, function: Callable[..., Any], *arguments: Any) -> asyncio.Future[Any]:
         return asyncio.get_running_loop().run_in_executor(None, function, *arguments)
 
-    def host(self, name: str, needs: Needs) -> FakeActor:
+    def create_actor(self, name: str, needs: ResourceNeeds) -> FakeActor:
         self.makes.set()
         self.may_make.wait(HANG_S)
         return self.actor
@@ -169,13 +169,13 @@ def test_one_that_is_lost_with_its_cluster_is_told_and_not_asked_again(killed: l
     async def test(placement: FakePlacement) -> None:
         running = Running(placement)
         await wait_for_soon(lambda: running.process.pid)
-        running.process.lose()
+        running.process.mark_lost()
         (end,) = running.ends
         assert end.lost
         await running.process.stop(0.05)
-        running.process.lose()
+        running.process.mark_lost()
         assert running.ends == [end]
-        assert placement.places == {}
+        assert placement.placed == {}
         assert killed == []
 
     run(test)
@@ -186,15 +186,15 @@ def test_one_that_waits_to_begin_when_it_is_lost_is_not_made(killed: list[Any]) 
     made: list[str] = []
 
     async def test(placement: FakePlacement) -> None:
-        calls = Calls()
-        placement.asked = calls.asked  # type: ignore[method-assign]
+        calls = RayCalls()
+        placement.call_ray = calls.call  # type: ignore[method-assign]
         placement.host = lambda name, needs: made.append(name)  # type: ignore[method-assign,assignment,return-value]
-        calls.hold()
+        calls.suspend()
         running = Running(placement)
-        await wait_for_soon(lambda: calls._may_begin._waiters)
-        running.process.lose()
-        await running.process.let_go()
-        calls.go_on()
+        await wait_for_soon(lambda: calls._enabled._waiters)
+        running.process.mark_lost()
+        await running.process.detach()
+        calls.resume()
         await others_have_called()
         assert made == []
         assert running.ends[0].lost
@@ -206,7 +206,7 @@ def test_one_that_is_let_go_asks_nothing_more(killed: list[Any]) -> None:
     async def test(placement: FakePlacement) -> None:
         running = Running(placement)
         await wait_for_soon(lambda: running.process.pid)
-        await running.process.let_go()
+        await running.process.detach()
         running.process.send("a")
         placement.actor.said.put_nowait("b")
         await running.process.stop(0.05)
@@ -228,8 +228,8 @@ def test_one_that_is_stopped_when_the_cluster_is_lost_is_not_waited_for(killed: 
         await wait_for_soon(lambda: running.process.pid)
         stopping = asyncio.ensure_future(running.process.stop(100))
         await stops.wait()
-        running.process.lose()
-        await running.process.let_go()
+        running.process.mark_lost()
+        await running.process.detach()
         await asyncio.wait_for(stopping, HANG_S)
         assert running.ends == []
         assert killed == []
@@ -244,7 +244,7 @@ def test_an_actor_that_cannot_be_made_is_no_lost_node(killed: list[Any]) -> None
         await wait_for_soon(lambda: running.ends)
         (end,) = running.ends
         assert not end.lost
-        assert placement.places == {}
+        assert placement.placed == {}
 
     run(test)
 
@@ -264,7 +264,7 @@ def test_a_message_that_cannot_be_taken_in_does_not_end_the_others(killed: list[
     async def test(placement: FakePlacement) -> None:
         running = Running(placement)
         running.raises = KeyError("x")
-        for message in ("a", "b", NodeGone(3)):
+        for message in ("a", "b", UnexpectedExit(3)):
             placement.actor.said.put_nowait(message)
         await wait_for_soon(lambda: running.ends)
         assert running.messages == ["a", "b"]
@@ -286,7 +286,7 @@ def test_one_that_is_given_up_before_it_has_begun_is_not_listed(killed: list[Any
         await wait_for_soon(lambda: running.ends)
         placement.actor.begins.set()
         await wait_for_soon(lambda: running.process.pid)
-        assert not placement.places
+        assert not placement.placed
 
     run(test)
 
@@ -309,7 +309,7 @@ def test_one_that_is_stopped_while_the_head_is_silent_is_killed_later(
 
 def test_nodes_are_not_asked_for_in_another_loop_than_they_are_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
     """`open` runs in a loop of its own: an answer that came after its end was waited for without end."""
-    for name in ("check_folder", "mark"):
+    for name in ("check_folder", "write_marker"):
         monkeypatch.setattr(ray_placement, name, lambda *arguments: None)
     node = {"NodeID": "a", "NodeManagerHostname": "host", "Alive": True}
     monkeypatch.setattr(ray_placement, "all_nodes", lambda: [node])

@@ -11,7 +11,7 @@ from peers import GET, HOST, LARGE_MB, SHORT, Peer, drip, put, refused, stub
 from waiting import wait_for
 
 from server.connections import guard
-from server.connections.connection import Connection
+from server.connections.connection import GuardedConnection
 from server.connections.guard import LINGER_S
 
 
@@ -93,7 +93,7 @@ def test_small_pieces_grow_without_being_copied():
     pieces = []
     for first in (b"a", b"a" * 100_000):
         cycle = Cycle()
-        connection = Connection.__new__(Connection)
+        connection = GuardedConnection.__new__(GuardedConnection)
         connection.__dict__.update(_fault=None, _delivered=0, _left=None, cycle=cycle)
         connection._record = type("OpenConnection", (), {"body": 0})()
         connection.parser = type("Parser", (), {"should_upgrade": lambda self: False})()

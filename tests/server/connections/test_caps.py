@@ -11,7 +11,7 @@ import pytest
 from peers import GET, HOST, Peer, put, refused, stub
 from waiting import HANG_S, wait_for
 
-from server.connections import guard, process
+from server.connections import guard, process_limits
 from server.connections.guard import peer_key
 
 LONG = dict(header_seconds=60, body_seconds=60, keep_alive_seconds=60)
@@ -185,7 +185,7 @@ def test_uploads_of_one_peer_do_not_keep_out_another_request():
 def test_there_is_a_file_for_every_connection():
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     try:
-        assert process.room_for_connections(10) == 10
-        assert 10 < process.room_for_connections(1 << 40) < 1 << 40
+        assert process_limits.raise_open_file_limit(10) == 10
+        assert 10 < process_limits.raise_open_file_limit(1 << 40) < 1 << 40
     finally:
         resource.setrlimit(resource.RLIMIT_NOFILE, before)

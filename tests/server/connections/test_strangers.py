@@ -28,7 +28,7 @@ def running(request, tmp_path_factory):
 
 @pytest.fixture
 def sdk(running):
-    with Client(running.url, token=running.token, patience=HANG_S) as client:
+    with Client(running.url, token=running.token, busy_timeout=HANG_S) as client:
         yield client
 
 

@@ -12,28 +12,28 @@ from prometheus_client.exposition import generate_latest
 from running import Running, fake_settings
 from waiting import HANG_S
 
-from client.wire import Cluster, Node, Waiting
-from server.health.metrics import of_cluster
+from client.wire import Cluster, Node, WaitingProcess
+from server.health.metrics import cluster_gauges
 
 ALIVE = Node(
     id="n1",
     host="stage-1",
     alive=True,
     cpus=8,
-    cpus_taken=1.25,
+    cpus_reserved=1.25,
     gpus=0,
     memory_mb=16_000,
-    memory_taken_mb=900.5,
+    memory_reserved_mb=900.5,
     scenes=["s1"],
 )
 LOST = ALIVE.model_copy(update={"id": "n2", "host": "stage-2", "alive": False, "scenes": []})
-WAITS = Waiting(scene="s2", role="worker", needs="1 CPU", seconds=9)
+WAITS = WaitingProcess(scene="s2", role="worker", needs="1 CPU", seconds=9)
 
 
 def written(cluster: Cluster) -> dict[str, float]:
     class Collector:
         def collect(self) -> Iterator[object]:
-            return of_cluster(cluster)
+            return cluster_gauges(cluster)
 
     registry = CollectorRegistry()
     registry.register(Collector())  # type: ignore[arg-type]
@@ -47,16 +47,16 @@ def test_nodes_scenes_and_what_waits() -> None:
         'scas4d_node_up{host="stage-1",node="n1"}': 1,
         'scas4d_node_up{host="stage-2",node="n2"}': 0,
         'scas4d_node_cpus{host="stage-1",node="n1"}': 8,
-        'scas4d_node_cpus_taken{host="stage-1",node="n1"}': 1.25,
+        'scas4d_node_cpus_reserved{host="stage-1",node="n1"}': 1.25,
         'scas4d_node_memory_bytes{host="stage-1",node="n1"}': 16e9,
-        'scas4d_node_memory_taken_bytes{host="stage-1",node="n1"}': 900.5e6,
+        'scas4d_node_memory_reserved_bytes{host="stage-1",node="n1"}': 900.5e6,
         'scas4d_scene_node{node="n1",scene="s1"}': 1,
         'scas4d_processes_waiting{role="worker"}': 2,
     }
 
 
 def test_a_head_that_does_not_answer_tells_no_node() -> None:
-    found = written(Cluster(placement="ray", nodes=[ALIVE], waiting=[], answers=False))
+    found = written(Cluster(placement="ray", nodes=[ALIVE], waiting=[], head_responds=False))
     assert found == {
         "scas4d_cluster_up": 0,
         'scas4d_scene_node{node="n1",scene="s1"}': 1,

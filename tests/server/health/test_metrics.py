@@ -42,7 +42,7 @@ def test_what_happens_to_frames_and_questions_is_counted(http, sdk, scene):
     sent = sum(map(len, pictures().values()))
     assert 2 * sent <= risen("scas4d_ingest_bytes_total") <= 2 * sent + 4096
     assert risen("scas4d_update_seconds_count", "update") == 2
-    assert risen("scas4d_answer_seconds_count", "answered", "render") == 1
+    assert risen("scas4d_query_seconds_count", "answered", "render") == 1
     assert after["scas4d_queue_frames", scene] == 0
     assert after["scas4d_committed_frames", scene] == 2
     assert after["scas4d_subscribers",] == 0

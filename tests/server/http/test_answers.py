@@ -11,7 +11,7 @@ from running import Running, fake_settings, picture, pictures, problem
 from waiting import HANG_S
 
 from client.sdk import Client
-from server.http.unchanging import disposition
+from server.http.immutable import content_disposition
 from server.routes import health
 
 NAME = next(iter(pictures()))
@@ -150,10 +150,10 @@ def test_a_render_is_named(http, committed):
 
 
 def test_names_of_files_are_safe_in_a_header():
-    assert disposition('a"b\\c/\r\n.png') == (
+    assert content_disposition('a"b\\c/\r\n.png') == (
         "attachment; filename=\"a_b_c___.png\"; filename*=UTF-8''a%22b%5Cc%2F%0D%0A.png"
     )
-    assert disposition("vorn–links.png").endswith("filename*=UTF-8''vorn%E2%80%93links.png")
+    assert content_disposition("vorn–links.png").endswith("filename*=UTF-8''vorn%E2%80%93links.png")
 
 
 def test_a_full_disk_ends_ingest_and_not_the_service(tmp_path, monkeypatch):

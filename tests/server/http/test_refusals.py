@@ -16,7 +16,7 @@ CUT_JPEG, CUT_PNG = picture(format="JPEG")[:-9], picture()[:-9]
 @pytest.fixture(scope="module")
 def here(service):
     """A scene of two cameras with one committed frame."""
-    with Client(service.url, patience=HANG_S) as sdk:
+    with Client(service.url, busy_timeout=HANG_S) as sdk:
         id = sdk.create_scene(make_rig()).id
         sdk.put_frame(id, 0, pictures())
         sdk.wait(id, 0)
@@ -41,7 +41,7 @@ QUERIES = {
     "tracks?pixels=1,2&camera=c0": ("pixels", "1,2", "'pixel'"),
     "tracks?pixel=99,2&camera=c0": ("pixels", "[99.0, 2.0]", "0 ≤ u < 24"),
     "tracks?pixel=1,2": ("camera", "nothing", "c0, c1"),
-    "tracks?ids=99": ("ids", "[99]", "out of an answer"),
+    "tracks?ids=99": ("ids", "[99]", "from an answer"),
     "tracks?ids=0&from=7": ("from", "7", "0 to 0"),
     "tracks": ("ids", "none", "exactly one of"),
     "parts?cont=3": ("cont", "3", "'count'"),

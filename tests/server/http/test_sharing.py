@@ -155,7 +155,7 @@ def test_it_ends(running, owner, scenes, monkeypatch):
         assert http.get("/v1/scenes").status_code == 200
         now = sharing.time.time()
         monkeypatch.setattr(sharing.time, "time", lambda: now + 61)
-        assert "has ended" in problem(http.get("/v1/scenes"), 401)["detail"]
+        assert "has expired" in problem(http.get("/v1/scenes"), 401)["detail"]
 
 
 def test_a_stream_ends_with_its_link(running, owner, scenes):
@@ -171,7 +171,7 @@ def test_a_stream_ends_with_its_link(running, owner, scenes):
                 except websockets.ConnectionClosed as closed:
                     return closed.rcvd.code, closed.rcvd.reason
 
-    assert asyncio.run(run(2)) == (1008, "the link has ended")
+    assert asyncio.run(run(2)) == (1008, "the link has expired")
     assert asyncio.run(run(60)) is None
 
 

@@ -35,8 +35,8 @@ BAD = {
     "wrong size": (lambda: picture(size=(WIDTH + 1, HEIGHT)), f"{WIDTH + 1}x{HEIGHT}", "size the camera was"),
     "16 bits": (sixteen_bits, "16 bits", "send 8 bits"),
     "CMYK": (lambda: picture(format="JPEG", mode="CMYK"), "CMYK", "send RGB or grey"),
-    "animated PNG": (animated, "animated", "one picture a file"),
-    "animated WebP": (animated_webp, "animated", "one picture a file"),
+    "animated PNG": (animated, "animated", "one picture per file"),
+    "animated WebP": (animated_webp, "animated", "one picture per file"),
     "50,000 x 50,000 header": (lambda: declares(50_000, 50_000), "50000x50000", "size the camera was"),
     "no picture": (lambda: b"GIF89a or so", "bytes", "encode the picture"),
 }

@@ -14,7 +14,7 @@ from sending import FRAMED, create, finished, framed, put_framed, status
 from waiting import HANG_S
 
 from client.wire.framing import MAX_HEAD, PREFIX
-from server.ingest.receive import Receiving, read_framed
+from server.ingest.receive import FrameReceiver, read_framed
 
 
 def with_head(head, *files):
@@ -92,7 +92,7 @@ def test_a_body_is_read_in_whatever_pieces_it_arrives(tmp_path, cuts):
             yield body[begin:end]
 
     def begin(head):
-        return Receiving(tmp_path, head, None, lambda file, data: None, keep=False)
+        return FrameReceiver(tmp_path, head, None, lambda file, data: None, keep=False)
 
     async def read():
         head, receiving = await read_framed(pieces(), begin, len(body))

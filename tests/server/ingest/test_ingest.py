@@ -136,14 +136,14 @@ def test_a_frame_is_closed_on_request_down_to_the_minimum(http, make):
 
 
 def test_a_frame_is_closed_at_its_deadline(http, make):
-    id = make(2, part_seconds=0.3)
+    id = make(2, open_frame_seconds=0.3)
     put_camera(http, id, 0, "c1", picture())
     report = finished(http, id, 0)
     assert (report["state"], report["used_cameras"]) == ("committed", ["c1"])
 
 
 def test_fewer_cameras_than_the_minimum_set_the_frame_aside(http, make):
-    id = make(2, part_seconds=0.2, minimum_cameras=2)
+    id = make(2, open_frame_seconds=0.2, minimum_cameras=2)
     put_camera(http, id, 0, "c1", picture())
     report = finished(http, id, 0)
     assert (report["state"], report["error"]) == (
@@ -294,7 +294,7 @@ def test_a_scene_has_only_so_many_sending_websockets(http, make, service, monkey
     id = make()
     address = f"{service.url.replace('http', 'ws')}/v1/scenes/{id}/ingest"
     most = 3
-    monkeypatch.setattr(acknowledge, "MOST_SOCKETS", most)
+    monkeypatch.setattr(acknowledge, "MAX_SOCKETS", most)
     with contextlib.ExitStack() as stack:
         sockets = [stack.enter_context(connect(address)) for _ in range(most)]
         with pytest.raises(InvalidStatus) as refused:

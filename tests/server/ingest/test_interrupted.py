@@ -37,7 +37,7 @@ def test_a_refused_sender_that_goes_in_the_middle_leaves_the_frame_free(http, ma
     with socket.create_connection(("127.0.0.1", service.port)) as sender:
         sender.sendall(f"{head}Content-Length: {len(body)}\r\n\r\n".encode() + body[:-400_000])
         assert refused.wait(HANG_S)
-    wait_for(lambda: ingest._coming == {})
+    wait_for(lambda: ingest._receiving == {})
     assert http.post(f"/v1/scenes/{id}/frames/0/missing").json()["state"] == "missing"
 
 
@@ -131,7 +131,7 @@ def test_a_scene_that_failed_is_found_with_nothing_waiting(tmp_path):
     asyncio.run(write())
     found = recover(SceneFolder(tmp_path), "s")
     assert found.ledger.waiting() == []
-    assert [(event.index, event.fact) for event in found.events] == [(1, "failed")]
+    assert [(event.index, event.type) for event in found.events] == [(1, "frame_failed")]
     assert "told to" in found.ledger.frames[1].report.error
 
 

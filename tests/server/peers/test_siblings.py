@@ -40,7 +40,7 @@ RUNNING, GONE = [], []
 class Together(Placement):
     """Placement of services that know one another by a list."""
 
-    has_siblings = True
+    has_peers = True
 
     async def peers(self):
         return [one.url for one in RUNNING if one.app.state.placement is not self] + GONE
@@ -146,10 +146,12 @@ def test_the_cluster_is_told_with_the_scenes_of_every_service(services, other):
     told = [client.get("/v1/cluster").json() for client in (first, second, third)]
     assert all(id in found["nodes"][0]["scenes"] for found in told)
     assert len({json.dumps(found["nodes"]) for found in told}) == 1
-    own = [client.get("/v1/cluster", headers={module.PASSED: "1"}).json()["nodes"][0] for client in (first, second)]
+    own = [
+        client.get("/v1/cluster", headers={module.PROXIED_HEADER: "1"}).json()["nodes"][0] for client in (first, second)
+    ]
     assert id in own[0]["scenes"]
     assert id not in own[1]["scenes"]
-    assert told[1]["nodes"][0]["cpus_taken"] >= own[0]["cpus_taken"] + own[1]["cpus_taken"] >= 1
+    assert told[1]["nodes"][0]["cpus_reserved"] >= own[0]["cpus_reserved"] + own[1]["cpus_reserved"] >= 1
     GONE.append("http://127.0.0.1:9")
     try:
         wait_for(lambda: "x-unreachable" in second.get("/v1/cluster").headers)
@@ -165,7 +167,7 @@ def test_streams_and_ingest_by_websocket(services, other):
     with connect(f"{url}/v1/scenes/{id}/ingest", additional_headers=headers) as socket:
         socket.send(framed(2, pictures(2)))
         assert '"status":202' in socket.recv().replace(" ", "")
-    with Client(str(second.base_url).rstrip("/"), token=token, patience=HANG_S) as sdk:
+    with Client(str(second.base_url).rstrip("/"), token=token, busy_timeout=HANG_S) as sdk:
         sdk.wait(id, 2)
         image = sdk.render(id, "c0", 2)
     assert image.shape[2] == 3
@@ -211,7 +213,7 @@ def test_who_may_only_read_one_scene_may_no_more_elsewhere(services, other):
     assert problem(second.delete(f"/v1/scenes/{id}", headers=link), 403)
     assert [one["id"] for one in second.get("/v1/scenes", headers=link).json()["scenes"]] == [id]
     assert problem(second.get(f"/v1/scenes/{id}", headers={"Authorization": "Bearer wrong"}), 401)
-    assert problem(second.get(f"/v1/scenes/{id}", headers={"X-Scas4d-Passed": "1"}), 404)
+    assert problem(second.get(f"/v1/scenes/{id}", headers={"X-Scas4d-Proxied": "1"}), 404)
 
 
 def test_a_service_that_does_not_answer_is_no_scene_that_is_not_there(services, other, fresh):

@@ -20,7 +20,7 @@ from waiting import HANG_S, wait_for
 
 from client.sdk import Client
 from client.wire import CameraModel, part_colour
-from server.processes import query_queue, renderer
+from server.processes import query_executor, reader_process
 from server.processes.placement import ProcessExit
 from server.processes.queries import Answer
 
@@ -28,7 +28,7 @@ from server.processes.queries import Answer
 @pytest.fixture(scope="module")
 def impatient(tmp_path_factory):
     """A service that soon gives up waiting for an answer; long enough for a process to start on a busy machine."""
-    with mock.patch.object(query_queue, "ANSWER_SECONDS", 15.0):
+    with mock.patch.object(query_executor, "ANSWER_SECONDS", 15.0):
         running = Running(fake_settings(tmp_path_factory.mktemp("data")))
         yield running
         running.stop()
@@ -37,7 +37,10 @@ def impatient(tmp_path_factory):
 @contextlib.contextmanager
 def two_frames(impatient):
     """A scene of two frames: id, its readers, and a client."""
-    with Client(impatient.url, patience=HANG_S) as sdk, httpx.Client(base_url=impatient.url, timeout=HANG_S) as http:
+    with (
+        Client(impatient.url, busy_timeout=HANG_S) as sdk,
+        httpx.Client(base_url=impatient.url, timeout=HANG_S) as http,
+    ):
         id = sdk.create_scene(make_rig(), frames_per_second=10).id
         for index in range(2):
             sdk.put_frame(id, index, pictures())
@@ -136,7 +139,7 @@ def test_the_process_for_bulk_starts_with_the_first_question_and_yields_to_the_o
 
 def test_too_many_questions_are_refused(scene, monkeypatch):
     id, readers, http = scene
-    monkeypatch.setattr(query_queue, "MOST_WAITING", 1)
+    monkeypatch.setattr(query_executor, "MOST_WAITING", 1)
     hanging = in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}"))
     wait_for(lambda: readers.bulk._at_work is not None)
     in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids=0"))
@@ -148,7 +151,7 @@ def test_too_many_questions_are_refused(scene, monkeypatch):
 
 
 def test_deleting_a_scene_answers_whoever_waits(service):
-    with Client(service.url, patience=HANG_S) as sdk, httpx.Client(base_url=service.url, timeout=HANG_S) as http:
+    with Client(service.url, busy_timeout=HANG_S) as sdk, httpx.Client(base_url=service.url, timeout=HANG_S) as http:
         id = sdk.create_scene(make_rig()).id
         sdk.put_frame(id, 0, pictures())
         sdk.wait(id, 0)
@@ -157,7 +160,7 @@ def test_deleting_a_scene_answers_whoever_waits(service):
         wait_for(lambda: readers.bulk._at_work is not None)
         processes = [readers.views.process._process, readers.bulk.process._process]
         sdk.delete_scene(id)
-        assert "ended" in problem(hanging.result(HANG_S), 503)["detail"]
+        assert "closed" in problem(hanging.result(HANG_S), 503)["detail"]
         for process in processes:
             with pytest.raises(ValueError, match="closed"):
                 process.is_alive()
@@ -167,7 +170,7 @@ def test_new_frames_are_seen_without_a_new_process(scene):
     id, readers, http = scene
     assert http.get(f"/v1/scenes/{id}/tracks?ids=0").json()["frames"] == [0, 1]
     before = readers.views.process.pid, readers.bulk.process.pid
-    with Client(str(http.base_url), patience=HANG_S) as sdk:
+    with Client(str(http.base_url), busy_timeout=HANG_S) as sdk:
         for index in (2, 3):
             sdk.put_frame(id, index, pictures())
             sdk.wait(id, index)
@@ -180,7 +183,7 @@ def test_views_of_parts_never_wait_for_parts_but_the_first_time(scene):
     id, readers, http = scene
     address = f"/v1/scenes/{id}/render?kind=parts&parts=2"
     assert http.get(address).headers["x-parts-frame"] == "1"
-    with Client(str(http.base_url), patience=HANG_S) as sdk:
+    with Client(str(http.base_url), busy_timeout=HANG_S) as sdk:
         sdk.put_frame(id, 2, pictures())
         sdk.wait(id, 2)
     in_the_background(lambda: http.get(f"/v1/scenes/{id}/tracks?ids={fakes.HANGS}", timeout=2.0))
@@ -243,7 +246,7 @@ def test_parts_are_labels_with_colours_that_stay(still):
     picture = Image.open(io.BytesIO(http.get(f"/v1/scenes/{id}/render?kind=parts&parts=2").content))
     assert picture.mode == "P"
     assert np.array(picture)[3, 3] == 2
-    palette = np.array(renderer.part_colours()).reshape(256, 3)
+    palette = np.array(reader_process.part_colours()).reshape(256, 3)
     assert palette[0].tolist() == [0, 0, 0]
     assert tuple(palette[2]) == part_colour(1)
     assert picture.convert("RGB").getpixel((3, 3)) == tuple(palette[2])
@@ -322,13 +325,13 @@ class FakePlacement:
 @pytest.mark.parametrize(("lost", "times", "status"), [(True, 1, None), (True, 2, 503), (False, 1, 500)])
 def test_a_query_whose_reader_is_lost_with_its_machine_goes_to_the_next(monkeypatch, lost, times, status):
     """A machine that is lost is no fault of the query; one that two of them are lost with may be."""
-    monkeypatch.setattr(query_queue, "FIRST_PAUSE_S", 0.01)
+    monkeypatch.setattr(query_executor, "FIRST_PAUSE_S", 0.01)
     placement = FakePlacement()
     spec = mock.Mock()
     spec.folder.name = "scene"
 
     async def asks():
-        queue = query_queue.QueryQueue(None, spec, placement, grace=1.0, damaged=lambda files: None)
+        queue = query_executor.QueryExecutor(None, spec, placement, grace=1.0, damaged=lambda files: None)
         asking = asyncio.ensure_future(queue.ask(mock.Mock(kind="render")))
         for number in range(1, times + 1):
             while len(placement.started) < number or not placement.started[-1].asked:

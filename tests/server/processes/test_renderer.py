@@ -12,9 +12,9 @@ from running import make_rig
 from scas4d_core.settings import Settings
 from scas4d_core.storage.history import History
 from server.messages import SceneSpec
-from server.processes.part_labels import fitted
-from server.processes.queries import Answer, AskedQuery, GaussiansQuery, PartsQuery, Refused, RenderQuery
-from server.processes.renderer import Renderer
+from server.processes.part_labels import resize_labels
+from server.processes.queries import Answer, GaussiansQuery, NumberedQuery, PartsQuery, QueryRefused, RenderQuery
+from server.processes.reader_process import QueryReader
 from server.storage.layout import SceneFolder
 
 
@@ -25,11 +25,11 @@ def renderer(tmp_path):
     history.append(0, 0.0, first.replace(foreground=np.ones(40, np.float32)))
     history.append(3, 0.1, history.newest.concatenate(history.newest.rows([4, 5])).retire([7]))
     history.append(5, 0.2, history.newest.revive([7]).retire([41]))
-    return Renderer(SceneSpec(SceneFolder(tmp_path), make_rig(), Settings()))
+    return QueryReader(SceneSpec(SceneFolder(tmp_path), make_rig(), Settings()))
 
 
 def test_lives(renderer):
-    found = renderer.answer(AskedQuery(1, GaussiansQuery((141, 107, 100))))
+    found = renderer.answer(NumberedQuery(1, GaussiansQuery((141, 107, 100))))
     assert isinstance(found, Answer)
     assert json.loads(found.body) == {
         "frame": 5,
@@ -39,13 +39,13 @@ def test_lives(renderer):
             {"id": 100, "born": 0, "retired": [], "revived": []},
         ],
     }
-    refused = renderer.answer(AskedQuery(2, GaussiansQuery((141, 142))))
-    assert isinstance(refused, Refused)
+    refused = renderer.answer(NumberedQuery(2, GaussiansQuery((141, 142))))
+    assert isinstance(refused, QueryRefused)
     assert (refused.status, "[142]" in refused.fault, refused.remedy != "") == (404, True, True)
 
 
 def test_parts_have_a_label_for_each_and_views_of_any_frame_take_them(renderer):
-    found = renderer.answer(AskedQuery(1, PartsQuery(2)))
+    found = renderer.answer(NumberedQuery(1, PartsQuery(2)))
     assert isinstance(found, Answer), found
     parts = json.loads(found.body)
     assert parts["ids"] == list(range(100, 142))
@@ -55,11 +55,11 @@ def test_parts_have_a_label_for_each_and_views_of_any_frame_take_them(renderer):
     for frame in (0, 3, 5):
         for given in (labels, labels[:40]):
             query = RenderQuery(camera, frame, ("parts",), "npz", (0.0, 0.0, 0.0), parts=2, labels=given)
-            assert isinstance(renderer.answer(AskedQuery(2, query)), Answer)
+            assert isinstance(renderer.answer(NumberedQuery(2, query)), Answer)
 
 
 def test_labels_are_fitted():
     labels = np.array([2, 0, 1], np.int16)
-    assert fitted(labels, 5).tolist() == [2, 0, 1, -1, -1]
-    assert fitted(labels, 2).tolist() == [2, 0]
-    assert fitted(labels, 3).dtype == np.int16
+    assert resize_labels(labels, 5).tolist() == [2, 0, 1, -1, -1]
+    assert resize_labels(labels, 2).tolist() == [2, 0]
+    assert resize_labels(labels, 3).dtype == np.int16

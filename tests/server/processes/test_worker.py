@@ -39,12 +39,12 @@ def test_kernels_are_compiled_before_they_are_called(tmp_path, monkeypatch, poin
     ours, theirs = Pipe()
     with ours, theirs:
         first = Worker(spec, theirs)
-        assert first.open()
+        assert first.resume()
         assert asked == []  # nothing to reconstruct yet
         images = {name: np.zeros((HEIGHT, WIDTH, 3), np.uint8) for name in spec.rig.names}
         first.reconstruct(Frame(0, 0.0, images, {}), {}, Budget(), time.perf_counter())
         first.reconstruct(Frame(1, 0.1, images, {}), {}, Budget(), time.perf_counter())
-        assert Worker(spec, theirs).open()
+        assert Worker(spec, theirs).resume()
         said = []
         while ours.poll():
             said.append(ours.recv())

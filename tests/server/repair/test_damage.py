@@ -30,7 +30,10 @@ NEVER = {"scrub_mb_per_second": 0}
 def serving(folder, **changes):
     running = Running(fake_settings(folder, **changes))
     try:
-        with httpx.Client(base_url=running.url, timeout=HANG_S) as http, Client(running.url, patience=HANG_S) as sdk:
+        with (
+            httpx.Client(base_url=running.url, timeout=HANG_S) as http,
+            Client(running.url, busy_timeout=HANG_S) as sdk,
+        ):
             yield http, sdk
     finally:
         running.stop()
@@ -313,12 +316,12 @@ def test_the_metrics_count_what_is_found_and_read(tmp_path):
 def test_sentences_are_bounded_and_counted():
     log = DamageLog(["a"])
     for _ in range(2):
-        log.say(DamageKind.STATE, "b /tmp/x/b.npz", lasting=True)
+        log.add(DamageKind.STATE, "b /tmp/x/b.npz", lasting=True)
     assert log.sentences == ["a", "b b.npz"]
-    log.say(DamageKind.STATE, "b /tmp/x/b.npz")
+    log.add(DamageKind.STATE, "b /tmp/x/b.npz")
     assert log.sentences == ["a", "b b.npz (2 times)"]
     for number in range(SENTENCES_KEPT):
-        log.say(DamageKind.FRAME, f"{number}")
+        log.add(DamageKind.FRAME, f"{number}")
     assert len(log.sentences) == SENTENCES_KEPT + 1
     assert log.sentences[0].startswith("2 more")
 

@@ -131,7 +131,7 @@ def test_a_frame_that_kills_its_worker_twice_is_set_aside_and_the_scene_goes_on(
     sdk.wait(scene, 0)
     sdk.put_frame(scene, 1, pictures(fakes.DIES))
     report = sdk.wait(scene, 1)
-    assert (report.state, report.attempts) == ("failed", 2)
+    assert (report.state, report.worker_deaths) == ("failed", 2)
     assert "exit code 7" in report.error
     status = sdk.scene(scene)
     assert (status.state, status.worker_deaths) == ("degraded", 2)

@@ -24,7 +24,7 @@ FRAMES = 6
 @pytest.fixture(scope="module")
 def finished(service):
     """A scene of six frames."""
-    with Client(service.url, patience=HANG_S) as sdk:
+    with Client(service.url, busy_timeout=HANG_S) as sdk:
         id = sdk.create_scene(make_rig(), frames_per_second=10).id
         for index in range(FRAMES):
             sdk.put_frame(id, index, pictures())
@@ -106,7 +106,7 @@ def test_pieces_cover_everything_once_within_their_bounds():
     query = TracksQuery(
         frames=tuple(range(0, 200, 2)), at=0, points=np.arange(15000.0).reshape(5000, 3), project=cameras
     )
-    pieces = track_answers.pieces(query)
+    pieces = track_answers.split_query(query)
     assert [len(row[0].points) for row in pieces] == [2048, 2048, 904]
     for row in pieces:
         assert sum((piece.frames for piece in row), ()) == query.frames
@@ -116,7 +116,7 @@ def test_pieces_cover_everything_once_within_their_bounds():
             assert (piece.at, piece.format, piece.project) == (0, "npz", cameras)
     np.testing.assert_array_equal(np.concatenate([row[0].points for row in pieces]), query.points)
     few = replace(query, points=query.points[:3], frames=(4, 5))
-    assert [[piece.frames for piece in row] for row in track_answers.pieces(few)] == [[(4, 5)]]
+    assert [[piece.frames for piece in row] for row in track_answers.split_query(few)] == [[(4, 5)]]
 
 
 def test_a_long_history_is_read_a_frame_at_a_time(tmp_path, monkeypatch):
@@ -134,7 +134,7 @@ def test_a_long_history_is_read_a_frame_at_a_time(tmp_path, monkeypatch):
     monkeypatch.setattr(History, "stacked", noting)
     reader = fakes.FakeCommitted(history, make_rig().world_frame(), None)
     query = TracksQuery(frames=tuple(range(30)), at=0, points=points)
-    found = track_answers.find(reader, history, query)
+    found = track_answers.compute_tracks(reader, history, query)
     assert found["tracks_world"].shape == (30, 2, 3)
     assert max(len(indices) for indices in reads) == 1
 

@@ -201,7 +201,7 @@ def test_a_scene_is_exported_by_the_command(service, finished, tmp_path, monkeyp
     for wrong, says in (
         (("--format", "obj"), "is not known"),
         (("--format", "ply", "--frames", "7:9"), "7"),
-        (("--format", "ply", "--frames", "x"), "no range"),
+        (("--format", "ply", "--frames", "x"), "not a range"),
         (("--format", "ply", "--id", "3"), "leave --id out"),
         (("--format", "usd", "--out", "a.ply"), ".usdc"),
     ):

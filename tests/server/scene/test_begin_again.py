@@ -418,7 +418,7 @@ def test_an_upload_that_is_under_way_is_asked_for_again(http, sdk, service, make
 
     thread = threading.Thread(target=send)
     thread.start()
-    wait_for(lambda: service.app.state.scenes[id].ingest.is_coming(1))
+    wait_for(lambda: service.app.state.scenes[id].ingest.is_receiving(1))
     begun(http, id, 1)
     go_on.set()
     thread.join(HANG_S)

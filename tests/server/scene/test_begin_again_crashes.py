@@ -13,9 +13,9 @@ from sending import create, put_form, serving, settled, status, wait_for
 
 from client.wire import ReconstructionRequest
 from scas4d_core.storage.history import History
-from server.scene import beginning, found
+from server.scene import new_reconstruction, stored_scene
 from server.storage.events import FrameAccepted, FrameFailed, PicturesDeleted, ReconstructionBegun, StatesDeleted
-from server.storage.journal import Journal, bytes_of, read_journal
+from server.storage.journal import Journal, encode_events, read_journal
 from server.storage.layout import DataFolder
 from server.storage.ledger import Ledger
 from server.storage.recovery import NO_STATE, recover
@@ -66,7 +66,7 @@ def crashes(monkeypatch):
                 step("event", self.path.parent.name, self.path.parent)
             await super().append(*events)
 
-    write, bury = found.write_definition, DataFolder.bury
+    write, bury = stored_scene.write_definition, DataFolder.move_to_deleted
 
     def definition(folder, given):
         step("definition", folder.name, folder.path)
@@ -77,9 +77,9 @@ def crashes(monkeypatch):
             step(f"move {path.name}", path.parent.name, path.parent)
         return bury(self, path, name)
 
-    monkeypatch.setattr(beginning, "Journal", Watched)
-    monkeypatch.setattr(found, "write_definition", definition)
-    monkeypatch.setattr(DataFolder, "bury", moved)
+    monkeypatch.setattr(new_reconstruction, "Journal", Watched)
+    monkeypatch.setattr(stored_scene, "write_definition", definition)
+    monkeypatch.setattr(DataFolder, "move_to_deleted", moved)
     return at, reached
 
 
@@ -127,11 +127,15 @@ def test_a_torn_event_never_was(tmp_path, crashes):
     folder = DataFolder(tmp_path / "crashed").scene(id)
     content = folder.journal.read_bytes()
     (event,) = (event for event in read_journal(folder.journal).events if isinstance(event, ReconstructionBegun))
-    start = len(content) - len(bytes_of([event]))
+    start = len(content) - len(encode_events([event]))
     for end in range(start, len(content), 37):
         folder.journal.write_bytes(content[:end])
         found = recover(folder, id)
-        assert (found.ledger.reconstruction, list(found.ledger.committed), found.good) == (0, [0, 2], start)
+        assert (found.ledger.reconstruction, list(found.ledger.committed), found.good) == (
+            0,
+            [0, 2],
+            start,
+        )
         assert found.folder.states.name == "states"
     folder.journal.write_bytes(content)
     found = recover(folder, id)
@@ -145,7 +149,7 @@ def damaged(folder, how):
         folder.journal.unlink()
     elif how == "event":
         content = bytearray(folder.journal.read_bytes())
-        content[content.index(b'"fact":"begun"') + 3] ^= 4
+        content[content.index(b'"type":"reconstruction_begun"') + 3] ^= 4
         folder.journal.write_bytes(content)
     else:
         text = folder.definition.read_text()
@@ -195,7 +199,7 @@ def test_a_full_disk_refuses_and_leaves_the_scene_as_it_was(tmp_path, monkeypatc
         id = filled(http, sdk)
         before = committed(tmp_path, id)
         with monkeypatch.context() as patched:
-            patched.setattr(beginning, "Journal", Full)
+            patched.setattr(new_reconstruction, "Journal", Full)
             problem(begin(http, id), 507)
         assert committed(tmp_path, id) == before
         assert settled(http, id)["reconstruction"] == 0
@@ -210,7 +214,7 @@ def taken(index):
 
 
 def begun(number, index):
-    return ReconstructionBegun(number=number, index=index, points=None, settings={}, asked=ReconstructionRequest())
+    return ReconstructionBegun(number=number, index=index, points=None, settings={}, request=ReconstructionRequest())
 
 
 def test_what_happened_to_frames_before_is_forgotten_and_frames_of_old_states_are_no_commits():
@@ -259,7 +263,7 @@ def test_a_frame_whose_event_is_damaged_is_not_lost_by_a_beginning(tmp_path):
         journal = DataFolder(tmp_path).scene(id).journal
         content = bytearray(journal.read_bytes())
         (last,) = (e for e in read_journal(journal).events if isinstance(e, FrameAccepted) and e.index == FRAMES)
-        content[content.rindex(bytes_of([last])) + 2] ^= 1
+        content[content.rindex(encode_events([last])) + 2] ^= 1
         journal.write_bytes(content)
         assert begin(http, id).status_code == 200
         assert status(http, id)["next_frame"] == FRAMES + 1

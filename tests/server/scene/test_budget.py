@@ -23,7 +23,10 @@ from server.storage.ledger import Ledger
 def serving(folder):
     running = Running(fake_settings(folder))
     try:
-        with httpx.Client(base_url=running.url, timeout=HANG_S) as http, Client(running.url, patience=HANG_S) as sdk:
+        with (
+            httpx.Client(base_url=running.url, timeout=HANG_S) as http,
+            Client(running.url, busy_timeout=HANG_S) as sdk,
+        ):
             yield running, http, sdk
     finally:
         running.stop()
@@ -42,7 +45,7 @@ def iterations(sdk, id):
 def test_a_scene_has_the_budget_of_its_settings_until_another_is_put(sdk):
     id = sdk.create_scene(make_rig(), settings={"update": {"iterations": 70, "skip_tolerance": 0.5}}).id
     found = sdk.budget(id)
-    assert (found.asked, found.since) == (Budget(), 0)
+    assert (found.requested, found.since) == (Budget(), 0)
     assert found.effective.model_dump() == {
         "iterations": 70,
         "budget_ms": None,
@@ -52,7 +55,7 @@ def test_a_scene_has_the_budget_of_its_settings_until_another_is_put(sdk):
     put = sdk.set_budget(id, budget_ms=400, skip_tolerance=-1)
     assert put == sdk.budget(id)
     assert put.effective.model_dump() == {"iterations": 70, "budget_ms": 400, "stop_gain": 0.0, "skip_tolerance": -1}
-    assert sdk.scene(id).budget == put.asked
+    assert sdk.scene(id).budget == put.requested
     assert sdk.set_budget(id).effective == found.effective  # nothing put: as it was made
     sdk.delete_scene(id)
 
@@ -94,7 +97,7 @@ def test_frames_that_wait_get_the_budget_that_held_for_them_after_kill_9(tmp_pat
         http.post(f"/v1/scenes/{id}/pause")
         os.kill(worker, signal.SIGKILL)
     with serving(tmp_path) as (_, http, sdk):
-        assert sdk.budget(id).asked == Budget(iterations=50)
+        assert sdk.budget(id).requested == Budget(iterations=50)
         assert sdk.scene(id).budget == Budget(iterations=50)
         sdk.resume(id)
         push(sdk, id, 3)
@@ -123,7 +126,7 @@ def test_what_is_no_budget_is_refused_and_changes_nothing(http, quiet_scene, bod
     document = problem(http.put(f"/v1/scenes/{quiet_scene}/budget", json=body), 422)
     assert document["field"].split(".")[-1] == field
     assert document["remedy"]
-    assert http.get(f"/v1/scenes/{quiet_scene}/budget").json()["asked"] == Budget().model_dump()
+    assert http.get(f"/v1/scenes/{quiet_scene}/budget").json()["requested"] == Budget().model_dump()
 
 
 def test_numbers_that_are_none_are_refused(http, quiet_scene):
@@ -150,4 +153,4 @@ def test_later_events_win_and_each_frame_finds_its_own():
     for index, count in ((2, 20), (4, 40), (3, 30)):  # frames were taken back in between
         ledger.apply(BudgetChanged(index=index, budget=Budget(iterations=count)))
     assert [ledger.budget_of(index).iterations for index in range(6)] == [None, None, 20, 30, 30, 30]
-    assert ledger.begins_next() == 0
+    assert ledger.next_to_begin() == 0

@@ -30,8 +30,8 @@ def test_it_holds_where_the_journal_is_written_anew(tmp_path):
         edit(http, id, name="rehearsal", archived=True)
         journal = tmp_path / "scenes" / id / "journal.log"
         journal.unlink()
-        scene = running.app.state.scenes.by_id[id]
-        scene.updates.worker._process._loop.call_soon_threadsafe(scene.log.journal.look)
+        scene = running.app.state.scenes.awake[id]
+        scene.updates.worker._process._loop.call_soon_threadsafe(scene.log.journal.rewrite_if_moved)
         wait_for(journal.exists)
         wait_for(lambda: journal.stat().st_size > 0)
     with serving_with(tmp_path) as (_, http, _sdk):
@@ -99,7 +99,7 @@ def test_a_rule_for_states_needs_a_place(tmp_path):
         for id in ids:
             assert edit(http, id, keep_states={"last": 3}).status_code in (200, 429)
         scenes = running.app.state.scenes
-        with_processes = [scene for scene in scenes.by_id.values() if scene.updates.worker._process is not None]
+        with_processes = [scene for scene in scenes.awake.values() if scene.updates.worker._process is not None]
         assert len(with_processes) <= 1
         assert all(scene.has_place for scene in with_processes)
 

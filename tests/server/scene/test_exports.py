@@ -41,7 +41,7 @@ def over(sdk, id, export):
 
 @pytest.fixture(scope="module")
 def ran(service):
-    with Client(service.url, patience=HANG_S) as sdk:
+    with Client(service.url, busy_timeout=HANG_S) as sdk:
         id = sdk.create_scene(make_rig(), name="Robot / 1", frames_per_second=10).id
         push(sdk, id, range(4))
         yield sdk, id
@@ -211,11 +211,11 @@ def test_a_damaged_state_is_named_and_mended(ran, service):
 
 def test_limits_are_told(ran, service, monkeypatch, http):
     sdk, id = ran
-    monkeypatch.setattr(rules, "MOST_A_SCENE", 1)
+    monkeypatch.setattr(rules, "MAX_PER_SCENE", 1)
     done = over(sdk, id, sdk.begin_export(id, "ply").id)
     with pytest.raises(Conflict, match="1 export, as many as it may"):
         sdk.begin_export(id, "ply")
-    monkeypatch.setattr(rules, "MOST_WAITING", 0)
+    monkeypatch.setattr(rules, "MAX_WAITING", 0)
     assert problem(http.post(f"/v1/scenes/{id}/exports", json={"format": "ply"}), 429)["remedy"]
     monkeypatch.undo()
     monkeypatch.setattr(rules, "free_bytes", lambda path: exporter.RESERVE_BYTES + 100)
@@ -269,7 +269,7 @@ def test_a_scene_that_sleeps_is_exported_asleep_and_leftovers_go_at_the_start(tm
     running = Running(fake_settings(tmp_path))
     try:
         assert not (tmp_path / "exports").exists()
-        with Client(running.url, patience=HANG_S) as sdk:
+        with Client(running.url, busy_timeout=HANG_S) as sdk:
             id = sdk.create_scene(make_rig(), frames_per_second=10).id
             push(sdk, id, [0])
             sdk.edit_scene(id, archived=True)
@@ -283,5 +283,5 @@ def test_a_scene_that_sleeps_is_exported_asleep_and_leftovers_go_at_the_start(tm
 
 def test_failures_are_told_without_paths():
     full = OSError(28, "No space left on device", "/usr/share/a.npz")
-    assert exporter.words(full).startswith("the disk has no room (No space left on device)")
-    assert exporter.words(RuntimeError("in /usr/share/a.npz")) == "RuntimeError: in a.npz"
+    assert exporter.explain(full).startswith("the disk has no room (No space left on device)")
+    assert exporter.explain(RuntimeError("in /usr/share/a.npz")) == "RuntimeError: in a.npz"

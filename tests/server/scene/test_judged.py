@@ -57,7 +57,7 @@ def served(tmp_path_factory):
     folder = tmp_path_factory.mktemp("judged")
     running = Running(ServerSettings(data=folder), core=None)
     try:
-        with Client(running.url, patience=HANG_S) as sdk:
+        with Client(running.url, busy_timeout=HANG_S) as sdk:
             id = sdk.create_scene(RIG, settings=SETTINGS, frames_per_second=10).id
             sdk.put_points(id, InitialPoints(BOX.means.astype(np.float64), BOX.colours, BOX.foreground))
             for index in range(4):
@@ -70,7 +70,7 @@ def served(tmp_path_factory):
 def test_a_frame_that_is_met_carries_its_report(served):
     _, sdk, id, _ = served
     report = sdk.frame(id, 3)
-    assert (report.degraded, report.dropped_cameras, report.kept, report.tries) == (None, {}, "end", ["as set"])
+    assert (report.degraded, report.dropped_cameras, report.candidate, report.attempts) == (None, {}, "end", ["as set"])
     assert report.errors["end"] < report.errors["previous"]
     assert report.curve[-1].iterations == report.iterations == 20
     assert report.planned == [(0, 20)]
@@ -120,9 +120,9 @@ def test_one_dark_camera_is_left_out_by_name(served):
     assert "c2: it shows nothing" in sdk.scene(id).error
     assert metric(sdk, "scas4d_cameras_left_out_total") == left_out + 1
     assert metric(sdk, 'scas4d_alarms_total{what="camera_left_out"}') == raised + 1
-    assert [(alarm.what.value, alarm.camera) for alarm in report.alarms] == [("camera_left_out", "c2")]
+    assert [(alarm.kind.value, alarm.camera) for alarm in report.alarms] == [("camera_left_out", "c2")]
     assert "shows nothing" in report.alarms[0].evidence
-    assert [alarm.what.value for alarm in sdk.frame(id, 3).alarms] == []
+    assert [alarm.kind.value for alarm in sdk.frame(id, 3).alarms] == []
 
 
 def test_a_budget_and_a_replay_on_the_method_itself(served):
@@ -154,7 +154,7 @@ def test_what_was_judged_is_known_again_after_a_restart(served):
     running.stop()
     again = Running(running.app.state.settings, core=None)
     try:
-        with Client(again.url, patience=HANG_S) as after, httpx.Client(base_url=again.url, timeout=HANG_S) as http:
+        with Client(again.url, busy_timeout=HANG_S) as after, httpx.Client(base_url=again.url, timeout=HANG_S) as http:
             assert after.frame(id, index) == before
             assert after.scene(id).degraded
             assert "previous state kept" in after.scene(id).error

@@ -15,10 +15,10 @@ from waiting import HANG_S
 from scas4d_core.storage.history import History
 from server.processes import worker
 from server.processes.placement import Placement, ProcessExit
-from server.storage.fencing import epoch_read
+from server.storage.fencing import current_epoch
 from server.storage.layout import DataFolder
 from server.updates import worker_process
-from server.updates.worker_process import LONGEST_AFTER_LOST_S, OTHER_DEATHS, WorkerDeaths
+from server.updates.worker_process import MAX_WAIT_AFTER_LOSS_S, OTHER_DEATHS, WorkerDeaths
 
 
 class Machines(Placement):
@@ -95,11 +95,11 @@ def test_states_go_to_other_machines_and_back(tmp_path):
         id = create(http)
         sent(http, id, range(2))
         committed(http, id, 2)
-        assert epoch_read(states(tmp_path, id)) is None
+        assert current_epoch(states(tmp_path, id)) is None
     with service(tmp_path, Machines) as http:
         sent(http, id, [2])
         committed(http, id, 3)
-    there = epoch_read(states(tmp_path, id))
+    there = current_epoch(states(tmp_path, id))
     assert there == 1
     left = History.open(states(tmp_path, id).resolve())
     with service(tmp_path, Placement) as http:
@@ -109,15 +109,15 @@ def test_states_go_to_other_machines_and_back(tmp_path):
         sent(http, id, [4])
         committed(http, id, 5)
         assert http.get(f"/v1/scenes/{id}/frames/4").json()["time"] == pytest.approx(0.4)
-    assert epoch_read(states(tmp_path, id)) > there
+    assert current_epoch(states(tmp_path, id)) > there
     assert History.load(states(tmp_path, id)).indices == [0, 1, 2, 3, 4]
 
 
 def test_machines_that_are_lost_one_after_another_are_given_more_and_more_time():
     """A frame may be what takes them down."""
     deaths = WorkerDeaths()
-    pauses = [deaths.died(ProcessExit(None, lost=True))[1] for _ in range(12)]
+    pauses = [deaths.note_death(ProcessExit(None, lost=True))[1] for _ in range(12)]
     assert pauses[:4] == [0.5, 0.5, 0.5, 1.0]
-    assert pauses[-1] == LONGEST_AFTER_LOST_S
-    deaths.committed()
-    assert deaths.died(ProcessExit(None, lost=True)) == (False, 0.5)
+    assert pauses[-1] == MAX_WAIT_AFTER_LOSS_S
+    deaths.note_commit()
+    assert deaths.note_death(ProcessExit(None, lost=True)) == (False, 0.5)

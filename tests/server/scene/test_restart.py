@@ -22,7 +22,7 @@ from scas4d_core.captures import InitialPoints
 from scas4d_core.storage.npz import write_npz
 from server.storage import recovery
 from server.storage.definition import FORMAT
-from server.storage.frame_table import LOST
+from server.storage.frame_table import RECORD_LOST
 
 
 def without(document, *names):
@@ -31,7 +31,7 @@ def without(document, *names):
 
 def test_everything_is_found_again(tmp_path):
     with serving(tmp_path) as (http, sdk):
-        id = create(http, queue_frames=9, part_seconds=3600)
+        id = create(http, queue_frames=9, open_frame_seconds=3600)
         sdk.put_points(id, InitialPoints(np.zeros((3, 3)), np.zeros((3, 3), np.float32)))
         receipts = [put(http, id, index, pictures(index)).json() for index in range(3)]
         sdk.wait(id, 2)
@@ -110,7 +110,7 @@ def test_a_camera_out_of_step_is_a_warning_for_as_long_as_it_is(tmp_path):
             sdk.wait(id, index)
         (said,) = sdk.scene(id).warnings
         assert said.startswith("cameras are out of step: 'c1' is late")
-        assert [name for name, one in sdk.frame(id, 1).timing.items() if one.off] == ["c1"]
+        assert [name for name, one in sdk.frame(id, 1).timing.items() if one.out_of_step] == ["c1"]
         assert sdk.frame(id, 1).alarms == []
     with serving(tmp_path) as (http, sdk):
         deadline = time.monotonic() + HANG_S
@@ -140,12 +140,12 @@ def test_deaths_at_a_frame_are_counted_over_restarts(tmp_path):
         sdk.wait(id, 0)
         put(http, id, 1, pictures(fakes.DIES))
         until = time.monotonic() + HANG_S
-        while not http.get(f"/v1/scenes/{id}/frames/1").json()["attempts"]:
+        while not http.get(f"/v1/scenes/{id}/frames/1").json()["worker_deaths"]:
             assert time.monotonic() < until
             time.sleep(0.02)
     with serving(tmp_path) as (http, sdk):
         report = sdk.wait(id, 1)
-        assert (report.state, report.attempts) == ("failed", 2)
+        assert (report.state, report.worker_deaths) == ("failed", 2)
 
 
 def test_a_deletion_that_was_cut_short_is_finished_and_half_a_scene_is_none(tmp_path):
@@ -235,7 +235,7 @@ def test_a_lost_journal_costs_the_events_and_no_state(tmp_path):
         status = http.get(f"/v1/scenes/{id}").json()
         assert (status["committed"], status["next_frame"]) == (4, 4)
         assert status["damage"]
-        assert LOST in problem(put(http, id, 0), 409)["detail"]
+        assert RECORD_LOST in problem(put(http, id, 0), 409)["detail"]
         assert sdk.render(id, "c0", 0).shape
         put(http, id, 4)
         assert sdk.wait(id, 4).state == "committed"
@@ -251,7 +251,7 @@ def test_it_answers_while_scenes_are_recovered(tmp_path, monkeypatch):
         assert go_on.acquire(timeout=HANG_S)
         return recovery.recover(*given)
 
-    monkeypatch.setattr("server.scene.found.recover", recover)
+    monkeypatch.setattr("server.scene.stored_scene.recover", recover)
     running = Running(fake_settings(tmp_path), ready=False)
     try:
         with httpx.Client(base_url=running.url, timeout=HANG_S) as http:
@@ -286,7 +286,7 @@ def test_a_service_that_ends_while_scenes_are_recovered_leaves_them_as_they_are(
         id = create(http)
     go_on = threading.Semaphore(0)
     monkeypatch.setattr(
-        "server.scene.found.recover", lambda *given: go_on.acquire(timeout=HANG_S) and recovery.recover(*given)
+        "server.scene.stored_scene.recover", lambda *given: go_on.acquire(timeout=HANG_S) and recovery.recover(*given)
     )
     running = Running(fake_settings(tmp_path), ready=False)
     threading.Timer(0.5, go_on.release).start()

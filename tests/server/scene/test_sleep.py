@@ -22,19 +22,19 @@ def test_an_idle_scene_falls_asleep_and_says_what_it_is(tmp_path):
         id = filled(http)
         before = status(http, id)
         wait_for(lambda: status(http, id)["asleep"])
-        assert running.app.state.scenes.by_id == {}
+        assert running.app.state.scenes.awake == {}
         assert status(http, id) == before | {"asleep": True}
         assert http.get("/v1/scenes").json()["scenes"] == [before | {"asleep": True}]
         metrics = http.get("/metrics").text
         assert "scas4d_scenes_asleep 1.0" in metrics
         assert f'scas4d_gaussians{{scene="{id}"}}' not in metrics
-        assert running.app.state.scenes.by_id == {}  # none of that has woken it
+        assert running.app.state.scenes.awake == {}  # none of that has woken it
 
 
 def test_its_processes_end_with_it(tmp_path):
     with serving_with(tmp_path) as (running, http, _):
         id = filled(http)
-        scene = running.app.state.scenes.by_id[id]
+        scene = running.app.state.scenes.awake[id]
         processes = [scene.updates.worker._process._process, scene.readers.views.process._process]
         put_to_sleep(http, id)
         for process in processes:
@@ -63,7 +63,7 @@ def test_a_view_wakes_it_without_a_worker(tmp_path):
         id = filled(http)
         put_to_sleep(http, id)
         assert view(http, id).status_code == 200
-        scene = running.app.state.scenes.by_id[id]
+        scene = running.app.state.scenes.awake[id]
         assert scene.readers.views.process is not None
         assert scene.updates.worker._process is None
         assert status(http, id)["asleep"] is False
@@ -132,7 +132,7 @@ def test_many_at_once_wake_one_scene(tmp_path):
 
         def look():
             while not monitor.is_set():
-                seen.append(id in scenes.by_id or id in scenes.asleep)
+                seen.append(id in scenes.awake or id in scenes.asleep)
 
         watching = threading.Thread(target=look)
         watching.start()
@@ -164,7 +164,7 @@ def test_a_sleeping_scene_is_deleted_without_waking(tmp_path):
         problem(http.get(f"/v1/scenes/{id}"), 404)
         problem(view(http, id), 404)
         assert list((tmp_path / "scenes").iterdir()) == []
-        assert running.app.state.scenes.by_id == {}
+        assert running.app.state.scenes.awake == {}
 
 
 def test_a_folder_that_cannot_be_read_when_it_wakes_is_tried_again(tmp_path):
@@ -189,7 +189,7 @@ def test_scenes_of_long_ago_sleep_from_the_start(tmp_path):
         before = status(http, old)
     os.utime(tmp_path / "scenes" / old / "journal.log", (0, 0))
     with serving_with(tmp_path) as (running, http, _):
-        assert set(running.app.state.scenes.by_id) == {new}
+        assert set(running.app.state.scenes.awake) == {new}
         assert status(http, old) == before | {"asleep": True}
         assert view(http, old, 1).status_code == 200
 
@@ -229,9 +229,9 @@ def test_a_card_tells_what_sleeps_without_reading_its_folder(tmp_path, monkeypat
     with serving_with(tmp_path) as (_, http, _sdk):  # read, and a card is left
         before = status(http, id)
     with monkeypatch.context() as patched, serving_with(tmp_path, queue_frames=7) as (running, http, _):
-        patched.setattr("server.scene.scenes.find", None)
+        patched.setattr("server.scene.scenes.read_stored_scene", None)
         assert status(http, id) == before | {"queue_limit": 7}
-        assert running.app.state.scenes.by_id == {}
+        assert running.app.state.scenes.awake == {}
     with serving_with(tmp_path) as (_, http, _sdk):
         assert view(http, id, 1).status_code == 200
         put_form(http, id, 2)
@@ -260,16 +260,16 @@ def doubt(folder, how):
 
 @pytest.mark.parametrize("how", ["flipped", "cut", "another scene's", "journal", "state", "points"])
 def test_a_card_that_cannot_be_believed_is_left_aside(tmp_path, how):
-    from server.scene.status_cache import read_card
+    from server.scene.status_cache import read_status_cache
     from server.storage.layout import SceneFolder
 
     with serving_with(tmp_path) as (_, http, _sdk):
         id = filled(http)
         put_to_sleep(http, id)
     folder = tmp_path / "scenes" / id
-    assert read_card(SceneFolder(folder)) is not None
+    assert read_status_cache(SceneFolder(folder)) is not None
     doubt(folder, how)
-    assert read_card(SceneFolder(folder)) is None
+    assert read_status_cache(SceneFolder(folder)) is None
     with serving_with(tmp_path) as (_, http, _sdk):
         assert status(http, id)["next_frame"] == 2
 

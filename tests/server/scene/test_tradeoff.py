@@ -13,7 +13,7 @@ from waiting import HANG_S, wait_for
 from client.sdk import Client
 from client.wire import IngestSettings, Retention
 from scas4d_core.frame_outcome import OTHER_ORDERS
-from server.scene.tradeoff import telling
+from server.scene.tradeoff import usable_reports
 
 
 def push(sdk, id, indices, red=0):
@@ -34,7 +34,7 @@ def points(found, kind):
 @pytest.fixture(scope="module")
 def ran(service):
     """A scene that ran 100 and 40 iterations."""
-    with Client(service.url, patience=HANG_S) as sdk:
+    with Client(service.url, busy_timeout=HANG_S) as sdk:
         id = sdk.create_scene(make_rig(), frames_per_second=10).id
         push(sdk, id, range(4))
         sdk.set_budget(id, iterations=40)
@@ -48,10 +48,12 @@ def ran(service):
 def test_a_first_update_in_several_orders_tells_nothing_of_its_iterations():
     seconds = {"total": 2.0}
     reports = [
-        SimpleNamespace(state="committed", index=index, iterations=300, degraded=None, tries=["as set"], seconds=taken)
+        SimpleNamespace(
+            state="committed", index=index, iterations=300, degraded=None, attempts=["as set"], seconds=taken
+        )
         for index, taken in ((1, {**seconds, OTHER_ORDERS: 1.0}), (2, seconds))
     ]
-    assert [report.index for report in telling(reports, 0)] == [2]
+    assert [report.index for report in usable_reports(reports, 0)] == [2]
 
 
 def test_a_scene_without_a_frame_has_nothing_to_tell(sdk, scene):
@@ -173,7 +175,7 @@ def test_what_cannot_be_replayed_says_what_would_help(http, sdk):
     push(sdk, id, range(7))
     wait_for(lambda: not sdk.frame(id, 4).pictures_kept)
     document = problem(http.post(f"/v1/scenes/{id}/tradeoff", json={"frames": 4}), 409)
-    assert "not held" in document["detail"]
+    assert "no longer kept" in document["detail"]
     assert "at most 1 frame" in document["remedy"]
     assert sdk.replay(id, [10], frames=1).replay.state == "running"
     sdk.delete_scene(id)
@@ -205,14 +207,14 @@ def test_what_is_no_replay_is_refused(http, quiet_scene, body):
 
 def test_after_a_restart_what_was_measured_is_read_again(tmp_path):
     running = Running(fake_settings(tmp_path))
-    with Client(running.url, patience=HANG_S) as sdk:
+    with Client(running.url, busy_timeout=HANG_S) as sdk:
         id = sdk.create_scene(make_rig(), frames_per_second=10).id
         push(sdk, id, range(4))
         before = sdk.tradeoff(id)
     running.stop()
     running = Running(fake_settings(tmp_path))
     try:
-        with Client(running.url, patience=HANG_S) as sdk:
+        with Client(running.url, busy_timeout=HANG_S) as sdk:
             assert sdk.tradeoff(id) == before
             assert sdk.tradeoff(id) == before
     finally:

@@ -41,15 +41,15 @@ def test_what_was_written_is_read(tmp_path, definition):
 
 
 def test_labels_of_nodes_are_kept(stored):
-    assert Definition.of_json(stored).request.nodes == {}
+    assert Definition.from_json(stored).request.nodes == {}
     stored["request"]["nodes"] = {"rig": "stage-a"}
-    assert Definition.of_json(Definition.of_json(stored).as_json()).request.nodes == {"rig": "stage-a"}
+    assert Definition.from_json(Definition.from_json(stored).as_json()).request.nodes == {"rig": "stage-a"}
 
 
 @pytest.mark.parametrize("other", [FORMAT - 1, FORMAT + 1])
 def test_another_format_is_refused_by_name(stored, other):
     with pytest.raises(DefinitionError, match=rf"format {other}.*reads format {FORMAT}.*version that wrote it"):
-        Definition.of_json({**stored, "format": other})
+        Definition.from_json({**stored, "format": other})
 
 
 def test_what_the_file_has_is_not_replaced_by_what_the_journal_has(tmp_path, stored):
@@ -64,4 +64,4 @@ def test_what_the_file_has_is_not_replaced_by_what_the_journal_has(tmp_path, sto
 def test_settings_that_are_refused_are_named(stored, value):
     stored["settings"]["update"]["iterations"] = value
     with pytest.raises(DefinitionError, match="iterations"):
-        Definition.of_json(stored)
+        Definition.from_json(stored)

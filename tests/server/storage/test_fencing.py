@@ -16,8 +16,8 @@ from scas4d_core.compact import CompactWriter, FileHeader
 from scas4d_core.gaussians import Gaussians
 from scas4d_core.storage.history import History
 from server.storage import fencing
-from server.storage.disk import FolderLock, alone
-from server.storage.fencing import FencingError, begin_epoch, epoch_read, epochs, heal, sweep
+from server.storage.disk import FolderLock, lock_states
+from server.storage.fencing import FencingError, begin_epoch, current_epoch, epochs, remove_earlier_epochs, repair_link
 from server.storage.layout import SceneFolder, epoch_folder
 
 STATE = Gaussians.of_points(np.random.default_rng(0).normal(size=(20, 3)), radius=0.1)
@@ -48,9 +48,9 @@ def frames(states: Path) -> list[int]:
 
 
 def test_the_next_epoch_has_what_was_committed_and_is_read(states: Path, lock: Path) -> None:
-    assert epoch_read(states) == 0
+    assert current_epoch(states) == 0
     assert begin_epoch(states, lock) == 1
-    assert epoch_read(states) == 1
+    assert current_epoch(states) == 1
     assert states.is_symlink()
     assert states.resolve() == epoch_folder(states, 1)
     assert frames(states) == frames(epoch_folder(states, 0)) == [0, 1]
@@ -73,7 +73,7 @@ def test_a_reader_goes_on_over_the_change(states: Path, lock: Path) -> None:
     reader = History.load(states)
     begin_epoch(states, lock)
     History.open(epoch_folder(states, 1)).append(2, 2.0, moved(2))
-    assert sweep(states, 1) == ["states.0"]
+    assert remove_earlier_epochs(states, 1) == ["states.0"]
     reader.refresh()
     assert reader.indices == [0, 1, 2]
     assert np.array_equal(reader.gaussians(0).means, moved(0).means)
@@ -144,7 +144,7 @@ def test_files_that_keep_vanishing_are_a_fault(states: Path, lock: Path, monkeyp
     monkeypatch.setattr(fencing.os, "link", gone)
     with pytest.raises(FencingError, match=r"states\.0 kept changing"):
         begin_epoch(states, lock)
-    assert epoch_read(states) == 0
+    assert current_epoch(states) == 0
     assert sorted(path.name for path in states.parent.glob("states*")) == ["states", "states.0"]
 
 
@@ -156,7 +156,7 @@ def test_a_full_disk_leaves_nothing_behind(states: Path, lock: Path, monkeypatch
     monkeypatch.setattr(fencing, "_copy", full)
     with pytest.raises(OSError, match="No space left"):
         begin_epoch(states, lock)
-    assert epoch_read(states) == 0
+    assert current_epoch(states) == 0
     assert sorted(path.name for path in states.parent.iterdir()) == ["states", "states.0"]
 
 
@@ -170,7 +170,7 @@ def test_a_link_that_cannot_be_moved_leaves_all_as_it_was(
     with pytest.raises(OSError, match="Input/output"):
         begin_epoch(states, lock)
     monkeypatch.undo()
-    assert epoch_read(states) == 0
+    assert current_epoch(states) == 0
     assert sorted(path.name for path in states.parent.iterdir()) == ["states", "states.0"]
     assert begin_epoch(states, lock) == 1
     assert frames(states) == [0, 1]
@@ -178,10 +178,10 @@ def test_a_link_that_cannot_be_moved_leaves_all_as_it_was(
 
 def test_workers_that_end_before_they_work_do_not_fill_the_disk(states: Path, lock: Path) -> None:
     """Sweeping waits for a worker that works."""
-    for _ in range(3 * fencing.MOST_KEPT):
+    for _ in range(3 * fencing.MAX_REMAINING):
         begin_epoch(states, lock)
-    assert len(epochs(states)) == fencing.MOST_KEPT
-    assert max(epochs(states)) == epoch_read(states)
+    assert len(epochs(states)) == fencing.MAX_REMAINING
+    assert max(epochs(states)) == current_epoch(states)
     assert frames(states) == [0, 1]
 
 
@@ -189,7 +189,7 @@ def test_a_folder_that_is_read_stays_where_the_disk_does_not_say_that_the_link_w
     states: Path, lock: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(folder: Path) -> None:
-        if epoch_read(states) == 1:
+        if current_epoch(states) == 1:
             raise OSError(errno.EIO, "Input/output error")
 
     monkeypatch.setattr(fencing, "sync_folder", fails)
@@ -203,7 +203,7 @@ def test_links_that_were_never_moved_go_at_the_next_beginning_and_not_while_one_
 ) -> None:
     left = states.with_name(".states.0a1b.link")
     left.symlink_to("states.0")
-    sweep(states, 0)
+    remove_earlier_epochs(states, 0)
     assert left.is_symlink()
     begin_epoch(states, lock)
     assert not left.is_symlink()
@@ -222,7 +222,7 @@ def test_without_links_files_are_copied(states: Path, lock: Path, monkeypatch: p
 def test_a_folder_of_one_machine_becomes_that_of_epoch_0(tmp_path: Path, lock: Path) -> None:
     states = tmp_path / "states"
     History.open(states).append(0, 0.0, STATE)
-    assert epoch_read(states) is None
+    assert current_epoch(states) is None
     assert begin_epoch(states, lock) == 1
     assert frames(states) == frames(epoch_folder(states, 0)) == [0]
 
@@ -235,11 +235,11 @@ def test_a_local_worker_that_is_at_work_still_is_waited_for(
     History.open(states).append(0, 0.0, STATE)
     held = FolderLock(lock, wait=False)
     held.write("4711\n")
-    monkeypatch.setattr(fencing, "LOCAL_S", 0.1)
+    monkeypatch.setattr(fencing, "LOCK_WAIT_S", 0.1)
     with pytest.raises(FencingError, match=r"process 4711\) does not end"):
         begin_epoch(states, lock)
     assert not states.is_symlink()
-    monkeypatch.setattr(fencing, "LOCAL_S", 60)
+    monkeypatch.setattr(fencing, "LOCK_WAIT_S", 60)
     threading.Timer(0.2, held.release).start()
     assert begin_epoch(states, lock) == 1
     assert frames(states) == [0]
@@ -249,10 +249,10 @@ def test_a_stop_between_renaming_and_linking_loses_nothing(tmp_path: Path, lock:
     states = tmp_path / "states"
     History.open(states).append(0, 0.0, STATE)
     states.rename(epoch_folder(states, 0))
-    heal(states)
-    assert epoch_read(states) == 0
+    repair_link(states)
+    assert current_epoch(states) == 0
     assert frames(states) == [0]
-    heal(tmp_path / "states_2")
+    repair_link(tmp_path / "states_2")
     assert not (tmp_path / "states_2").exists()
 
 
@@ -298,7 +298,7 @@ def test_sweeping_leaves_later_epochs_and_other_reconstructions(states: Path, lo
     shutil.copytree(epoch_folder(states, 0), other)
     for name in ("states.0.abcd.part", "states.2.abcd.part"):
         (states.parent / name).mkdir()
-    assert sweep(states, 1) == ["states.0", "states.0.abcd.part"]
+    assert remove_earlier_epochs(states, 1) == ["states.0", "states.0.abcd.part"]
     assert other.is_dir()
     assert frames(states) == [0, 1]
 
@@ -309,9 +309,9 @@ def test_parts_of_an_epoch_are_none_of_its_folders(states: Path) -> None:
 
 
 def test_a_worker_with_an_epoch_does_not_wait_for_one_that_stopped(tmp_path: Path, lock: Path) -> None:
-    held = alone(SceneFolder(tmp_path))
+    held = lock_states(SceneFolder(tmp_path))
     assert held is not None
-    assert alone(SceneFolder(tmp_path, epoch=1)) is None  # with a lock it would wait for ever
+    assert lock_states(SceneFolder(tmp_path, epoch=1)) is None  # with a lock it would wait for ever
     assert int(lock.read_text()) == os.getpid()
     assert [path.name for path in tmp_path.iterdir()] == [lock.name]
     held.release()

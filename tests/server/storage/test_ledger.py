@@ -11,16 +11,16 @@ from client.wire import CameraFitModel, CurvePointModel, FrameReportModel, Frame
 from scas4d_core.frame_report import CurvePoint, FrameReport
 from scas4d_core.update.result import CameraFit
 from server.storage.events import (
+    CameraAccepted,
     FrameAccepted,
     FrameFailed,
     FrameMissing,
     FramesSkipped,
-    PartAccepted,
     PicturesDeleted,
     StatesDeleted,
     WorkerDied,
 )
-from server.storage.frame_table import LOST, RECORDS_KEPT, FrameTable
+from server.storage.frame_table import RECORD_LOST, RECORDS_KEPT, FrameTable
 from server.storage.ledger import Ledger
 from server.storage.report_fields import NOT_SENT, WIRE_NAMES
 
@@ -61,7 +61,7 @@ def test_an_entry_says_what_the_events_said():
     assert [report.pictures_kept for report in reports_] == [False, False, True, True, False]
     assert [report.error for report in reports_[:2]] == [None, "cable"]
     assert "frame 3 came" in reports_[2].error
-    assert (reports_[3].error, reports_[3].attempts) == ("two deaths", 2)
+    assert (reports_[3].error, reports_[3].worker_deaths) == ("two deaths", 2)
     assert reports_[3].dropped_cameras == {"c0": "torn"}
     assert ledger.frames[1].receipt is None
     assert ledger.frames[2].receipt.model_dump() == {"scene": "abc", "index": 2, "time": 0.2, "identity": identity(2)}
@@ -73,9 +73,9 @@ def test_an_entry_says_what_the_events_said():
 
 
 def test_what_is_lost_before_an_event_is_set_aside():
-    ledger = ledger_of(PartAccepted(index=1, time=None, camera="c0", file="f", hashes={}), taken(2))
+    ledger = ledger_of(CameraAccepted(index=1, time=None, camera="c0", file="f", hashes={}), taken(2))
     assert ledger.next_frame == 3
-    assert [ledger.frames[index].error for index in range(3)] == [LOST, LOST, None]
+    assert [ledger.frames[index].error for index in range(3)] == [RECORD_LOST, RECORD_LOST, None]
     assert ledger.open == {}
     ledger.apply(taken(1))  # found in the frame log
     assert (ledger.frames[1].state, ledger.frames[1].error) == (FrameState.QUEUED, None)
@@ -125,8 +125,8 @@ def test_the_numbers_of_the_newest_commits_are_in_memory():
     table = FrameTable("abc")
     table.grow(RECORDS_KEPT + 1)
     for index in range(RECORDS_KEPT + 1):
-        table.take(index, index / 10, identity(index), (), None)
-        table.move(index, FrameState.COMMITTED)
+        table.enqueue(index, index / 10, identity(index), (), None)
+        table.set_state(index, FrameState.COMMITTED)
         table.set_record(index, REPORT)
     assert (table[0].record is None, table[1].record is None) == (True, False)
     report = table[RECORDS_KEPT].report

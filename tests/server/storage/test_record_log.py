@@ -14,12 +14,14 @@ from client.wire import FrameFile, FrameHead
 from server.problems import Problem
 from server.storage import record_log
 from server.storage.events import FrameAccepted, FrameMissing, PauseChanged
-from server.storage.frame_store import FrameDamage, Upload, read_pictures, stored
+from server.storage.frame_store import FrameDamage, Upload, list_records, read_pictures
 from server.storage.journal import Journal, read_journal
-from server.storage.record_log import Damage, LogRecord, LogRecordKind, encoded, records
+from server.storage.record_log import Damage, LogRecord, LogRecordKind, encode_record, read_records
 
 PARTS = [
-    encoded(LogRecordKind.EVENT, index, {"fact": "missing", "index": index, "reason": "é" * index}, b"S4DR" * index)
+    encode_record(
+        LogRecordKind.EVENT, index, {"type": "frame_missing", "index": index, "reason": "é" * index}, b"S4DR" * index
+    )
     for index in range(4)
 ]
 LOG = b"".join(PARTS)
@@ -27,13 +29,13 @@ STARTS = [sum(map(len, PARTS[:index])) for index in range(5)]
 
 
 def whole(data):
-    return [found.index for found in records(data) if isinstance(found, LogRecord)]
+    return [found.index for found in read_records(data) if isinstance(found, LogRecord)]
 
 
 def covered(data):
     """Damage and records lie one behind the other, and nothing is left out."""
     at = 0
-    for found in records(data):
+    for found in read_records(data):
         if isinstance(found, Damage):
             assert found.start == at
             at = found.end
@@ -43,14 +45,14 @@ def covered(data):
 
 
 def test_a_whole_log_comes_back():
-    assert [(found.index, found.head["reason"], bytes(found.body)) for found in records(LOG)] == [
+    assert [(found.index, found.head["reason"], bytes(found.body)) for found in read_records(LOG)] == [
         (index, "é" * index, b"S4DR" * index) for index in range(4)
     ]
 
 
 def test_a_cut_at_every_byte_loses_only_what_it_cuts():
     for length in range(len(LOG)):
-        found = list(records(LOG[:length]))
+        found = list(read_records(LOG[:length]))
         expected = [index for index in range(4) if STARTS[index + 1] <= length]
         assert whole(LOG[:length]) == expected
         if length in STARTS:
@@ -79,8 +81,8 @@ def test_rubbish_between_records_is_stepped_over():
 
 
 def test_a_length_that_was_made_up_reads_no_further_than_the_file():
-    big = encoded(LogRecordKind.PICTURES, 5, {}, b"x" * 100)
-    assert [type(found) for found in records(big[:-50])] == [Damage]
+    big = encode_record(LogRecordKind.PICTURES, 5, {}, b"x" * 100)
+    assert [type(found) for found in read_records(big[:-50])] == [Damage]
 
 
 FACTS = [
@@ -131,7 +133,7 @@ def test_a_log_that_is_read_piece_by_piece_says_the_same(monkeypatch):
     """Wherever a piece ends: of a log that is whole, cut, damaged by flipped bits, or has rubbish in it."""
     rng = np.random.default_rng(0)
     events = [
-        encoded(LogRecordKind.EVENT, index, {"fact": "missing", "index": index, "reason": "é" * index})
+        encode_record(LogRecordKind.EVENT, index, {"type": "frame_missing", "index": index, "reason": "é" * index})
         for index in range(9)
     ]
     log = b"".join(events)
@@ -140,13 +142,13 @@ def test_a_log_that_is_read_piece_by_piece_says_the_same(monkeypatch):
         damaged = bytearray(log)
         damaged[at] ^= 1 << int(rng.integers(8))
         logs.append(bytes(damaged))
-    monkeypatch.setattr(record_log, "ENOUGH", 400)
+    monkeypatch.setattr(record_log, "DECIDABLE_BYTES", 400)
     for piece in (1, 7, 64, 10_000):
         monkeypatch.setattr(record_log, "PIECE", piece)
         for data in logs:
             told = [one if isinstance(one, Damage) else (one.frame, json.loads(one.text))
-                    for one in record_log.streamed(io.BytesIO(data))]  # fmt: skip
-            assert told == [one if isinstance(one, Damage) else (one.index, one.head) for one in records(data)]
+                    for one in record_log.stream_records(io.BytesIO(data))]  # fmt: skip
+            assert told == [one if isinstance(one, Damage) else (one.index, one.head) for one in read_records(data)]
 
 
 def test_a_full_disk_leaves_the_journal_whole(tmp_path, monkeypatch):
@@ -191,7 +193,7 @@ def test_a_record_of_pictures_comes_back(tmp_path):
     assert {name: bytes(data) for name, data in pictures.images.items()} == {"c0": b"picture", "c1": b"zz"}
     assert (pictures.index, pictures.time, pictures.part, pictures.masks) == (3, 0.5, False, {})
     assert [pictures.hashes[name]["image"] for name in ("c0", "c1")] == hashes
-    assert stored(tmp_path) == {record.name: record.size}
+    assert list_records(tmp_path) == {record.name: record.size}
 
 
 def test_every_cut_and_flipped_bit_of_a_record_of_pictures_is_found(tmp_path):

@@ -15,11 +15,11 @@ from waiting import HANG_S
 from client.wire import Budget, FileKind, FrameState, ReconstructionRequest
 from server.storage.events import (
     BudgetChanged,
+    CameraAccepted,
     FrameAccepted,
     FrameFailed,
     FrameMissing,
     FramesSkipped,
-    PartAccepted,
     PauseChanged,
     PicturesDeleted,
     ReconstructionBegun,
@@ -79,7 +79,7 @@ def lives(draw):
         files = (f"{index:010d}-{0:012x}.frame",)
         if how == "parts":
             events += parts(index, draw(st.integers(1, 3)))
-            files = tuple(event.file for event in events if isinstance(event, PartAccepted) and event.index == index)
+            files = tuple(event.file for event in events if isinstance(event, CameraAccepted) and event.index == index)
         events.append(FrameAccepted(index=index, time=index / 10, identity=identity(index), files=files))
         for own in draw(st.lists(st.booleans(), max_size=2)):
             events.append(WorkerDied(index=index, reason="x", own=own))
@@ -111,13 +111,13 @@ def lives(draw):
 
 def begins(number, index):
     return ReconstructionBegun(
-        number=number, index=index, points=None, settings={}, asked=ReconstructionRequest(frame=index)
+        number=number, index=index, points=None, settings={}, request=ReconstructionRequest(frame=index)
     )
 
 
 def parts(index, count):
     return [
-        PartAccepted(
+        CameraAccepted(
             index=index, time=index / 10, camera=f"c{k}", file=f"{index:010d}-{k:012x}.frame",
             hashes={FileKind.IMAGE: identity(k)},
         )
@@ -197,7 +197,7 @@ def flip(path, journal):
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 8
     path.write_bytes(content)
-    journal.renew("journal.log is damaged (a flipped bit)")
+    journal.rewrite("journal.log is damaged (a flipped bit)")
 
 
 def test_a_journal_that_is_deleted_replaced_or_damaged_is_written_anew(tmp_path):
@@ -260,7 +260,7 @@ def test_an_event_that_comes_while_a_renewal_fails_is_not_forgotten(tmp_path, mo
             no_space()
 
         monkeypatch.setattr(journal, "_replace", slow)
-        journal.renew("it is damaged")
+        journal.rewrite("it is damaged")
         await began.wait()
         appended = asyncio.create_task(journal.append(FrameMissing(index=0, reason="r")))
         await asyncio.sleep(0)

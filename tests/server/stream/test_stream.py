@@ -11,7 +11,7 @@ from websockets.sync.client import connect
 
 from client.errors import InvalidRequest, NotFound
 from client.stream import Stream, TracksEvent, ViewEvent, finished_frames, parts, scene_changes, tracks, view
-from client.wire.stream import MAGIC, STREAM_PROTOCOL, BulkHead, FrameMessage, SceneMessage, pack, unpack
+from client.wire.stream import MAGIC, STREAM_PROTOCOL, BinaryHead, FrameMessage, SceneMessage, pack, unpack
 
 
 @pytest.fixture
@@ -246,7 +246,7 @@ def test_the_handshake_is_refused_with_a_reason(service, scene):
 
 
 def test_a_binary_message_is_read_back_and_damage_is_noticed():
-    head = BulkHead(type="render", id="v", missed=3, frame=2, media_type="image/png")
+    head = BinaryHead(type="render", id="v", missed=3, frame=2, media_type="image/png")
     message = pack(head, b"pixels")
     assert message.startswith(MAGIC)
     assert unpack(message) == (head, b"pixels")

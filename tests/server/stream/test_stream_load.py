@@ -19,7 +19,7 @@ from server.processes import shared_queries
 from server.processes.queries import Answer, PartsQuery, RenderQuery
 from server.processes.shared_queries import SharedQueries, fingerprint
 from server.stream.live_queries import LiveRender
-from server.stream.outbox import UNSENT_REPLIES, Outbox
+from server.stream.outbox import MAX_UNSENT_REPLIES, Outbox
 
 READERS = 99
 FRAMES = 5
@@ -155,10 +155,10 @@ def test_a_dragged_camera_is_rendered_where_it_is_not_everywhere_it_was():
             sent.append(unpack(message)[0])
 
         live = live_of(reader, outbox)
-        tasks = [asyncio.create_task(live.run()), asyncio.create_task(outbox.empty_into(send))]
+        tasks = [asyncio.create_task(live.run()), asyncio.create_task(outbox.send_all(send))]
         for tag in range(50):
             camera = CameraModel.of(make_rig().cameras[0].scaled(1 + tag))
-            live.ask_for(RenderRequest(camera=camera), tag)
+            live.set_request(RenderRequest(camera=camera), tag)
             if tag == 0:
                 await settle()
         await reader.answer()  # of the first place; the reader had begun it
@@ -180,12 +180,12 @@ def test_a_slow_reader_asks_for_nothing_more():
             sent.append(unpack(message)[0])
 
         live = live_of(reader, outbox)
-        tasks = [asyncio.create_task(live.run()), asyncio.create_task(outbox.empty_into(send))]
-        live.ask_for(RenderRequest(camera="c0"), 0)
+        tasks = [asyncio.create_task(live.run()), asyncio.create_task(outbox.send_all(send))]
+        live.set_request(RenderRequest(camera="c0"), 0)
         await settle()
         await reader.answer()
         for tag in range(1, 21):
-            live.ask_for(RenderRequest(camera="c1"), tag)
+            live.set_request(RenderRequest(camera="c1"), tag)
             await settle()
         assert len(reader.asked) == 1
         gate.set()
@@ -212,7 +212,7 @@ def test_a_mailbox_keeps_the_newest_of_each_and_says_what_it_took_the_place_of()
         outbox.put("c", lambda missed: "c")
         outbox.drop("c")
         await outbox.reply(Subscribed(id="x"))
-        task = asyncio.create_task(outbox.empty_into(send))
+        task = asyncio.create_task(outbox.send_all(send))
         await settle()
         assert sent == ['{"type":"subscribed","id":"x"}', "a10 10", "b 4"]
         outbox.put("a", lambda missed: f"again {missed}")
@@ -233,7 +233,7 @@ def test_a_client_that_sends_without_reading_is_not_listened_to():
 
         task = asyncio.create_task(flood())
         await settle()
-        assert len(outbox._replies) == UNSENT_REPLIES
+        assert len(outbox._replies) == MAX_UNSENT_REPLIES
         task.cancel()
 
     run(test())

@@ -44,7 +44,7 @@ def test_workers_that_share_an_epoch_are_found(monkeypatch: pytest.MonkeyPatch) 
     begin = worker_process.begin_epoch
 
     def same(states, lock):
-        return begin(states, lock) if (epoch := fencing.epoch_read(states)) is None else epoch
+        return begin(states, lock) if (epoch := fencing.current_epoch(states)) is None else epoch
 
     monkeypatch.setattr(worker_process, "begin_epoch", same)
     outcome = simulate(SMALL)
@@ -53,17 +53,19 @@ def test_workers_that_share_an_epoch_are_found(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_states_that_are_not_taken_over_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fencing, "_linked", lambda source, target: True)
+    monkeypatch.setattr(fencing, "_link_all", lambda source, target: True)
     outcome = simulate(SMALL)
     assert outcome.frames.twice > 0
 
 
 def test_a_link_that_is_not_moved_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    point = fencing._point
+    point = fencing._point_link
     monkeypatch.setattr(
-        fencing, "_point", lambda states, epoch: None if states.is_symlink() and epoch > 2 else point(states, epoch)
+        fencing,
+        "_point_link",
+        lambda states, epoch: None if states.is_symlink() and epoch > 2 else point(states, epoch),
     )
-    monkeypatch.setattr(worker_process, "sweep", lambda states, epoch: [])
+    monkeypatch.setattr(worker_process, "remove_earlier_epochs", lambda states, epoch: [])
     monkeypatch.setattr("studies.simulation.simulate.PATIENCE_S", 60.0)
     outcome = simulate(SMALL)
     assert outcome.frames.lost > 0

@@ -10,7 +10,7 @@ import pytest
 from lenses import HEIGHT, WIDTH
 from rigs import NAMES, easymocap, lenses, opencv_file, opencv_matrix, write_pictures
 
-from client.importers.extras import MissingExtra
+from client.importers.extras import MissingExtraError
 from client.importers.formats.file_storage import read_storage
 from client.importers.open_source import open_source, read_calibration
 from scas4d_core.captures import CaptureError
@@ -130,7 +130,7 @@ def test_files_that_opencv_wrote(tmp_path):
 def test_opencv_is_asked_for_by_name(tmp_path, monkeypatch):
     easymocap(lenses(), tmp_path, sizes=True)
     monkeypatch.setitem(sys.modules, "cv2", None)
-    with pytest.raises(MissingExtra, match=r"reading OpenCV's YAML and XML files needs OpenCV .*\[importers\]"):
+    with pytest.raises(MissingExtraError, match=r"reading OpenCV's YAML and XML files needs OpenCV .*\[importers\]"):
         read_calibration(tmp_path)
 
 

@@ -157,7 +157,7 @@ def change(text, old, new):
         ('name = "cam2"', 'name = "cam1"', "two cameras are called 'cam1'"),
         ('name = "cam2"', "name = 1.5", r"\[cam_0\] has the name 1.5; give text"),
         ("[metadata]", "[metadata]\n[", "cannot be read as TOML"),
-        ("[cam_0]", "zoom = 3\n[cam_0]", "zoom is no table of a camera"),
+        ("[cam_0]", "zoom = 3\n[cam_0]", "zoom is not the table of a camera"),
     ],
 )
 def test_what_cannot_be_is_named(tmp_path, old, new, said):

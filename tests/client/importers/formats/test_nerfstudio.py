@@ -115,7 +115,7 @@ def change(document, path, value):
         (("frames", 1, "transform_matrix"), "x", "transform_matrix must be 4x4"),
         (("frames", 1, "transform_matrix", 0, 0), float("nan"), "transform_matrix must be 4x4 .* finite"),
         (("frames", 1, "transform_matrix", 0), [0, 0, 0, 0], "transform_matrix cannot be inverted"),
-        (("frames", 1, "transform_matrix", 0), [2, 0, 0, 0], "is no rotation"),
+        (("frames", 1, "transform_matrix", 0), [2, 0, 0, 0], "is not a rotation"),
         (("frames", 1, "time"), "now", "time is 'now'"),
         (("w",), None, "has no w, nor is there one at the top"),
         (("h",), 240.5, "h is 240.5; give the picture's size in whole pixels"),

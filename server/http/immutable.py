@@ -1,4 +1,4 @@
-"""Answers that stay as they are: with a tag, a range of bytes where one is asked for, and a name for the file."""
+"""Responses with immutable content: entity tags, byte ranges and file names."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from server.problems import Problem
 RANGE = re.compile(r"bytes=([0-9]{0,18})-([0-9]{0,18})")
 TAG_BYTES = 16
 PIECE = 256 * 1024
-"""Bytes of a file that are read at once."""
+"""Size in bytes of the blocks in which a file is read."""
 KEEP = "private, no-cache"
-"""Caches keep an answer, and ask before each use whether it still holds: a damaged state may be made again."""
+"""Cache-Control value. Caches must revalidate a stored response, since a damaged state may be recomputed."""
 
 
-def disposition(name: str, *, inline: bool = False) -> str:
-    """Returns a Content-Disposition (RFC 6266) with the name of the file, whatever characters it has.
+def content_disposition(name: str, *, inline: bool = False) -> str:
+    """Returns a Content-Disposition header (RFC 6266) for a file name with arbitrary characters.
 
-    >>> disposition("front.png", inline=True)
+    >>> content_disposition("front.png", inline=True)
     'inline; filename="front.png"'
     """
     kind = "inline" if inline else "attachment"
@@ -37,7 +37,7 @@ def disposition(name: str, *, inline: bool = False) -> str:
     return f'{kind}; filename="{plain}"{other}'
 
 
-def unchanging(
+def immutable_response(
     request: Request,
     body: bytes | memoryview,
     *,
@@ -46,17 +46,21 @@ def unchanging(
     inline: bool = False,
     headers: Mapping[str, str] | None = None,
 ) -> Response:
-    """Answers with bytes that stay as they are for this address.
+    """Returns a response with bytes that never change for this URL.
 
-    304 for `If-None-Match` with the tag, 206 for one range of bytes (`If-Range` must have the tag); several ranges, and
-    units other than bytes, get the whole (RFC 9110, 13.1 and 14.2).
+    The status is 304 if `If-None-Match` has the tag, and 206 for a single byte range (`If-Range` must have the tag).
+    The response to multiple ranges or to other units has the whole body (RFC 9110, 13.1 and 14.2).
 
     Args:
-        request: with the conditions. body: the whole of it. media_type: of it.
-        name: of the file, for those who save it. inline: browsers show it. headers: others.
+        request: the request with its conditional headers.
+        body: the complete body.
+        media_type: media type of the body.
+        name: file name for clients that save the body.
+        inline: whether browsers display the body instead of saving it.
+        headers: additional headers.
 
     Raises:
-        Problem: 416, the range begins behind the end.
+        Problem: 416 if the range starts at or after the end of the body.
     """
     tag = f'"{blake3(body).hexdigest(TAG_BYTES)}"'
     kept = {
@@ -64,9 +68,9 @@ def unchanging(
         "ETag": tag,
         "Cache-Control": KEEP,
         "Accept-Ranges": "bytes",
-        "Content-Disposition": disposition(name, inline=inline),
+        "Content-Disposition": content_disposition(name, inline=inline),
     }
-    if is_known(request, tag):
+    if matches_etag(request, tag):
         return Response(status_code=304, headers=kept)
     wanted = _range(request, tag, len(body))
     if wanted is None:
@@ -76,25 +80,29 @@ def unchanging(
     return Response(bytes(body[start:end]), 206, kept, media_type)
 
 
-async def unchanging_file(request: Request, path: Path, *, tag: str, media_type: str, name: str) -> Response:
-    """Answers with a file that stays as it is, as `unchanging` does, and holds a piece of it in memory.
+async def immutable_file_response(request: Request, path: Path, *, tag: str, media_type: str, name: str) -> Response:
+    """Returns a response with an immutable file, like `immutable_response`, but streams it in blocks.
 
     Args:
-        request: with the conditions. path: of the file. tag: without quotes, of its bytes. media_type: of it.
-        name: of the file, for those who save it.
+        request: the request with its conditional headers.
+        path: path of the file.
+        tag: entity tag of the file's contents, without quotes.
+        media_type: media type of the file.
+        name: file name for clients that save the file.
 
     Raises:
-        Problem: 416, the range begins behind the end. FileNotFoundError: there is no such file.
+        Problem: 416 if the range starts at or after the end of the file.
+        FileNotFoundError: there is no such file.
     """
     opened = await asyncio.to_thread(path.open, "rb")
     kept = {
         "ETag": f'"{tag}"',
         "Cache-Control": KEEP,
         "Accept-Ranges": "bytes",
-        "Content-Disposition": disposition(name),
+        "Content-Disposition": content_disposition(name),
     }
     try:
-        if is_known(request, kept["ETag"]):
+        if matches_etag(request, kept["ETag"]):
             opened.close()
             return Response(status_code=304, headers=kept)
         size = os.fstat(opened.fileno()).st_size
@@ -114,7 +122,7 @@ async def unchanging_file(request: Request, path: Path, *, tag: str, media_type:
 
 
 def _pieces(opened: BinaryIO, start: int, end: int) -> Iterator[bytes]:
-    """Reads an open file from one byte to another, and closes it; in threads, as Starlette runs it."""
+    """Yields the bytes from `start` to `end` of an open file and closes it; Starlette runs it in threads."""
     with opened:
         opened.seek(start)
         while start < end and (piece := opened.read(min(PIECE, end - start))):
@@ -122,8 +130,8 @@ def _pieces(opened: BinaryIO, start: int, end: int) -> Iterator[bytes]:
             yield piece
 
 
-def is_known(request: Request, tag: str) -> bool:
-    """True where `If-None-Match` has the tag, weak or strong."""
+def matches_etag(request: Request, tag: str) -> bool:
+    """Returns whether `If-None-Match` contains the tag, by weak comparison."""
     given = request.headers.get("if-none-match")
     if given is None or request.method not in ("GET", "HEAD"):
         return False
@@ -133,10 +141,10 @@ def is_known(request: Request, tag: str) -> bool:
 
 
 def _range(request: Request, tag: str, size: int) -> tuple[int, int] | None:
-    """Returns begin and end of the range that is asked for; None: the whole.
+    """Returns start and end of the requested byte range, or None for the whole body.
 
     Raises:
-        Problem: 416.
+        Problem: 416 if the range is not satisfiable.
     """
     given = request.headers.get("range")
     if given is None or request.headers.get("if-range", tag) != tag:

@@ -20,18 +20,18 @@ from server.storage.journal import Journal
 from server.storage.layout import SceneFolder
 from server.storage.points import points_positions, points_sha256
 from server.storage.recovery import Recovered, recover
-from server.updates.reports import of_first_report
+from server.updates.reports import first_frame_facts
 from server.updates.trouble import last_trouble
 
 
 @dataclass(frozen=True)
-class FoundScene:
+class StoredScene:
     """A scene as it lies in its folder.
 
     Attributes:
         definition: with the settings of the reconstruction that was begun last. content: of its folder.
         points_sha256: of the initial cloud, or None. warnings: what looks wrong with the rig, a sentence each.
-        first: see `of_first_report`. used: when its journal was last written, seconds since the epoch.
+        first: see `first_frame_facts`. used: when its journal was last written, seconds since the epoch.
     """
 
     definition: Definition
@@ -65,7 +65,7 @@ class FoundScene:
         )
 
 
-async def make(folder: SceneFolder, definition: Definition) -> FoundScene:
+async def create_folder(folder: SceneFolder, definition: Definition) -> StoredScene:
     """Makes the folder of a new scene: its journal, and last the definition, which makes it a scene.
 
     Raises:
@@ -81,10 +81,12 @@ async def make(folder: SceneFolder, definition: Definition) -> FoundScene:
     await asyncio.to_thread(write_definition, folder, definition)
     content = await asyncio.to_thread(recover, folder, definition.id)
     rig, settings = definition.request.rig.rig(), definition.settings.scene
-    return FoundScene(definition, content, warnings=rig_warnings(rig, settings))
+    return StoredScene(definition, content, warnings=rig_warnings(rig, settings))
 
 
-def find(folder: SceneFolder, bury: Callable[[Path, str], object], said: Sequence[str] = ()) -> FoundScene:
+def read_stored_scene(
+    folder: SceneFolder, bury: Callable[[Path, str], object], said: Sequence[str] = ()
+) -> StoredScene:
     """Reads a scene back from its folder. Blocking.
 
     Args:
@@ -104,7 +106,7 @@ def find(folder: SceneFolder, bury: Callable[[Path, str], object], said: Sequenc
     before = [*said, damage] if damage is not None else said
     content.damage[:0] = [sentence for sentence in dict.fromkeys(before) if sentence not in content.damage]
     folder, begun = content.folder, content.ledger.begun
-    if (now := definition.after(begun)) is not definition:
+    if (now := definition.with_reconstruction(begun)) is not definition:
         try:
             write_definition(folder, now)
         except OSError as error:  # the journal has it, and the next start writes it
@@ -114,11 +116,11 @@ def find(folder: SceneFolder, bury: Callable[[Path, str], object], said: Sequenc
         with contextlib.suppress(FileNotFoundError):  # states of a worker before: they are swept a minute after it
             bury(path, f"{folder.name}-{path.name}")
     rig, settings, positions = now.request.rig.rig(), now.settings, points_positions(folder.points)
-    return FoundScene(
+    return StoredScene(
         now,
         content,
         points_sha256(folder.points),
         rig_warnings(rig, settings.scene) if positions is None else rig_warnings(rig, settings.scene, positions),
-        of_first_report(content.first_report) if content.ledger.committed else {},
+        first_frame_facts(content.first_report) if content.ledger.committed else {},
         used,
     )

@@ -20,7 +20,7 @@ BEHIND = 8
 log = logging.getLogger("scas4d.worker")
 
 
-class Compacting:
+class StateCompactor:
     """Keeps the newest states of a scene exact and the others compact.
 
     Args:
@@ -29,18 +29,18 @@ class Compacting:
 
     def __init__(self, spec: SceneSpec) -> None:
         self._spec = spec
-        self._rules = spec.kept
+        self._rules = spec.retention
         self._compaction: Compaction | None = None
         self._failed = False
 
-    def keep(self, rules: IngestSettings) -> None:
+    def set_rules(self, rules: IngestSettings) -> None:
         """Goes by other rules from now on."""
         self._rules = rules
         if self._compaction is not None:
             self._compaction.close()
         self._compaction = None
 
-    def meanwhile(self, history: History, waits: Callable[[], bool]) -> None:
+    def compact_while_idle(self, history: History, waits: Callable[[], bool]) -> None:
         """Compacts states that are due until a message waits; a disk that takes nothing is tried at the next message.
 
         Args:

@@ -1,4 +1,4 @@
-"""Checks that the data folder is the same one on every node, and keeps what the service relies on."""
+"""Startup check of the data folder, which all nodes must share and which must support certain file operations."""
 
 from __future__ import annotations
 
@@ -14,29 +14,31 @@ from ray.exceptions import RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from scas4d_core.storage.npz import open_atomically
-from server.cluster.marks import appears
+from server.cluster.folder_marker import wait_for_content
 from server.cluster.nodes import living_nodes
 from server.storage.fencing import PART
 
-PROBE = ".probe"
-PATIENCE_S = 180.0
-"""Seconds that a node may take to answer: its first task starts a Python process, slow on a node with other work."""
+PROBE_NAME = ".probe"
+TIMEOUT_S = 180.0
+"""Maximum seconds for a node to respond; its first task starts a Python process, which is slow on a busy node."""
 
 
 def check_folder(data: Path) -> None:
-    """Has every node read what this process wrote, write a file, sync it, rename and link it; reads it back.
+    """Checks that every node can read a file that this process wrote, and that this process can read theirs.
+
+    Each node also syncs, renames and links its file.
 
     Raises:
-        RuntimeError: a node does not see the folder, or its file system does not do.
+        RuntimeError: a node does not see the folder, or its file system does not support these operations.
     """
     data.mkdir(parents=True, exist_ok=True)
     word = secrets.token_hex(8)
-    probe = data / f"{PROBE}-{word}"
+    probe = data / f"{PROBE_NAME}-{word}"
     probe.write_text(word)
     nodes = {node["NodeID"]: node for node in living_nodes()}
     try:
         asked = {
-            id: _look.options(scheduling_strategy=NodeAffinitySchedulingStrategy(id, soft=False)).remote(
+            id: _probe.options(scheduling_strategy=NodeAffinitySchedulingStrategy(id, soft=False)).remote(
                 str(data), word, id
             )
             for id in nodes
@@ -44,28 +46,28 @@ def check_folder(data: Path) -> None:
         for id, answer in asked.items():
             name = f"node {nodes[id]['NodeManagerHostname']} ({id[:8]})"
             try:
-                fault = ray.get(answer, timeout=PATIENCE_S)
+                fault = ray.get(answer, timeout=TIMEOUT_S)
             except RayError as error:
                 raise RuntimeError(f"{name} does not answer: {error}") from None
             if fault is not None:
                 raise RuntimeError(f"{name} {fault}; mount the data folder {data} there, at the same path")
-            if not appears(data / f"{PROBE}-{word}-{id[:8]}", word):
+            if not wait_for_content(data / f"{PROBE_NAME}-{word}-{id[:8]}", word):
                 raise RuntimeError(f"what {name} writes to {data} does not appear here; is it the same folder?")
     finally:
-        for path in data.glob(f"{PROBE}-{word}*"):  # what a node left that did not get to its end, too
+        for path in data.glob(f"{PROBE_NAME}-{word}*"):  # includes files of nodes that failed midway
             path.unlink(missing_ok=True)
 
 
-def probe_here(data: Path, word: str, id: str) -> str | None:
-    """Tries the folder on this node; returns what is wrong, after the node's name. Blocking."""
+def probe_from_node(data: Path, word: str, id: str) -> str | None:
+    """Checks the folder on this node; returns None or the fault, worded to follow the node's name. Blocking."""
     try:
-        if not appears(data / f"{PROBE}-{word}", word):
+        if not wait_for_content(data / f"{PROBE_NAME}-{word}", word):
             return f"does not see what the service writes to {data}"
-        beside, path = (data / f"{PROBE}-{word}-{id[:8]}{end}" for end in (PART, ""))
+        beside, path = (data / f"{PROBE_NAME}-{word}-{id[:8]}{end}" for end in (PART, ""))
         with open_atomically(path, beside) as file:
             file.write(word.encode())
         link, symbolic = path.with_suffix(".link"), path.with_suffix(".symbolic")
-        with contextlib.suppress(OSError):  # states are copied then
+        with contextlib.suppress(OSError):  # without hard links, states are copied
             os.link(path, link)
         symbolic.symlink_to(path.name)
         symbolic.replace(link)
@@ -76,5 +78,5 @@ def probe_here(data: Path, word: str, id: str) -> str | None:
 
 
 @ray.remote(num_cpus=0)
-def _look(data: str, word: str, id: str) -> Any:
-    return probe_here(Path(data), word, id)
+def _probe(data: str, word: str, id: str) -> Any:
+    return probe_from_node(Path(data), word, id)

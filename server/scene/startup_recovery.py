@@ -7,12 +7,12 @@ import secrets
 from collections.abc import Awaitable, Callable
 
 from scas4d_core.storage.npz import sync_folder
-from server.problems import Problem, counted
+from server.problems import Problem, count_noun
 from server.storage.definition import never_acknowledged
 from server.storage.layout import DataFolder, SceneFolder
 
 
-class Recovering:
+class StartupRecovery:
     """The scenes that were found at the start, until they are recovered.
 
     Args:
@@ -52,7 +52,7 @@ class Recovering:
             return
         raise Problem(
             503,
-            f"recovering {self._count - len(self._left)} of {counted(self._count, 'scene')}",
+            f"recovering {self._count - len(self._left)} of {count_noun(self._count, 'scene')}",
             field="id" if id is not None else None,
             value=id,
             remedy="ask again: all acknowledged frames are on disk, and are being read",
@@ -64,7 +64,7 @@ class Recovering:
         while self._left:
             await self._read(self._data.scene(self._left[0]))
             del self._left[0]
-        await asyncio.to_thread(self._data.sweep)
+        await asyncio.to_thread(self._data.remove_deleted)
 
     def _folders(self) -> list[str]:
         """Lists the folders of scenes, newest journal first; moves those never acknowledged to the deleted ones."""

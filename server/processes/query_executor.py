@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from functools import partial
 
 from server import counters
-from server.messages import Damaged, SceneSpec
-from server.problems import Problem, counted
-from server.processes.placement import AnyProcess, Entry, Placement, ProcessExit
-from server.processes.queries import Answer, AskedQuery, Query, Refused
+from server.messages import DamageFound, SceneSpec
+from server.problems import Problem, count_noun
+from server.processes.placement import Entry, Placement, ProcessExit, ProcessHandle
+from server.processes.queries import Answer, NumberedQuery, Query, QueryRefused
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
 """Pause before a process that ended by itself is started again; it doubles with each end without an answer."""
@@ -25,7 +25,7 @@ MOST_WAITING = 64
 ANSWER_SECONDS = 120.0
 """A query that takes longer gets 503: the longest that is let in takes about half of it."""
 
-Noticed = Callable[[Mapping[str, str]], None]
+OnDamage = Callable[[Mapping[str, str]], None]
 """Called with files of the states' folder that cannot be read, by name with the reason."""
 
 log = logging.getLogger("scas4d.server")
@@ -37,15 +37,15 @@ class _WaitingQuery:
 
     number: int
     query: Query
-    answer: asyncio.Future[Answer | Refused]
+    answer: asyncio.Future[Answer | QueryRefused]
     lost: bool = False
 
-    def end(self, answer: Answer | Refused) -> None:
+    def end(self, answer: Answer | QueryRefused) -> None:
         if not self.answer.done():
             self.answer.set_result(answer)
 
 
-class QueryQueue:
+class QueryExecutor:
     """A reader process and the queue before it. The process has one query at a time; cancelled ones are never started.
 
     Args:
@@ -64,7 +64,7 @@ class QueryQueue:
         placement: Placement,
         *,
         grace: float,
-        damaged: Noticed,
+        damaged: OnDamage,
     ) -> None:
         self._entry = entry
         self._spec = spec
@@ -73,7 +73,7 @@ class QueryQueue:
         self._damaged = damaged
         self._waiting: deque[_WaitingQuery] = deque()
         self._at_work: _WaitingQuery | None = None
-        self.process: AnyProcess | None = None
+        self.process: ProcessHandle | None = None
         self._life: object = None
         self._ending: set[asyncio.Task[None]] = set()
         self._failures = 0
@@ -92,7 +92,7 @@ class QueryQueue:
         if self.process is None and self._pause is None and not self._closed:
             self._start()
 
-    async def ask(self, query: Query) -> Answer | Refused:
+    async def ask(self, query: Query) -> Answer | QueryRefused:
         """Queues a query and returns its answer.
 
         Raises:
@@ -101,14 +101,14 @@ class QueryQueue:
         if len(self._waiting) >= MOST_WAITING:
             raise Problem(
                 503,
-                f"{counted(len(self._waiting), 'question')} of this scene waiting for an answer already",
+                f"{count_noun(len(self._waiting), 'question')} of this scene waiting for an answer already",
                 field="id",
                 value=self._spec.folder.name,
                 remedy="ask less often, or subscribe (WS …/stream): it sends the newest only",
                 headers={"Retry-After": "1"},
             )
         if self._closed:
-            return Refused(0, "the scene has ended", status=503)
+            return QueryRefused(0, "the scene was closed", status=503)
         self._asked += 1
         turn = _WaitingQuery(self._asked, query, asyncio.get_running_loop().create_future())
         self._waiting.append(turn)
@@ -142,12 +142,12 @@ class QueryQueue:
             await process.stop(0 if busy else seconds)
         await asyncio.gather(*self._ending)
         for turn in turns:
-            turn.end(Refused(turn.number, "the scene has ended", status=503))
+            turn.end(QueryRefused(turn.number, "the scene was closed", status=503))
 
     def _start(self) -> None:
         self._life = life = object()
         ended = partial(self._process_ended, life)
-        self.process = self._placement.start(self._entry, self._spec, self._answered, ended)
+        self.process = self._placement.start(self._entry, self._spec, self._on_answer, ended)
 
     def _next(self) -> None:
         """Gives the process the next query, if it is free."""
@@ -158,10 +158,10 @@ class QueryQueue:
         assert self.process is not None
         self._at_work = self._waiting.popleft()
         stale, self.stale = None if self.stale is None else frozenset(self.stale), set()
-        self.process.send(AskedQuery(self._at_work.number, self._at_work.query, stale))
+        self.process.send(NumberedQuery(self._at_work.number, self._at_work.query, stale))
 
-    def _answered(self, message: Answer | Refused | Damaged) -> None:
-        if isinstance(message, Damaged):
+    def _on_answer(self, message: Answer | QueryRefused | DamageFound) -> None:
+        if isinstance(message, DamageFound):
             self._damaged(message.files)
             return
         turn = self._at_work
@@ -197,9 +197,9 @@ class QueryQueue:
                 self._waiting.appendleft(turn)
             else:
                 fault = f"the reader ended while it was busy with this: {reason}"
-                turn.end(Refused(turn.number, fault, status=503 if reason.lost else 500))
-        self._pause = asyncio.get_running_loop().call_later(pause, self._go_on)
+                turn.end(QueryRefused(turn.number, fault, status=503 if reason.lost else 500))
+        self._pause = asyncio.get_running_loop().call_later(pause, self._restart)
 
-    def _go_on(self) -> None:
+    def _restart(self) -> None:
         self._pause = None
         self._next()

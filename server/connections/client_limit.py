@@ -1,4 +1,4 @@
-"""Limits the requests of each client behind a trusted proxy to the connections that a peer may have."""
+"""Per-client limit on concurrent requests behind a trusted proxy."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from server.connections.refusals import Refusal, problem
 
 
 class ClientLimit:
-    """Counts requests and WebSockets under way by the address of their client, and answers 429 above the limit.
+    """Middleware that limits the concurrent requests and WebSockets of each client address.
 
-    A proxy's connections are not counted as one peer's; instead each client that it names (X-Forwarded-For, read by
-    uvicorn from trusted proxies alone) is held to the same number.
+    Above the limit, it responds with 429. The connections of a proxy do not count as those of a single peer.
+    Instead, the limit per peer applies to each client that the proxy names in X-Forwarded-For. uvicorn reads this
+    header from trusted proxies only.
     """
 
     def __init__(self, app: ASGIApp, guard: ConnectionGuard) -> None:
@@ -24,14 +25,14 @@ class ClientLimit:
         self._under_way: Counter[str] = Counter()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Passes the request on, or refuses it."""
+        """Passes the request on, or responds with 429."""
         address = (scope.get("client") or ("",))[0]
         limits = self.guard.limits
         if scope["type"] not in ("http", "websocket") or limits.is_proxy(address):
             await self.app(scope, receive, send)
             return
         if self._under_way[address] >= limits.per_peer:
-            self.guard.refused(Refusal.CLIENT_REQUESTS)
+            self.guard.count_refusal(Refusal.CLIENT_REQUESTS)
             refused = problem(Refusal.CLIENT_REQUESTS, limits.of_refusal(Refusal.CLIENT_REQUESTS))
             await problems.refuse(refused, scope, receive, send)
             return

@@ -1,4 +1,4 @@
-"""`Curve`: how a lens bends rays, and back, as far as its polynomial rises. Numpy only."""
+"""`DistortionCurve`: how a lens bends rays, and back, as far as its polynomial rises. Numpy only."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CLOSE = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
-class Curve:
+class DistortionCurve:
     """The bending of a lens: by the ray's radius at distance 1 or, of a fisheye, by its angle from the axis.
 
     Attributes:
@@ -43,7 +43,7 @@ class Curve:
     bends: Float
 
     @classmethod
-    def of(cls, lens: LensCamera) -> Curve:
+    def of(cls, lens: LensCamera) -> DistortionCurve:
         """Measures a lens that is not straight."""
         samples = np.linspace(0, np.pi, SAMPLES) if lens.fisheye else np.tan(np.linspace(0, FLAT, SAMPLES))
         bends, slopes = _profile(lens, samples)
@@ -63,30 +63,30 @@ class Curve:
         return cls(lens, float(samples[end - 1]), turns, samples[:end], bends[:end])
 
     @property
-    def widest(self) -> float:
+    def max_radius(self) -> float:
         """Radius of a ray at distance 1 up to which the lens is believed; infinite beyond 89°."""
         if not self.lens.fisheye:
             return self.reach
         return float(np.tan(self.reach)) if self.reach < FLAT else np.inf
 
-    def bent(self, rays: Float) -> Float:
+    def distort(self, rays: Float) -> Float:
         """Rays (x/z, y/z) [P, 2], within `widest`, to where the lens's plane at distance 1 shows them [P, 2]."""
         radius = np.linalg.norm(rays, axis=-1, keepdims=True)
         of = np.arctan(radius) if self.lens.fisheye else radius
         bends, _ = _profile(self.lens, of)
-        return rays * np.where(radius > 0, bends / np.maximum(radius, 1e-12), 1.0) + _aside(self.lens, rays)
+        return rays * np.where(radius > 0, bends / np.maximum(radius, 1e-12), 1.0) + _tangential_offset(self.lens, rays)
 
-    def straight(self, bent: Float) -> Float:
+    def undistort(self, bent: Float) -> Float:
         """Undoes `bent`, [P, 2] to [P, 2]: ±infinity beyond 89° of a fisheye, NaN where no ray is believed."""
         if self.lens.fisheye or not _tangential(self.lens).any():
-            return self._outward(bent)
-        rays = self._outward(bent)
+            return self._undistort_radial(bent)
+        rays = self._undistort_radial(bent)
         for _ in range(ROUNDS):
-            rays = self._outward(bent - _aside(self.lens, rays))
-        close = np.abs(self.bent(rays) - bent).max(axis=-1) < CLOSE
+            rays = self._undistort_radial(bent - _tangential_offset(self.lens, rays))
+        close = np.abs(self.distort(rays) - bent).max(axis=-1) < CLOSE
         return np.where(close[:, None], rays, np.nan)
 
-    def _outward(self, bent: Float) -> Float:
+    def _undistort_radial(self, bent: Float) -> Float:
         """Undoes the radial part alone."""
         radius = np.linalg.norm(bent, axis=-1)
         of = np.interp(radius, self.bends, self.samples)
@@ -124,7 +124,7 @@ def _tangential(lens: LensCamera) -> Float:
     return np.zeros(2) if lens.fisheye else lens.distortion[2:4]
 
 
-def _aside(lens: LensCamera, rays: Float) -> Float:
+def _tangential_offset(lens: LensCamera, rays: Float) -> Float:
     """The tangential part of the bending, [P, 2]."""
     p1, p2 = _tangential(lens)
     x, y = rays[:, 0], rays[:, 1]

@@ -26,21 +26,21 @@ from scas4d_core.engines.limits import rig_limits
 from scas4d_core.errors import InputError, message_of, without_paths
 from scas4d_core.storage.frame_files import frame_file
 from scas4d_core.storage.history import DamagedFrameError, History, UnreadableFrameError
-from server.messages import Damaged, SceneSpec, Stop
+from server.messages import DamageFound, SceneSpec, Stop
 from server.processes import track_answers
 from server.processes.compact_answers import compact_head, write_compact
-from server.processes.part_labels import PartLabels, fitted
+from server.processes.part_labels import PartLabels, resize_labels
 from server.processes.placement import use_one_thread
 from server.processes.queries import (
     Answer,
-    AskedQuery,
     CompactQuery,
     GaussiansQuery,
     LabelsQuery,
+    NumberedQuery,
     PartsQuery,
     PlyQuery,
     Query,
-    Refused,
+    QueryRefused,
     RenderQuery,
     TracksQuery,
 )
@@ -64,12 +64,12 @@ DAMAGED_AT_ONCE = 8
 log = logging.getLogger("scas4d.renderer")
 
 
-def views(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
+def run_view_reader(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     """Runs the process for views until it is asked to stop, or until the service is gone."""
     _serve(spec, connection)
 
 
-def bulk(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
+def run_bulk_reader(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     """Runs the process for queries that may take long."""
     os.nice(BULK_NICE)
     for left in spec.folder.path.glob(f"{EXPORT}.*"):  # of one that was killed while it answered
@@ -79,7 +79,7 @@ def bulk(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
 
 def _serve(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    renderer = Renderer(spec)
+    renderer = QueryReader(spec)
     while True:
         try:
             message = connection.recv()
@@ -87,16 +87,16 @@ def _serve(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
             break
         if isinstance(message, Stop):
             break
-        if isinstance(message, AskedQuery):
+        if isinstance(message, NumberedQuery):
             answer = renderer.answer(message)
             if faults := renderer.pop_faults():  # before a refused query is asked again
-                connection.send(Damaged(faults))
+                connection.send(DamageFound(faults))
             connection.send(answer)
     logging.shutdown()
     os._exit(0)
 
 
-class Renderer:
+class QueryReader:
     """Answers queries about committed states, one after the other."""
 
     def __init__(self, spec: SceneSpec) -> None:
@@ -148,7 +148,7 @@ class Renderer:
                 if index is not None and index not in known:
                     history.files.faults.setdefault(frame_file(index), f"{frame_file(index)} is gone")
 
-    def answer(self, ask: AskedQuery) -> Answer | Refused:
+    def answer(self, ask: NumberedQuery) -> Answer | QueryRefused:
         """Returns the encoded answer, or the reason for a refusal."""
         asked = f"{ask.query.kind} query"
         self._stale = None if ask.stale is None or self._stale is None else self._stale | ask.stale
@@ -159,21 +159,23 @@ class Renderer:
                 log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
                 if more and isinstance(ask.query, PartsQuery | LabelsQuery):  # found from all others
                     continue
-                return Refused(ask.number, message_of(error), "ask again later: it is mended if it can be", status=503)
+                return QueryRefused(
+                    ask.number, message_of(error), "ask again later: it is mended if it can be", status=503
+                )
             except UnreadableFrameError as error:  # deleted since the service checked
                 log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
                 self._note_missing(ask.query)
-                return Refused(ask.number, message_of(error), status=404)
+                return QueryRefused(ask.number, message_of(error), status=404)
             except InputError as error:
                 log.warning("scene %s refused %s: %s", self.spec.folder.name, asked, error)
                 status = 404 if isinstance(ask.query, GaussiansQuery) else 422
-                return Refused(ask.number, without_paths(error.fault), without_paths(error.remedy), status)
+                return QueryRefused(ask.number, without_paths(error.fault), without_paths(error.remedy), status)
             except ValueError as error:
                 log.warning("scene %s refused %s: %s", self.spec.folder.name, asked, error)
-                return Refused(ask.number, message_of(error))
+                return QueryRefused(ask.number, message_of(error))
             except Exception as error:
                 log.exception("scene %s, %s", self.spec.folder.name, asked)
-                return Refused(ask.number, f"{type(error).__name__}: {message_of(error)}", status=500)
+                return QueryRefused(ask.number, f"{type(error).__name__}: {message_of(error)}", status=500)
         raise AssertionError("the last turn returns")
 
     def _answer(self, number: int, query: Query) -> Answer:
@@ -181,13 +183,13 @@ class Renderer:
             case RenderQuery():
                 painted = query.labels
                 if painted is not None:
-                    painted = fitted(painted, len(self.history.gaussians(query.frame)))
+                    painted = resize_labels(painted, len(self.history.gaussians(query.frame)))
                 view = self.reader.render(query.camera, query.frame, background=query.background, labels=painted)
                 body, media_type, headers = encode_view(view, query.kinds, query.format, query.quality)
                 return Answer(number, body, media_type, {**headers, "X-Frame": str(query.frame)})
             case TracksQuery():
-                tracks = track_answers.find(self.reader, self.history, query)
-                return Answer(number, *track_answers.encoded(tracks, query, track_answers.metres_per_unit(self.spec)))
+                tracks = track_answers.compute_tracks(self.reader, self.history, query)
+                return Answer(number, *track_answers.encode(tracks, query, track_answers.metres_per_unit(self.spec)))
             case PartsQuery():
                 labels, last = self.labels(query.count), self.history.indices[-1]
                 model = parts_model(labels, self.history.gaussians(last).ids, last)

@@ -1,4 +1,4 @@
-"""A scene's reconstruction begun anew: checks the request, makes the event of it, journals it."""
+"""Restart of a scene's reconstruction: checks the request, builds its event and journals it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from client.wire import FrameState, ReconstructionRequest
 from scas4d_core.cameras import Rig
 from scas4d_core.rig_checks import RigError, check_start
 from scas4d_core.settings import Settings
-from server.problems import Problem, counted, of_rig
+from server.problems import Problem, count_noun, rig_problem
 from server.storage.definition import read_definition
 from server.storage.disk import full_disk, no_room
 from server.storage.events import ReconstructionBegun
@@ -23,84 +23,88 @@ from server.storage.recovery import recover
 log = logging.getLogger("scas4d.server")
 
 
-def how_to_begin_again(ledger: Ledger) -> str:
-    """Says how a scene that has failed goes on."""
+def restart_remedy(ledger: Ledger) -> str:
+    """Returns the remedy for a failed scene: a restart of its reconstruction."""
     number = ledger.reconstruction + 1
     return (
-        f"begin its reconstruction anew: PUT /v1/scenes/{ledger.scene}/reconstructions/{number}, "
+        f"restart its reconstruction: PUT /v1/scenes/{ledger.scene}/reconstructions/{number}, "
         f"or scas4d begin-again {ledger.scene}"
     )
 
 
-def begins_anew(id: str) -> Problem:
-    """Makes the answer, 503, for a scene whose reconstruction is being begun anew."""
+def restarting_problem(id: str) -> Problem:
+    """Returns the 503 response for a scene whose reconstruction is being restarted."""
     fault = "the reconstruction of this scene is being begun anew"
     return Problem(503, fault, field="id", value=id, remedy="ask again", headers={"Retry-After": "1"})
 
 
 @dataclass(frozen=True)
-class Beginning:
-    """A reconstruction to begin in place of the one before.
+class NewReconstruction:
+    """Reconstruction that will replace the current one.
 
     Args:
-        number: of it. asked: how. settings: of the scene with those of the request, checked. rig: of the scene.
+        number: number of the new reconstruction.
+        request: restart request.
+        settings: validated settings of the scene with the request's changes.
+        rig: rig of the scene.
     """
 
     number: int
-    asked: ReconstructionRequest
+    request: ReconstructionRequest
     settings: Settings
     rig: Rig
 
     def event(self, ledger: Ledger, folder: SceneFolder) -> ReconstructionBegun | None:
-        """Makes the event of the beginning; None: it was begun before, by the same request.
+        """Returns the event that starts the reconstruction, or None if the same request already started it.
 
         Args:
-            ledger, folder: of the scene as it is.
+            ledger: current ledger of the scene.
+            folder: current folder of the scene.
 
         Raises:
-            Problem: 409, it is another number's turn, the frame cannot be begun with, or committed frames would be
-                dropped unasked; 422, distances are unknown.
+            Problem: 409, another number is next, the reconstruction cannot start with the frame, the scene is archived,
+                or committed frames would be discarded without consent; 422, the rig's scale is unknown.
         """
-        if self._known(ledger):
+        if self._is_repeated(ledger):
             return None
         if ledger.edited.archived:
             raise Problem(
                 409,
-                "the scene is archived: all it has stays as it is",
+                "the scene is archived",
                 field="archived",
                 value=True,
-                remedy='take that back first: PATCH …/scenes/{id} with {"archived": false}, scas4d scenes restore',
+                remedy='unarchive it first: PATCH …/scenes/{id} with {"archived": false}, scas4d scenes restore',
             )
-        index = self._first(ledger)
+        index = self._first_frame(ledger)
         count = len(ledger.committed)
-        if count > 1 and not self.asked.discard:
+        if count > 1 and not self.request.discard:
             raise Problem(
                 409,
-                f"the states of {counted(count, 'committed frame')} would be dropped",
+                f"the states of {count_noun(count, 'committed frame')} would be discarded",
                 field="discard",
                 value=False,
-                remedy="set discard to true (begin-again --discard) to drop them, or create another scene",
+                remedy="set discard to true (begin-again --discard) to discard them, or create another scene",
                 committed=count,
             )
         cloud: int | None = None
-        if self.asked.points:
+        if self.request.points:
             cloud = self.number if folder.points_of(self.number).exists() else folder.cloud
         try:
             check_start(self.rig, cloud is not None and folder.points_of(cloud).exists())
         except RigError as error:
-            raise of_rig(error) from None
+            raise rig_problem(error) from None
         return ReconstructionBegun(
             number=self.number,
             index=index,
             points=cloud,
             settings=self.settings.model_dump(mode="json"),
-            asked=self.asked,
+            request=self.request,
         )
 
-    def _known(self, ledger: Ledger) -> bool:
-        """Returns whether the reconstruction was begun before, by the same request."""
+    def _is_repeated(self, ledger: Ledger) -> bool:
+        """Returns whether the same request already started the reconstruction."""
         now = ledger.reconstruction
-        if self.number == now and ledger.begun is not None and ledger.begun.asked == self.asked:
+        if self.number == now and ledger.begun is not None and ledger.begun.request == self.request:
             return True
         if self.number != now + 1:
             reason = "has begun already" if self.number <= now else "comes after another one"
@@ -114,19 +118,19 @@ class Beginning:
             )
         return False
 
-    def _first(self, ledger: Ledger) -> int:
-        """Returns the frame to begin with."""
-        frames, index = ledger.frames, self.asked.frame
+    def _first_frame(self, ledger: Ledger) -> int:
+        """Returns the index of the first frame of the reconstruction."""
+        frames, index = ledger.frames, self.request.frame
         if index is None:
-            sent = (i for i in range(frames.first, len(frames)) if _is_sent(frames[i]))
+            sent = (i for i in range(frames.first, len(frames)) if _takes_part(frames[i]))
             index = next(sent, max(frames.first, len(frames)))
         entry = frames.get(index)
-        if entry is None or (_is_sent(entry) and entry.files):
+        if entry is None or (_takes_part(entry) and entry.files):
             return index
         fault = f"frame {index} is {entry.state}"
-        if _is_sent(entry):
+        if _takes_part(entry):
             fault = f"the pictures of frame {index} are deleted"
-        held = next((other.index for other in frames.with_pictures() if _is_sent(other)), None)
+        held = next((other.index for other in frames.with_pictures() if _takes_part(other)), None)
         remedy = f"begin with the next frame that comes, {ledger.next_frame}"
         if held is not None:
             remedy = f"begin with frame {held}, the first whose pictures are held, or with the next that comes, "
@@ -141,14 +145,16 @@ class Beginning:
         )
 
 
-async def journal_beginning(folder: SceneFolder, beginning: Beginning) -> list[str]:
-    """Journals the beginning of a scene that is stopped, if it still may: a frame may have been committed since.
+async def journal_new_reconstruction(folder: SceneFolder, beginning: NewReconstruction) -> list[str]:
+    """Journals the restart of a stopped scene after checking the request again.
+
+    The second check is necessary because a frame may have been committed since the first one.
 
     Returns:
-        Sentences about damage that was found.
+        One message per fault found in the folder.
 
     Raises:
-        Problem: see `Beginning.event`; 507, the disk is full.
+        Problem: see `NewReconstruction.event`; 507, the disk is full.
     """
     definition, _ = await asyncio.to_thread(read_definition, folder)
     recovered = await asyncio.to_thread(recover, folder, definition.id, definition.as_json())
@@ -167,6 +173,6 @@ async def journal_beginning(folder: SceneFolder, beginning: Beginning) -> list[s
     return recovered.damage
 
 
-def _is_sent(entry: FrameEntry) -> bool:
+def _takes_part(entry: FrameEntry) -> bool:
     """Returns whether the frame was acknowledged and takes part in reconstructions."""
     return entry.receipt is not None and entry.state not in (FrameState.MISSING, FrameState.SKIPPED)

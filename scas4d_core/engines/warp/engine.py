@@ -1,0 +1,293 @@
+"""The engine of GPUs: one iteration of an update in Warp, in the order of algorithm 1."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from math import log10
+
+import numpy as np
+import warp as wp
+from numpy.typing import NDArray
+
+from scas4d_core.engines.cpu.gloss import LearntGloss, features_seen, without_turn
+from scas4d_core.engines.engine import AttemptStart, IterationLog, StepScalars, Tables, Thinned, ViewRecord
+from scas4d_core.engines.gains import GainEstimator
+from scas4d_core.engines.plan import Structure, UpdatePlan
+from scas4d_core.engines.views import LABEL, TrainingView
+from scas4d_core.engines.warp.adam import Adam
+from scas4d_core.engines.warp.colours import WarpColours
+from scas4d_core.engines.warp.deformation import WarpDeformation
+from scas4d_core.engines.warp.layout import IMAGE_LOSS, MASK_LOSS, SHIFT, SQUARES
+from scas4d_core.engines.warp.pictures import PicturePass
+from scas4d_core.engines.warp.renderer import WarpRenderer
+from scas4d_core.gaussians import Gaussians, quaternion_products
+from scas4d_core.guards import SMALLEST_SQUARE, GuardCounts, summed
+
+Array = NDArray[np.float32]
+
+RECORDS = 4096
+"""Rows of the log on the device; the host reads them when they are full."""
+
+
+class WarpEngine:
+    """The ``UpdateEngine`` of NVIDIA Warp, on a GPU or on Warp's CPU device.
+
+    Kernels are launched one by one, and the host reads the overflow flag after each picture. Gloss and gains of the
+    cameras are computed on the host, from pictures and gradients that come down for them.
+
+    Args:
+        device: of Warp, as "cpu" or "cuda:0".
+
+    Attributes:
+        renderer: draws states with the background and limits of the plan.
+    """
+
+    name = "warp"
+    renderer: WarpRenderer
+
+    def __init__(self, device: str = "cuda:0") -> None:
+        self._device = device
+
+    def bind(self, plan: UpdatePlan, structure: Structure) -> None:
+        """See ``UpdateEngine.bind``; this engine does all that a plan can ask for."""
+        self._plan, self._structure, self._rows = plan, structure, structure.hierarchy.rows
+        self.renderer = WarpRenderer(plan.background, plan.limits, self._device, plan.image)
+        self._deformation = WarpDeformation(self._device, plan, structure)
+        self._pictures = PicturePass(self._device, plan, len(structure.roots))
+        self._pictures.reserve(RECORDS)
+        self._camera_rows = {name: row for row, name in enumerate(plan.cameras)}
+        self._views: list[TrainingView] = []
+        self._probes: list[TrainingView] = []
+        self._view, self._record = (wp.zeros(1, dtype=wp.int32, device=self._device) for _ in range(2))
+
+    def load_views(self, views: Sequence[TrainingView], probes: Sequence[TrainingView]) -> None:
+        """See ``UpdateEngine.load_views``; where gains are followed, the views get exposures of their own."""
+        self._views, self._probes = list(views), list(probes)
+        if self._plan.camera_gains:
+            exposures = {view.name: view.exposure.copy() for view in views}
+            self._views = [replace(view, exposure=exposures[view.name]) for view in views]
+            self._probes = [replace(view, exposure=exposures[view.name]) for view in probes]
+        self._pictures.load_views([*self._views, *self._probes])
+
+    def load_state(self, previous: Gaussians) -> None:
+        """See ``UpdateEngine.load_state``."""
+        self._previous, device = previous, self._device
+        self._deformation.start(previous)
+        self._pictures.forget_guards()
+        self._opacities = wp.array(previous.opacities, dtype=wp.float32, device=device)
+        self._features = wp.array(previous.features(previous.colours), dtype=wp.float32, ndim=2, device=device)
+        self._gloss: LearntGloss | None = None
+        self._gains: GainEstimator | None = None
+        self._colours: WarpColours | None = None
+        self._layer_steps: list[Adam] = []
+        self._own_step: Adam | None = None
+        self._log, self._records = IterationLog(), 0
+
+    def set_tables(self, tables: Tables) -> None:
+        """See ``UpdateEngine.set_tables``."""
+        self._deformation.set_tables(tables)
+
+    def begin(self, start: AttemptStart) -> None:
+        """See ``UpdateEngine.begin``."""
+        plan, previous, deformation = self._plan, self._previous, self._deformation
+        self._start, self._log = start, IterationLog()
+        betas = start.beta1, start.beta2
+        if plan.colours is not None:
+            self._colours = WarpColours(plan, self._features, previous.colours, self._rows, start)
+        if plan.gloss and previous.gloss is not None and previous.environment is not None:
+            roots = self._structure.roots
+            self._gloss = LearntGloss(previous.gloss, previous.environment, len(previous), self._rows, roots)
+        if start.gains is not None:
+            self._gains = GainEstimator(start.gains, self._camera_rows, self._views)
+            self._expose()
+        columns = [[r] * 3 + [t] * 3 + [scaling] * 4 for r, t, scaling in start.layers]
+        self._layer_steps = [
+            Adam(table, rates, betas) for table, rates in zip(deformation.clusters, columns, strict=True)
+        ]
+        own = [start.position] * 3 + [start.rotation] * 3 + [start.scale] * 3
+        self._own_step = Adam(deformation.deltas, own, betas)
+        deformation.set_samples(list(start.samples))
+
+    def iterate(self, views: Sequence[int], step: StepScalars) -> None:
+        """See ``UpdateEngine.iterate``."""
+        deformation, pictures, lap = self._deformation, self._pictures, self._start.lap
+        deformation.forward()
+        lap("cascade")
+        for gradient in (pictures.grad_means, pictures.grad_factors, pictures.grad_features):
+            gradient.zero_()
+        rows = [self._picture(index, 1.0 / len(views), step) for index in views]
+        lap("render backward")
+        deformation.backward(pictures.grad_means, pictures.grad_factors, step)
+        if self._colours is not None:
+            self._colours.backward(_as_table(pictures.grad_features), deformation.loss)
+        lap("cascade backward")
+        self._step(step)
+        loss = sum(row[IMAGE_LOSS] + row[MASK_LOSS] for row in rows) / len(views)
+        self._log.losses.append(float(loss + deformation.loss.numpy()[0]))
+        lap("adam")
+
+    def _picture(self, index: int, weight: float, step: StepScalars) -> Array:
+        """Renders a view, compares it, and carries its losses back, times a weight; its row of the log."""
+        view, deformation, pictures = self._views[index], self._deformation, self._pictures
+        if self._gloss is None:
+            row = self._launched(index, _as_rows(self._features), weight)
+        else:
+            means, turns = deformation.means.numpy(), deformation.turns.numpy()
+            seen, total = self._features.numpy().copy(), pictures.grad_features.numpy().copy()
+            colours = np.ascontiguousarray(seen[:, :LABEL])
+            self._gloss.shade(means, turns, colours, view.camera, seen)
+            pictures.grad_features.zero_()
+            row = self._launched(index, wp.array(seen, dtype=wp.vec4, device=self._device), weight)
+            own = pictures.grad_features.numpy() / np.float32(weight)
+            self._gloss.shade_backward(means, colours, view.camera, own)
+            pictures.grad_features.assign(total + np.float32(weight) * own)
+        if self._gains is not None or step.keep_pictures:
+            height, width = view.target.shape[1:]
+            planes = pictures.planes.numpy()[:, :height, :width]
+            if step.keep_pictures:
+                self._log.keep(index, Thinned.of(planes[: LABEL + 1], planes[LABEL + 1]))
+            if self._gains is not None:
+                self._gains.record_rendering(view, planes[:LABEL])
+                self._expose()
+        self._log.rendered.append(record_of(index, row, view))
+        return row
+
+    def _launched(self, index: int, features: wp.array, weight: float) -> Array:
+        """A picture of the deformed Gaussians, its gradients added; with more room where lists had too little."""
+        deformation, pictures = self._deformation, self._pictures
+        self._view.fill_(index)
+        given = (deformation.means, deformation.factors, self._opacities, features)
+        pictures.launch(self._view, self._record, *given, weight)
+        # A picture that overflowed was drawn empty, and has added no gradient.
+        while pictures.grow():
+            pictures.launch(self._view, self._record, *given, weight)
+        row: Array = pictures.log.numpy()[0]
+        return row
+
+    def _step(self, step: StepScalars) -> None:
+        """Adam over all that is free."""
+        deformation = self._deformation
+        for adam, gradient, factor in zip(self._layer_steps, deformation.cluster_gradients, step.layers, strict=True):
+            adam.step(gradient, factor)
+        assert self._own_step is not None  # begin was called
+        self._own_step.step(deformation.delta_gradients, step.own)
+        if self._colours is not None:
+            self._colours.step(step.colour)
+        if self._gloss is not None:
+            self._gloss.step(step.gloss, step.smooth_gloss)
+
+    def _expose(self) -> None:
+        """Sends the exposures of the views and probes to the device."""
+        views = [*self._views, *self._probes]
+        exposures = np.zeros((len(views), LABEL + 1, 2), np.float32)
+        exposures[..., 0] = 1
+        for row, view in enumerate(views):
+            exposures[row, : len(view.exposure)] = view.exposure
+        self._pictures.exposures.assign(exposures)
+
+    def leave_out(self, views: Sequence[int]) -> None:
+        """See ``UpdateEngine.leave_out``."""
+        if self._gains is not None:
+            self._gains.leave_out([self._views[index] for index in views])
+
+    def wait(self, iteration: int) -> None:
+        """See ``UpdateEngine.wait``."""
+        wp.synchronize_device(self._device)
+
+    def probe(self, which: Sequence[int], *, moved: bool, learnt: bool) -> list[float]:
+        """See ``UpdateEngine.probe``."""
+        deformation, pictures, state, turns = self._deformation, self._pictures, self._previous, None
+        means, factors = deformation.previous
+        if moved:
+            deformation.forward()
+            means, factors = deformation.means, deformation.factors
+        if learnt:
+            state = self._with_looks(state)
+        if state.gloss is not None and moved:
+            state = state.replace(means=means.numpy())
+            turns = without_turn(len(state))
+            turns[self._rows] = deformation.turns.numpy()
+        errors = []
+        for index in which:
+            seen = features_seen(state, self._probes[index].camera, turns)
+            features = wp.array(seen, dtype=wp.vec4, device=self._device)
+            self._view.fill_(len(self._views) + index)
+            pictures.measure(self._view, self._record, means, factors, self._opacities, features)
+            while pictures.grow():
+                pictures.measure(self._view, self._record, means, factors, self._opacities, features)
+            errors.append(float(pictures.log.numpy()[0, IMAGE_LOSS]))
+        return errors
+
+    def tables(self) -> Tables:
+        """See ``UpdateEngine.tables``."""
+        return self._deformation.tables()
+
+    def log(self) -> IterationLog:
+        """See ``UpdateEngine.log``."""
+        steps = [*self._layer_steps, *([] if self._own_step is None else [self._own_step])]
+        counts: list[GuardCounts] = [self._pictures.guards(), *(step.guards() for step in steps)]
+        if self._colours is not None:
+            counts.append(self._colours.guards())
+        acted = dict(summed(counts)) | {"held_back": self._deformation.held_back}
+        self._log.guards = {name: count for name, count in acted.items() if count}
+        return self._log
+
+    def state(self, learnt: bool) -> Gaussians:
+        """See ``UpdateEngine.state``."""
+        previous, deformation = self._previous, self._deformation
+        deformation.forward()
+        rotations = previous.rotations.copy()
+        turned = quaternion_products(deformation.turns.numpy(), previous.rotations[self._rows])
+        rotations[self._rows] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+        means, factors = deformation.means.numpy().copy(), deformation.factors.numpy().copy()
+        moved = previous.replace(means=means, factors=factors, rotations=rotations)
+        return self._with_looks(moved) if learnt else moved
+
+    def exposures(self) -> Mapping[str, Array]:
+        """See ``UpdateEngine.exposures``."""
+        return {view.name: view.exposure.copy() for view in self._views}
+
+    def gains(self) -> Array:
+        """See ``UpdateEngine.gains``."""
+        if self._gains is None:
+            raise ValueError("gains were not given to begin; the plan has to follow them (UpdatePlan.camera_gains)")
+        self._gains.finish_round()
+        self._expose()
+        return self._gains.gains.copy()
+
+    def gradients(self) -> dict[str, Array]:
+        """See ``UpdateEngine.gradients``; those of frozen layers are not up to date."""
+        deformation = self._deformation
+        tables = {f"cluster {k}": table.numpy().copy() for k, table in enumerate(deformation.cluster_gradients)}
+        tables["deltas"] = deformation.delta_gradients.numpy().copy()
+        if self._colours is not None:
+            tables["colours"] = self._colours.gradients.numpy().copy()
+        if self._gloss is not None:
+            tables["gloss"], tables["environment"] = (gradient.copy() for gradient in self._gloss.gradients)
+        return tables
+
+    def _with_looks(self, state: Gaussians) -> Gaussians:
+        """A state with the colours, gloss and environment learnt so far."""
+        state = state.replace(colours=np.ascontiguousarray(self._features.numpy()[:, :LABEL]))
+        if self._gloss is None:
+            return state
+        return state.replace(gloss=self._gloss.gloss.copy(), environment=self._gloss.environment.copy())
+
+
+def record_of(index: int, row: Array, view: TrainingView) -> ViewRecord:
+    """The record of a rendering, from its row of the device's log."""
+    height, width = view.target.shape[1:]
+    psnr = 10 * log10(3 * height * width / max(float(row[SQUARES]), SMALLEST_SQUARE))
+    red, green, blue = row[SHIFT : SHIFT + LABEL].tolist()
+    return ViewRecord(index, psnr, (red, green, blue))
+
+
+def _as_rows(table: wp.array) -> wp.array:
+    """[N] of vec4, of the same memory as [N, 4]."""
+    return wp.array(ptr=table.ptr, dtype=wp.vec4, shape=table.shape[0], device=table.device)
+
+
+def _as_table(rows: wp.array) -> wp.array:
+    """[N, 4], of the same memory as [N] of vec4."""
+    return wp.array(ptr=rows.ptr, dtype=wp.float32, shape=(rows.shape[0], 4), device=rows.device)

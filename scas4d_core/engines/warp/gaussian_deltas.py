@@ -1,0 +1,170 @@
+"""The deltas of single Gaussians, equation (5), with the scale and floor terms; reference: ``engines.torch``."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from scas4d_core.engines.warp.cluster_map import LARGEST
+from scas4d_core.engines.warp.quaternions import (
+    conjugate,
+    matrix_backward,
+    matrix_of,
+    of_tangent,
+    of_tangent_backward,
+    product,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.struct
+class Terms:
+    """Weights and constants of the terms of single Gaussians.
+
+    Attributes:
+        separate: 1: the Jacobian does not move the covariance.
+        axis_length, floor: weight of one axis, and of one Gaussian; 0: no such term. plane: of the floor.
+    """
+
+    separate: wp.int32
+    axis_length: wp.float32
+    floor: wp.float32
+    plane: wp.vec4
+
+
+@wp.func
+def delta(deltas: wp.array2d[wp.float32], entry: wp.int32, first: wp.int32) -> wp.vec3:
+    """Three columns of a row of the deltas."""
+    return wp.vec3(deltas[entry, first], deltas[entry, first + 1], deltas[entry, first + 2])
+
+
+@wp.func
+def stretch(ds: wp.vec3) -> wp.mat33:
+    """diag(exp Δs), with clamped arguments."""
+    return wp.diag(
+        wp.vec3(
+            wp.exp(wp.clamp(ds[0], -LARGEST, LARGEST)),
+            wp.exp(wp.clamp(ds[1], -LARGEST, LARGEST)),
+            wp.exp(wp.clamp(ds[2], -LARGEST, LARGEST)),
+        )
+    )
+
+
+@wp.kernel
+def apply_deltas(
+    terms: Terms,
+    rows: wp.array[wp.int32],
+    sound: wp.array[wp.int32],
+    points: wp.array[wp.vec3],
+    jacobians: wp.array[wp.mat33],
+    turned: wp.array[wp.vec4],
+    previous_factors: wp.array[wp.mat33],
+    deltas: wp.array2d[wp.float32],
+    means: wp.array[wp.vec3],
+    factors: wp.array[wp.mat33],
+    turns: wp.array[wp.vec4],
+) -> None:
+    """Applies Δp, ΔR, Δs after the cascade; a thread for each of M moving Gaussians.
+
+    Args:
+        rows: [M] rows of the Gaussians in Θ. sound: [M] 1 for entries that are finite; others are left alone.
+        points, jacobians, turned: [M] after the cascade. previous_factors: [N] of Θ_{t−1}. deltas: [M, 9].
+        means, factors: out [N], the moving rows. turns: out [M] unit quaternions with w ≥ 0.
+    """
+    entry = wp.tid()
+    if sound[entry] == 1:
+        row = rows[entry]
+        q = of_tangent(delta(deltas, entry, 3))
+        carried = matrix_of(q)
+        if terms.separate == 0:
+            carried = carried * jacobians[entry]
+        means[row] = points[entry] + delta(deltas, entry, 0)
+        factors[row] = carried * previous_factors[row] * stretch(delta(deltas, entry, 6))
+        turn = product(q, turned[entry])
+        turns[entry] = wp.where(turn[0] < 0.0, -turn, turn)
+
+
+@wp.kernel
+def apply_deltas_backward(
+    terms: Terms,
+    rows: wp.array[wp.int32],
+    sound: wp.array[wp.int32],
+    jacobians: wp.array[wp.mat33],
+    turned: wp.array[wp.vec4],
+    previous_factors: wp.array[wp.mat33],
+    deltas: wp.array2d[wp.float32],
+    length_bounds: wp.array[wp.vec3],
+    means: wp.array[wp.vec3],
+    factors: wp.array[wp.mat33],
+    g_means: wp.array[wp.vec3],
+    g_factors: wp.array[wp.mat33],
+    tied_means: wp.array[wp.vec3],
+    tied_turns: wp.array[wp.vec4],
+    g_points: wp.array[wp.vec3],
+    g_jacobians: wp.array[wp.mat33],
+    g_turned: wp.array[wp.vec4],
+    g_deltas: wp.array2d[wp.float32],
+    loss: wp.array[wp.float32],
+) -> None:
+    """Turns gradients of the moved Gaussians into those of the deltas and of the cascade; adds two terms.
+
+    Args:
+        terms, rows, sound, jacobians, turned, previous_factors, deltas: as of ``apply_deltas``.
+        length_bounds: [M] metres; a longer axis is penalized (equation (8)). means, factors: [N] as moved.
+        g_means, g_factors: [N] gradients of the pictures. tied_means, tied_turns: [M] of the neighbour terms.
+        g_points, g_jacobians, g_turned: out [M] gradients of what the cascade gave. g_deltas: out [M, 9].
+        loss: [1] the weighted scale and floor terms are added.
+    """
+    entry = wp.tid()
+    if sound[entry] == 0:
+        for k in range(9):
+            g_deltas[entry, k] = 0.0
+        return
+    row = rows[entry]
+    here = wp.float32(0.0)
+    g_mean = g_means[row] + tied_means[entry]
+    depth = wp.dot(means[row], wp.vec3(terms.plane[0], terms.plane[1], terms.plane[2])) + terms.plane[3]
+    if terms.floor > 0.0 and depth > 0.0:
+        here += terms.floor * depth
+        g_mean += terms.floor * wp.vec3(terms.plane[0], terms.plane[1], terms.plane[2])
+    factor = factors[row]
+    g_factor = g_factors[row]
+    if terms.axis_length > 0.0:
+        for axis in range(3):
+            column = wp.vec3(factor[0, axis], factor[1, axis], factor[2, axis])
+            length = wp.length(column)
+            excess = length - length_bounds[entry][axis]
+            if excess > 0.0:
+                here += terms.axis_length * excess
+                for k in range(3):
+                    g_factor[k, axis] = g_factor[k, axis] + terms.axis_length * column[k] / length
+    dr = delta(deltas, entry, 3)
+    ds = delta(deltas, entry, 6)
+    q = of_tangent(dr)
+    rotation = matrix_of(q)
+    # F = R(Δr) C with C = J F_previous diag(exp Δs).
+    g_carried = wp.transpose(rotation) * g_factor
+    carried = wp.transpose(rotation) * factor
+    g_q = matrix_backward(q, g_factor * wp.transpose(carried))
+    for axis in range(3):
+        along = wp.float32(0.0)
+        for k in range(3):
+            along += g_carried[k, axis] * carried[k, axis]
+        g_deltas[entry, 6 + axis] = wp.where(wp.abs(ds[axis]) <= LARGEST, along, 0.0)
+    g_jacobian = wp.mat33(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    if terms.separate == 0:
+        g_jacobian = g_carried * wp.transpose(previous_factors[row] * stretch(ds))
+    turn = product(q, turned[entry])
+    g_turn = tied_turns[entry]
+    if turn[0] < 0.0:
+        g_turn = -g_turn
+    g_q += product(g_turn, conjugate(turned[entry]))
+    g_r = of_tangent_backward(dr, g_q)
+    for k in range(3):
+        g_deltas[entry, k] = g_mean[k]
+        g_deltas[entry, 3 + k] = g_r[k]
+    g_points[entry] = g_mean
+    g_jacobians[entry] = g_jacobian
+    g_turned[entry] = product(conjugate(q), g_turn)
+    if here != 0.0:
+        wp.atomic_add(loss, 0, here)

@@ -1,0 +1,78 @@
+"""Rigidity, isometry and rotation between neighbours, with their gradients; reference: ``engines.torch.losses``."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from scas4d_core.engines.warp.quaternions import matrix_backward, matrix_of
+from scas4d_core.guards import ROOT_FLOOR
+
+wp.set_module_options({"enable_backward": False})
+
+FLOOR = wp.constant(wp.float32(ROOT_FLOOR))
+
+
+@wp.kernel
+def neighbour_terms(
+    weights: wp.vec3,
+    sample: wp.array[wp.int32],
+    neighbours: wp.array2d[wp.int32],
+    pair_weights: wp.array2d[wp.float32],
+    distances: wp.array2d[wp.float32],
+    rows: wp.array[wp.int32],
+    previous: wp.array[wp.vec3],
+    means: wp.array[wp.vec3],
+    turns: wp.array[wp.vec4],
+    tied_means: wp.array[wp.vec3],
+    tied_turns: wp.array[wp.vec4],
+    loss: wp.array[wp.float32],
+) -> None:
+    """Adds up the three terms and their gradients; a thread for each of S sampled Gaussians.
+
+    Roots are exact: at rest differences are rounding, and a fast root would turn them into gradients of full size.
+
+    Args:
+        weights: of rigidity, isometry and rotation, for one pair; 0: no such term.
+        sample: [S] entries. neighbours, pair_weights, distances: [M, k], weights of 0 for pairs that do not count.
+        rows: [M] rows of the Gaussians in Θ. previous, means: [N] of Θ_{t−1}, and as moved. turns: [M].
+        tied_means, tied_turns: [M] gradients, added to. loss: [1] the weighted terms are added.
+    """
+    i = sample[wp.tid()]
+    here = wp.float32(0.0)
+    turn = turns[i]
+    rotation = matrix_of(turn)
+    mean = means[rows[i]]
+    before = previous[rows[i]]
+    g_mean = wp.vec3(0.0, 0.0, 0.0)
+    g_turn = wp.vec4(0.0, 0.0, 0.0, 0.0)
+    for k in range(neighbours.shape[1]):
+        weight = pair_weights[i, k]
+        if weight > 0.0:
+            j = neighbours[i, k]
+            g_other = wp.vec3(0.0, 0.0, 0.0)
+            offset = means[rows[j]] - mean
+            if weights[0] > 0.0:
+                change = wp.transpose(rotation) * offset - (previous[rows[j]] - before)
+                size = wp.sqrt(weight * wp.dot(change, change) + FLOOR)
+                here += weights[0] * size
+                g_change = weights[0] * weight / size * change
+                g_other += rotation * g_change
+                g_turn += matrix_backward(turn, wp.outer(offset, g_change))
+            if weights[1] > 0.0:
+                distance = wp.sqrt(wp.dot(offset, offset) + FLOOR)
+                longer = distance - distances[i, k]
+                size = wp.sqrt(weight * longer * longer + FLOOR)
+                here += weights[1] * size
+                g_other += weights[1] * weight * longer / size / distance * offset
+            if weights[2] > 0.0:
+                apart = turns[j] - turn
+                size = wp.sqrt(weight * wp.dot(apart, apart) + FLOOR)
+                here += weights[2] * size
+                g_apart = weights[2] * weight / size * apart
+                g_turn -= g_apart
+                wp.atomic_add(tied_turns, j, g_apart)
+            g_mean -= g_other
+            wp.atomic_add(tied_means, j, g_other)
+    wp.atomic_add(tied_means, i, g_mean)
+    wp.atomic_add(tied_turns, i, g_turn)
+    wp.atomic_add(loss, 0, here)
