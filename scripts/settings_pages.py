@@ -1,4 +1,4 @@
-"""Writes the tables of settings into docs/operations.md and docs/settings.md, from the fields themselves.
+"""Writes the tables of settings into docs/service-settings.md and docs/settings.md, from the fields themselves.
 
 python scripts/settings_pages.py            # writes
 python scripts/settings_pages.py --check    # says whether they are up to date
@@ -86,7 +86,7 @@ def written(page: Path, table: str) -> str:
 def main() -> None:
     """Writes, or checks."""
     stale = []
-    for name, table in (("operations.md", server_table()), ("settings.md", method_table())):
+    for name, table in (("service-settings.md", server_table()), ("settings.md", method_table())):
         page = DOCS / name
         text = written(page, table)
         if text != page.read_text():

@@ -36,7 +36,7 @@ DROPPED_CAMERAS = Counter(
 ALARMS = Counter(
     "scas4d_alarms",
     "Alarms of committed frames, by what they are about.",
-    ["what"],
+    ["kind"],
     registry=registry,
 )
 for what in AlarmKind:

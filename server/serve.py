@@ -58,7 +58,7 @@ def serve(settings: ServerSettings) -> None:
     prepare = partial(logs.configure, settings.log_format, settings.log_level)
     prepare()
     for name in unknown_names(os.environ):
-        log.warning("%s is not a setting and was ignored; docs/operations.md lists them", name)
+        log.warning("%s is not a setting and was ignored; docs/service-settings.md lists them", name)
     try:
         lock_data(settings.data).release()  # early check; the application takes the lock at startup
     except OSError as error:

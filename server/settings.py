@@ -1,6 +1,6 @@
 """Settings of the service: by argument, by environment (SCAS4D_<NAME>), by a TOML file (SCAS4D_CONFIG), by default.
 
-The first of these that names a setting decides. docs/operations.md has the table of all, written from here.
+The first of these that names a setting decides. docs/service-settings.md has the table, generated from here.
 """
 
 from __future__ import annotations
@@ -45,148 +45,154 @@ class ServerSettings(BaseSettings):
 
     model_config = SettingsConfigDict(frozen=True, extra="forbid", hide_input_in_errors=True, env_prefix=PREFIX)
 
-    data: Path = Field(default=Path("data"), description="Folder of the scenes; made when missing.")
+    data: Path = Field(default=Path("data"), description="Folder of the scenes; created if missing.")
 
-    host: str = Field(
-        default="127.0.0.1", description="Address to listen at. Beyond the loopback only together with a token."
-    )
-    port: int = Field(default=8000, ge=0, le=65535, description="Port to listen at; 0 takes a free one.")
+    host: str = Field(default="127.0.0.1", description="Address to listen at. Other than loopback only with a token.")
+    port: int = Field(default=8000, ge=0, le=65535, description="Port to listen at; 0: any free port.")
     token: SecretStr | None = Field(
         default=None,
-        description="Every request but those of /health, the viewer's page and the API's description has to bear it "
-        "(Authorization: Bearer). None: every user of this machine may do everything.",
+        description=(
+            "Token of every request (Authorization: Bearer), except for /health, the viewer's files "
+            "and the API description. None: every user of this machine may do everything."
+        ),
     )
     token_file: Path | None = Field(
-        default=None, description="File with the token, as a mounted secret; not together with `token`."
+        default=None, description="File with the token, such as a mounted secret; not together with `token`."
     )
     allowed_hosts: Names = Field(
         default=(),
-        description="Names under which the service may be addressed (Host), besides those of the loopback and the "
-        "address that it listens at: `studio.example`, or `studio.example:8443` for one port only. A name that is not "
-        "here is refused: it may be an attacker's, pointed at this machine.",
+        description=(
+            "Further names of the service (Host): `studio.example`, or `studio.example:8443` for one "
+            "port. Other names are refused, because they may be an attacker's."
+        ),
     )
     allowed_origins: Names = Field(
         default=(),
-        description="Other sites whose pages may use the service, as `https://viewer.example`; pages of the service "
-        "itself always may.",
+        description="Other sites whose pages may use the service, such as `https://viewer.example`.",
     )
 
     header_seconds: float = Field(
         default=10.0,
         gt=0,
         le=600,
-        description="Time from the first byte of a request to the end of its header, and from opening a connection to "
-        "that byte, in seconds; a later header gets 408, a connection without a byte is closed. A header is one or two "
-        "packets: ten seconds allow to send them three times again.",
+        description=(
+            "Seconds to send a header, from opening the connection or from the first byte of a later request."
+        ),
     )
     header_kb: int = Field(
         default=64,
         ge=8,
         le=1024,
-        description="Largest header of a request, with its address, in kB of 1024 bytes; a larger one gets 431 or 414. "
-        "Browsers send up to 16 kB with cookies of other services on this host; the time to read a header grows with "
-        "the square of its size.",
+        description="Largest header with its URL, in kB of 1024 bytes.",
     )
     body_seconds: float = Field(
         default=20.0,
         gt=0,
         le=3600,
-        description="Time in which 16 kB of a body, or its end, have to come while the service reads, in seconds; else "
-        "408. A radio link that is lost for a moment comes back sooner; 0.8 kB/s could not send a picture.",
+        description="Seconds per 16 kB of a body, or until its end.",
     )
     keep_alive_seconds: float = Field(
         default=15.0,
         gt=0,
         le=3600,
-        description="Life of a connection between two requests, in seconds. Longer than clients keep theirs (httpx 5 "
-        "s), so that none sends into one that is just closed; a proxy has to close its idle connections sooner than "
-        "this.",
+        description=(
+            "Lifetime of an idle connection in seconds. Clients should close earlier (httpx: 5 s), "
+            "and so should proxies."
+        ),
     )
     unread_seconds: float = Field(
         default=30.0,
         gt=0,
         le=3600,
-        description="Time in which a peer has to read 16 kB of the data that waits for it, in seconds; else the "
-        "connection is ended, a WebSocket's too. That data is held in memory.",
+        description=("Seconds in which a peer must read 16 kB of waiting data; otherwise the connection is aborted."),
     )
     max_connections: int = Field(
         default=1024,
         ge=8,
-        description="Open connections, at most half of the files that may be open; a further one takes the place of "
-        "one that has sent no whole header, is idle or has stopped sending, or gets 503.",
+        description="Open connections in total, at most half of the open files allowed.",
     )
     max_connections_per_peer: int = Field(
         default=256,
         ge=4,
-        description="Open connections of one address, or of one client behind a trusted proxy: enough for 64 cameras "
-        "with a sender each, and their viewers; more get 429.",
+        description=(
+            "Open connections per address, or per client of a trusted proxy: enough for 64 cameras "
+            "with a sender each, and their viewers."
+        ),
     )
     trusted_proxies: Names = Field(
         default=(),
-        description="Addresses or networks (`10.0.0.2, 10.1.0.0/24`) of proxies whose X-Forwarded-For and "
-        "X-Forwarded-Proto are believed, and whose connections are not counted as one peer's. Nobody else's are.",
+        description=(
+            "Addresses or networks (`10.0.0.2, 10.1.0.0/24`) of proxies whose X-Forwarded-For and "
+            "X-Forwarded-Proto are trusted."
+        ),
     )
 
     log_format: Literal["auto", "json", "text"] = Field(
         default="auto",
-        description="json: one object a line. text: plain lines, without requests that only read and succeed. auto: "
-        "text where the service runs in a terminal, else json.",
+        description=(
+            "json: one object per line. text: plain lines, without successful reads. auto: text in a "
+            "terminal, else json."
+        ),
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
-        default="info", description="info has a line a request."
+        default="info", description="info logs a line per request."
     )
 
     placement: str = Field(
         default="local",
-        description="Where processes of scenes run: `local`, on this machine; `ray`, on the Ray cluster that runs here "
-        "or that RAY_ADDRESS names; `ray=HOST:6379`, on that one (docs/cluster.md).",
+        description=(
+            "`local`: processes of scenes run on this machine. `ray`: on the local Ray cluster, or "
+            "the one in RAY_ADDRESS. `ray=HOST:6379`: on that cluster (docs/cluster.md)."
+        ),
     )
     max_scenes: int = Field(
         default=8,
         ge=1,
-        description="Scenes awake at a time, with up to three processes and some hundred megabytes each. Others sleep.",
+        description="Maximum number of awake scenes, with up to three processes each. The others sleep.",
     )
     sleep_seconds: float = Field(
         default=600.0,
         ge=0,
-        description="A scene that nobody sends to or looks at sleeps after so long: its processes end, and start again "
-        "when it is asked something. 0: never.",
+        description="An unused scene sleeps after this many seconds. 0: never.",
     )
     max_scene_memory_mb: float | None = Field(
         default=None,
         gt=0,
-        description="Memory of a scene in MB: one with a larger estimate (POST /v1/estimate) is refused. Default: "
-        "the machine's memory.",
+        description="Refuse scenes with a larger memory estimate, in MB. Default: the machine's memory.",
     )
     queue_frames: int = Field(
-        default=4, ge=1, description="Frames of a scene acknowledged and not finished; more get 429."
+        default=4, ge=1, description="Acknowledged, unfinished frames per scene; further frames get 429."
     )
     max_body_mb: float = Field(
         default=256,
         gt=0,
-        description="Largest request body: 64 cameras of 4 MB. One file, and a frame over a WebSocket, is "
-        "limited by the rig's pictures where that is less.",
+        description=(
+            "Largest request body: 64 cameras of 4 MB. Files and WebSocket messages have smaller "
+            "limits that depend on the rig."
+        ),
     )
     max_image_pixels: int = Field(
         default=40_000_000,
         ge=1,
-        description="Pixels of one camera; a decoded picture takes 3 bytes a pixel, twice while decoding.",
+        description="Pixels of one camera. A decoded picture takes 3 bytes per pixel, twice while decoding.",
     )
-    max_subscribers: int = Field(default=128, ge=1, description="Subscribers of one scene's stream; more get 429.")
+    max_subscribers: int = Field(
+        default=128, ge=1, description="Subscribers of one scene's stream; further ones get 429."
+    )
     scrub_mb_per_second: float = Field(
         default=4.0,
         ge=0,
-        description="All that a scene has on disk is read again in the background and compared with its checksums, so "
-        "fast for each scene, and at a quarter of that while a frame of it is at work; 0: never. 4 MB/s take half a "
-        "percent of a core.",
+        description=(
+            "Rate at which each scene's files are read again and their checksums verified; a quarter "
+            "of it during an update. 0: never. 4 MB/s take half a percent of a core."
+        ),
     )
-    scrub_pause_seconds: float = Field(
-        default=600.0, gt=0, description="Before each such pass over a scene; a flipped bit is found a pass later."
-    )
+    scrub_pause_seconds: float = Field(default=600.0, gt=0, description="Pause between two passes over a scene.")
     warm_up: bool = Field(
         default=True,
-        description="Compile the kernels at start where the cache lacks them, in processes beside; /health/ready waits "
-        "for those of a first frame.",
+        description=(
+            "Compile missing kernels at start, in other processes; /health/ready waits for those of a first frame."
+        ),
     )
 
     @classmethod

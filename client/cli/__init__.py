@@ -1,1 +1,1 @@
-"""The `scas4d` command."""
+"""The `scas4d` command line."""

@@ -1,4 +1,4 @@
-"""`python -m client.cli`: the `scas4d` command."""
+"""Entry point of `python -m client.cli`, the `scas4d` command."""
 
 from client.cli.main import main
 

@@ -1,4 +1,4 @@
-"""Options of every command and study that reads a capture; `with_capture_options` adds them."""
+"""Options of every command and study that reads a capture, and the decorator `with_capture_options` that adds them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from scas4d_core.captures import Capture
 
 
 class PicturesFrom(StrEnum):
-    """The kind of files that hold a capture's pictures."""
+    """Kinds of files that a capture's images can come from."""
 
     IMAGES = "images"
     VIDEOS = "videos"
@@ -25,7 +25,7 @@ class PicturesFrom(StrEnum):
 
 
 class SizeMismatch(StrEnum):
-    """Ways in which pictures of another shape than calibrated came about."""
+    """Ways in which images with another aspect ratio than the calibration were produced."""
 
     CORNER = "corner"
     CENTRE = "centre"
@@ -67,9 +67,9 @@ def _options(
 
 
 def with_capture_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Gives a command the options of a capture; they reach it as one `CaptureOptions`, its argument `options`.
+    """Adds the capture options to a command, which receives them as one `CaptureOptions` in its argument `options`.
 
-    An option that the command declares itself, as `masks`, stays its own.
+    An option that the command itself declares, such as `masks`, is not replaced.
 
     >>> @with_capture_options
     ... def count(folder: Path, options: CaptureOptions) -> None:
@@ -98,20 +98,20 @@ def with_capture_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def _parameters(function: Callable[..., Any]) -> dict[str, inspect.Parameter]:
-    """The parameters of a function by name; their annotations are values, not strings."""
+    """Returns a function's parameters by name, with annotations resolved to values."""
     hints = get_type_hints(function, include_extras=True)
     parameters = inspect.signature(function).parameters
     return {name: parameter.replace(annotation=hints[name]) for name, parameter in parameters.items()}
 
 
 def open_capture(folder: Path, options: CaptureOptions, **more: Any) -> Capture:
-    """Opens a capture for a command, and prints the remarks on its reading; `more` as in `open_source`."""
+    """Opens a capture for a command and prints the remarks from reading it; `more` is passed to `open_source`."""
     capture = options.open(folder, **more)
     print_remarks(capture)
     return capture
 
 
 def print_remarks(capture: Capture) -> None:
-    """Prints the remarks on a capture's reading."""
+    """Prints the remarks from reading a capture."""
     for remark in capture.remarks:
         console.print(remark, style="yellow", highlight=False, markup=False, soft_wrap=True)

@@ -1,4 +1,4 @@
-"""Settings, and labels of nodes, written on the command line as NAME=VALUE."""
+"""Settings and node labels given on the command line as NAME=VALUE."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import typer
 from client.wire.base import check_labels
 
 PRESETS = "scas4d, adaptive, fast, paper, dynamic3dgs, rigid, articulated, cloth, people or lights."
-"""Names of the presets, for the help of commands, which do not load them."""
+"""Names of the presets for the commands' help texts, which do not load the presets."""
 Preset = Annotated[str, typer.Option(help=PRESETS)]
 Changes = Annotated[
     list[str] | None,
@@ -31,10 +31,10 @@ Labels = Annotated[
 
 
 def parse_labels(labels: Sequence[str] | None) -> dict[str, str]:
-    """Reads labels of nodes; None gives none.
+    """Parses node labels; None means no labels.
 
     Raises:
-        ValueError: one without a sign, two values of one label, or one that no node can have.
+        ValueError: a label without `=`, one label with two values, or a label that is not valid for a node.
 
     >>> parse_labels(["rig=stage-a", "disk=fast"])
     {'rig': 'stage-a', 'disk': 'fast'}
@@ -50,10 +50,10 @@ def parse_labels(labels: Sequence[str] | None) -> dict[str, str]:
 
 
 def parse_changes(changes: Sequence[str] | None) -> dict[str, Any]:
-    """Reads each value as JSON, else as text; None gives no changes.
+    """Parses settings, each value as JSON or else as text; None means no changes.
 
     Raises:
-        ValueError: a change without a sign, or one inside another.
+        ValueError: a change without `=`, or a setting nested in another one that already has a value.
 
     >>> parse_changes(["update.iterations=200", "update.clusters=[64]", "device=cpu"])
     {'update': {'iterations': 200, 'clusters': [64]}, 'device': 'cpu'}
@@ -77,7 +77,7 @@ def parse_changes(changes: Sequence[str] | None) -> dict[str, Any]:
 
 
 def format_changes(values: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[str, Any]:
-    """The nested settings that are not as usual, by dotted name; the inverse of ``parse_changes``.
+    """Returns the nested settings that differ from `usual`, by dotted name; the inverse of ``parse_changes``.
 
     >>> format_changes({"update": {"iterations": 200, "seed": 0}}, {"update": {"iterations": 100, "seed": 0}})
     {'update.iterations': 200}
@@ -87,7 +87,7 @@ def format_changes(values: Mapping[str, Any], usual: Mapping[str, Any]) -> dict[
 
 
 def _flatten(values: Mapping[str, Any], under: str = "") -> Iterator[tuple[str, Any]]:
-    """``{"update": {"iterations": 100}}`` as ``("update.iterations", 100)``."""
+    """Flattens ``{"update": {"iterations": 100}}`` to ``("update.iterations", 100)``."""
     for name, value in values.items():
         if isinstance(value, dict):
             yield from _flatten(value, f"{under}{name}.")

@@ -22,18 +22,18 @@ from scas4d_core.captures import InitialPoints
 from scas4d_core.frame_outcome import AlarmKind
 
 PUSH_OUTAGE_S = 600.0
-"""A rig goes on trying for so long: a restart of the service is no reason to end a day's capture."""
+"""Seconds for which a rig keeps retrying, so that a restart of the service does not end a day's capture."""
 
 
 class Encoding(StrEnum):
-    """The format of pictures that are encoded anew."""
+    """Format of re-encoded images."""
 
     JPEG = "jpeg"
     PNG = "png"
 
 
 class WhenFull(StrEnum):
-    """The service's answer to a frame when the queue is full."""
+    """What the service does with a new frame when its queue is full."""
 
     REFUSE = "refuse"
     SKIP = "skip"
@@ -95,7 +95,7 @@ def push(
         raise ValueError("--node is for a new scene, and --scene continues one that has its nodes; leave one out")
     source = open_capture(capture, options, encoding=encoding.value)
     with Client(url, token=token, outage=0) as client:
-        client.live()  # a wrong address is said at once, an outage later is waited for
+        client.live()  # a wrong address fails immediately; only later outages are retried
     with Client(url, token=token, outage=outage) as client, Bars() as bars:
         delivery = rig.push(
             source,
@@ -117,7 +117,7 @@ def push(
         status = client.scene(delivery.scene)
     console.print(delivery.lateness.summary(fps), highlight=False, soft_wrap=True)
     for sentence in status.warnings:
-        if sentence not in source.remarks:  # those were printed when it was opened
+        if sentence not in source.remarks:  # already printed when the capture was opened
             console.print(sentence, style="yellow", highlight=False)
     console.print(f"scene {status.id}: {status.committed} of {status.next_frame} frames committed, {status.state}")
     console.print(f"{url.rstrip('/')}/#scene={status.id}", soft_wrap=True)
@@ -126,14 +126,14 @@ def push(
 
 
 def watch(scene: Scene, url: Url = DEFAULT_URL, token: Token = None) -> None:
-    """Prints each finished frame of a scene as it happens, until Ctrl-C or the scene is deleted."""
+    """Prints each frame of a scene when it finishes, until Ctrl-C or until the scene is deleted."""
     from client.stream import Stream, finished_frames, scene_changes
     from client.wire.stream import FrameMessage, SceneMessage
 
     state: str | None = None
     off = set[str]()
     with Client(url, token=token, outage=0) as client:
-        client.scene(scene)  # a wrong id is said at once
+        client.scene(scene)  # a wrong id fails immediately
     try:
         with Stream(url, scene, token=token) as stream:
             stream.subscribe("frames", finished_frames())
@@ -141,7 +141,7 @@ def watch(scene: Scene, url: Url = DEFAULT_URL, token: Token = None) -> None:
             for event in stream:
                 if isinstance(event, FrameMessage) and event.report.state in FINISHED:
                     console.print(frame_line(event.report, event.missed, off), highlight=False, soft_wrap=True)
-                    off |= out_of_step(event.report)  # each is named once, also where it comes and goes at the limit
+                    off |= out_of_step(event.report)  # report each only once
                 elif isinstance(event, SceneMessage) and event.status.state != state:
                     state = event.status.state
                     console.print(f"scene is {state}" + (f": {event.status.error}" if event.status.error else ""))
@@ -175,7 +175,7 @@ def budget(
     url: Url = DEFAULT_URL,
     token: Token = None,
 ) -> None:
-    """Prints the budget of a scene's updates; with options, sets it from the next frame on."""
+    """Prints the compute budget of a scene's updates; with options, changes it from the next frame on."""
     given = (iterations, milliseconds, stop_gain, skip_tolerance)
     if reset and any(value is not None for value in given):
         raise ValueError("--reset cannot be combined with a budget; leave one out")
@@ -224,7 +224,7 @@ def begin_again(
     url: Url = DEFAULT_URL,
     token: Token = None,
 ) -> None:
-    """Begins the reconstruction of a scene anew, after a first frame that failed or came out poor."""
+    """Restarts the reconstruction of a scene after its first frame failed or came out poor."""
     if points is not None and no_points:
         raise ValueError("--points and --no-points contradict each other; give one of them")
     settings = parse_changes(changes)
@@ -259,7 +259,9 @@ def import_(
     frames: Annotated[int | None, typer.Option(min=1, help="Maximum number of frames to import.")] = None,
     encoding: Encode = Encoding.JPEG,
 ) -> None:
-    """Undistorts a capture once and for all: read without OpenCV or PyAV, and fast enough for a rig's full rate."""
+    """Undistorts a capture once, so that reading it needs neither OpenCV nor PyAV and keeps up with the rig's frame
+    rate.
+    """
     from client.importers.write import write_dynamic3dgs
 
     source = open_capture(capture, options, encoding=encoding.value)
@@ -270,19 +272,21 @@ def import_(
 
 
 REPORT_LINE_PARTS = frozenset({AlarmKind.CAMERA_LEFT_OUT, AlarmKind.FRAME_REJECTED, AlarmKind.FRAME_IN_PART})
-"""Alarms that the line of a frame states already."""
+"""Alarms that the frame's report line already states."""
 
 
 def out_of_step(report: FrameReportModel) -> set[str]:
-    """The cameras that are clearly out of step, as a frame's report has them."""
+    """Returns the names of the cameras that a frame's report marks as out of step."""
     return {name for name, one in report.timing.items() if one.out_of_step}
 
 
 def frame_line(report: FrameReportModel, missed: int = 0, off: Collection[str] = ()) -> str:
-    """A finished frame's report as one line.
+    """Formats the report of a finished frame as one line.
 
     Args:
-        missed: frames before it that are not shown. off: cameras that are known to be out of step; others are named.
+        report: the frame's report.
+        missed: number of preceding frames that are not shown.
+        off: cameras already known to be out of step; only other cameras are named.
     """
     parts = [f"frame {report.index}: {report.state}"]
     if report.psnr is not None:
@@ -306,7 +310,7 @@ def frame_line(report: FrameReportModel, missed: int = 0, off: Collection[str] =
 
 
 def register(app: typer.Typer) -> None:
-    """Adds these commands."""
+    """Adds the commands of this module to the app."""
     app.command()(push)
     app.command(name="import")(import_)
     app.add_typer(scenes.app, name="scenes")

@@ -1,4 +1,4 @@
-"""`scas4d demo`: starts a service, streams a capture through it, saves pictures."""
+"""`scas4d demo`: starts a service, streams a capture through it, and saves images."""
 
 from __future__ import annotations
 
@@ -22,18 +22,20 @@ from client.sdk import Client
 from scas4d_core.captures import Capture
 
 POLL_S = 0.5
-"""Between two questions whether the service is ready."""
+"""Seconds between two checks whether the service is ready."""
 PREPARING = "making the kernels ready"
 
 
 @contextmanager
 def running_service(data: Path, log: Path, port: int = 8000) -> Iterator[str]:
-    """Runs a service on the loopback, at `port` or, where that is taken, at a free one; yields its address.
+    """Runs a service on the loopback interface and yields its URL.
 
-    The first start of all compiles the kernels of a first frame: it is waited for as long as the process lives.
+    The service listens at `port`, or at a free port if `port` is taken. Its very first start compiles the kernels of
+    the
+    first frame, so this waits as long as the process is alive.
 
     Raises:
-        RuntimeError: it ended, or cannot become ready; the message says why, and names its log.
+        RuntimeError: the service exited or cannot become ready; the message gives the reason and the log file.
         ModuleNotFoundError: the service is not installed.
     """
     need_server()
@@ -64,7 +66,7 @@ def running_service(data: Path, log: Path, port: int = 8000) -> Iterator[str]:
 
 
 def _free(port: int) -> int:
-    """Returns the port (any for 0) if nobody listens there, else 0."""
+    """Returns the port if it is free (for 0, any free port), else 0."""
     with socket.socket() as probe:
         try:
             probe.bind(("127.0.0.1", port))
@@ -74,7 +76,10 @@ def _free(port: int) -> int:
 
 
 def _compile_progress(url: str, log: Path) -> tuple[int, int] | None:
-    """Returns how many kernels are compiled, and of how many (0 of 1 where that is not known); None: it is ready."""
+    """Returns (compiled kernels, total kernels), or None if the service is ready.
+
+    The result is (0, 1) while the numbers are unknown.
+    """
     try:
         with Client(url, token=_token(), outage=0) as client:
             client.ready()
@@ -82,33 +87,34 @@ def _compile_progress(url: str, log: Path) -> tuple[int, int] | None:
         return 0, 1
     except ServiceError as error:
         said = error.problem.model_extra or {}
-        if said.get("warming_up") or said.get("recovering"):  # it will be, without anybody's doing
+        if said.get("warming_up") or said.get("recovering"):  # it becomes ready on its own
             return int(said.get("kernels_compiled", 0)), int(said.get("kernels", 1))
         raise RuntimeError(f"the service cannot become ready: {error}; its log is {log}") from None
     return None
 
 
 def _token() -> str | None:
-    """The token from the environment, which the started service reads too."""
+    """Returns the token from the environment, where the started service reads it too."""
     return os.environ.get("SCAS4D_TOKEN")
 
 
 def _last_log_line(log: Path) -> str:
-    """The last line that a person wrote for people, of a log that is JSON otherwise."""
+    """Returns the last human-readable line of a log whose other lines are JSON."""
     said = [line for line in log.read_text(errors="replace").splitlines() if line and not line.startswith("{")]
     return said[-1].removeprefix("scas4d: ") if said else "it says no reason"
 
 
 def run(capture: Capture, url: str, out: Path, *, frames: int | None, preset: str, settings: Mapping[str, Any]) -> str:
-    """Streams the capture through the service at `url` and saves its renders; returns the scene's id.
+    """Streams the capture through the service at `url`, saves its renders and returns the scene's id.
 
-    `out` gets truth | render | difference of every test camera and frame (of one training camera where there are no
-    test cameras), and depth and parts of the last frame.
+    `out` receives ground truth | render | difference for each frame and test camera (one training camera if there are
+    no
+    test cameras), and the depth and parts of the last frame.
     """
     name = f"demo of {capture.name}"
     with Client(url, token=_token()) as client:
         for earlier in client.scenes():
-            if earlier.name == name:  # each would be one of the few that the service takes
+            if earlier.name == name:  # old demo scenes would count towards the service's scene limit
                 client.delete_scene(earlier.id)
         with Bars() as bars:
             delivery = rig.push(
@@ -126,7 +132,7 @@ def run(capture: Capture, url: str, out: Path, *, frames: int | None, preset: st
 
 
 def _report(client: Client, id: str, frames: int) -> None:
-    """Prints a line on time, and a line for each frame that failed."""
+    """Prints one line with timings, and one line for each frame that failed."""
     reports = [client.frame(id, index) for index in range(frames)]
     for report in reports:
         if report.state != "committed":
@@ -138,7 +144,7 @@ def _report(client: Client, id: str, frames: int) -> None:
 
 
 def save_views(capture: Capture, client: Client, id: str, frames: int, out: Path) -> list[float]:
-    """Saves pictures of every committed frame; returns the mean PSNR over the cameras by frame."""
+    """Saves images of every committed frame; returns the mean PSNR over the cameras, per frame."""
     cameras = capture.full_test_rig.cameras if capture.full_test_rig is not None else capture.full_rig.cameras[:1]
     scores = []
     with Bars() as bars:

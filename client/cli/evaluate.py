@@ -1,4 +1,4 @@
-"""`scas4d evaluate`: a capture reconstructed and scored on its test cameras and ground truth."""
+"""`scas4d evaluate`: reconstructs a capture and scores it on its test cameras and ground truth."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
     from scas4d_core.reconstruction import Reconstruction
 
 Report = Callable[[str], None]
-"""Takes each line that is printed."""
+"""Receives each printed line."""
 
 
 DEFAULT_OPTIONS = CaptureOptions()
 
 TRAINING = "training cameras"
-"""Mark of a row that scores training pictures, because there are no test cameras."""
+"""Marks a row whose scores are those of training images, because there are no test cameras."""
 
 
 @dataclass(frozen=True)
@@ -43,16 +43,16 @@ class Job:
     """One row to be measured.
 
     Attributes:
-        capture: folder.
-        preset: name, for the table.
-        settings: of the reconstruction, complete.
-        frames: only so many frames of the capture; None: all.
-        masks: whether the method gets the masks (they are always used to measure).
-        points: whether the method gets the initial cloud.
-        pictures: frames whose comparison pictures are saved; negative ones count from the end.
-        lpips: also LPIPS; loads torch.
-        constants: of the method, by dotted name, to which a study gives another value; recorded with the row.
-        options: how the capture is read.
+        capture: folder of the capture.
+        preset: preset name, for the table.
+        settings: complete settings of the reconstruction.
+        frames: number of frames to reconstruct; None for all.
+        masks: whether the method gets the masks (the evaluation always uses them).
+        points: whether the method gets the initial point cloud.
+        pictures: frames whose comparison images are saved; negative indices count from the end.
+        lpips: whether to compute LPIPS too, which loads torch.
+        constants: constants of the method that a study overrides, as (dotted name, value); recorded with the row.
+        options: options for reading the capture.
     """
 
     capture: Path
@@ -67,23 +67,26 @@ class Job:
     options: CaptureOptions = DEFAULT_OPTIONS
 
     def open_given(self) -> Capture:
-        """The capture as the method gets it: at full size, without what is withheld."""
+        """Opens the capture as the method gets it: at full size, without the withheld inputs."""
         use_masks = self.masks and self.options.use_masks
         return self.options.open(self.capture, use_masks=use_masks, use_points=self.points)
 
     def open_truth(self) -> Capture:
-        """The capture as it is measured: scaled as rendered, and with test cameras, if they are those it trains on."""
+        """Opens the capture for measuring, at the resolution of the renders.
+
+        If it has no test cameras, its training cameras are used as test cameras.
+        """
         truth = self.options.open(self.capture, image_scale=self.settings.scene.image_scale)
         return truth if truth.full_test_rig is not None else truth.with_training_as_test()
 
     @property
     def record(self) -> Row:
-        """The settings and constants as the row has them."""
+        """Settings and constants as stored in the row."""
         return settings_record(self.settings, self.constants)
 
     @property
     def variant(self) -> str:
-        """Names the row without its capture: preset, iterations and a digest of everything else that is set."""
+        """Name of the row without its capture: preset, iterations, seed, and a digest of all other settings."""
         update = self.settings.update
         given: Row = {"frames": self.frames, "masks": self.masks, "points": self.points}
         if self.lpips:
@@ -93,13 +96,13 @@ class Job:
 
     @property
     def changes(self) -> str:
-        """Differences from the preset beside iterations and seed, and what is withheld, in words for the table."""
+        """Differences from the preset other than iterations and seed, and withheld inputs, as text for the table."""
         usual = preset(self.preset).model_dump(mode="json")
         words = [
             f"{name}={json.dumps(value, separators=(',', ':'))}"
             for name, value in format_changes(self.record, usual).items()
             if name not in ("update.iterations", "update.seed", "static.seed")
-            and (name, value) != ("static.seconds", None)  # studies have no limit, and depend on no machine
+            and (name, value) != ("static.seconds", None)  # studies set no time limit
         ]
         words += ["no masks"] * (not self.masks) + ["no points"] * (not self.points)
         words += [f"held out {', '.join(self.options.test)}"] if self.options.test else []
@@ -108,12 +111,12 @@ class Job:
 
     @property
     def key(self) -> str:
-        """Names the row; another setting is another row."""
+        """Name of the row; it is unique per combination of settings."""
         return f"{self.capture.resolve().name}-{self.variant}"
 
 
 def settings_record(settings: Settings, constants: Sequence[tuple[str, Any]]) -> Row:
-    """Settings as JSON, with those constants of the method that have another value, where there are any."""
+    """Returns the settings as JSON values, with the overridden constants of the method, if any."""
     return settings.model_dump(mode="json") | ({"constants": dict(constants)} if constants else {})
 
 
@@ -128,17 +131,17 @@ def evaluate(
     again: bool = False,
     report: Report = print,
 ) -> Row:
-    """Scores of a capture, printed as a table; `out` gets the row, a line a frame, pictures and table.md.
+    """Scores a capture and prints the table; `out` receives the row, one line per frame, images and table.md.
 
     Args:
-        folder: of the capture; without test cameras its training cameras are measured, and the row says so.
-        out: folder; scores that it holds are printed without another reconstruction.
-        options: how the capture is read.
-        frames: only so many; all where None.
-        preset_name: named settings.
-        changes: what differs from the preset, nested.
-        again: measures anew what `out` holds.
-        report: takes the printed lines.
+        folder: folder of the capture. Without test cameras, its training cameras are scored and the row is marked.
+        out: output folder; scores that it already contains are printed without another reconstruction.
+        options: options for reading the capture.
+        frames: number of frames; None for all.
+        preset_name: name of the preset.
+        changes: nested settings that override the preset.
+        again: measure again even if `out` has the scores.
+        report: receives the printed lines.
 
     Raises:
         CaptureError: the capture cannot be read.
@@ -162,7 +165,7 @@ def evaluate(
 
 
 def score_tables(rows: Sequence[Row], stages_of: Sequence[Row] | None = None) -> str:
-    """The table of scores, and the table of seconds by stage where there were updates; Markdown."""
+    """Returns the Markdown table of scores, followed by the table of seconds per stage if there were updates."""
     table = markdown(rows)
     if stages := stage_table(rows if stages_of is None else stages_of):
         table += f"\n\nMedian seconds of an update by stage:\n\n{stages}"
@@ -179,20 +182,24 @@ def measure(
 ) -> tuple[Reconstruction, Row]:
     """Reconstructs one capture and scores it.
 
-    Seconds are those of the reconstruction alone, decoding included. Peak memory is this process's, measuring included.
+    The times are those of the reconstruction alone, including decoding. Peak memory is that of this process, including
+    the evaluation.
 
     Args:
-        job: what is measured, with which settings.
-        store: takes a line a frame, and the pictures.
-        report: takes the printed lines.
+        job: what to measure, and with which settings.
+        store: receives one line per frame, and the images.
+        report: receives the printed lines.
         static: a frame 0 that was fitted before, and the seconds that it took.
-        fitted: called with frame 0 and its seconds once it is fitted here.
+        fitted: called with frame 0 and its time in seconds after it is fitted here.
+
+    Returns:
+        The reconstruction and the measured row.
     """
     truth, given = job.open_truth(), job.open_given()
     unseen = given.full_test_rig is not None
     if not unseen:
         report("    no test cameras: the scores are those of the training cameras (--test holds some out)")
-    # These bring the kernels; the table and the command do not.
+    # Imported lazily: this loads the kernels, which printing an existing table does not need.
     from scas4d_core.metrics.evaluation import measure_flicker, measure_parts, measure_pictures, measure_tracks
 
     store.start_frames(job.key)
@@ -264,7 +271,7 @@ def measure(
 
 
 def summary(lines: Sequence[Row]) -> Row:
-    """Means of the per-frame lines over all updates (every frame but the first), for the table."""
+    """Averages the per-frame lines over all updates (every frame but the first), for the table."""
     updates = lines[1:]
     if not updates:
         return {"updates": 0}
@@ -278,12 +285,12 @@ def summary(lines: Sequence[Row]) -> Row:
         "psnr_last": updates[-1]["psnr"],
         "alarms": sum(len(line.get("alarms", ())) for line in updates),
         "psnr_by_frame": [round(line["psnr"], 3) for line in lines],
-        **(_seconds(updates) if "seconds" in updates[0] else {}),  # states of a file took none
+        **(_seconds(updates) if "seconds" in updates[0] else {}),  # states read from a file have no timings
     }
 
 
 def _seconds(updates: Sequence[Row]) -> Row:
-    """Medians: the first update compiles or loads kernels, and they do not see it."""
+    """Returns median times; the median ignores the first update, which compiles or loads kernels."""
     stages = dict.fromkeys(name for line in updates for name in line["stages"])
     return {
         "seconds_update": float(np.median([line["seconds"] for line in updates])),
@@ -295,7 +302,7 @@ def _seconds(updates: Sequence[Row]) -> Row:
 
 
 def save_comparisons(reconstruction: Committed, capture: Capture, index: int, folder: Path) -> None:
-    """Saves truth | render | difference of every test camera as PNG files."""
+    """Saves ground truth | render | difference of every test camera as PNG files."""
     rig, truth = capture.test_rig, capture.test_frame(index)
     assert rig is not None
     for camera in rig.cameras:
@@ -305,7 +312,7 @@ def save_comparisons(reconstruction: Committed, capture: Capture, index: int, fo
 
 
 def save_parts(reconstruction: Committed, capture: Capture, index: int, labels: NDArray[Any], folder: Path) -> None:
-    """Saves true | rendered part labels of every labelled test camera, in colours, as PNG files."""
+    """Saves ground-truth | rendered part labels of every labelled test camera as coloured PNG files."""
     from scas4d_core.metrics.evaluation import render_parts
 
     truth, rig = capture.ground_truth, capture.test_rig
@@ -320,9 +327,11 @@ def save_parts(reconstruction: Committed, capture: Capture, index: int, labels: 
 
 
 def peak_megabytes() -> float | None:
-    """Largest resident memory of this process so far, 10⁶ bytes; None where the system does not report it (Windows)."""
+    """Returns the peak resident memory of this process in 10⁶ bytes, or None if the system does not report it
+    (Windows).
+    """
     status = Path("/proc/self/status")
-    if status.exists():  # on Linux `getrusage` reports, in a child, at least the memory of its parent
+    if status.exists():  # on Linux, `getrusage` in a child process also counts its parent's peak
         peak = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))
         return int(peak.split()[1]) * 1024 / 1e6
     try:

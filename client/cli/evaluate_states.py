@@ -1,6 +1,6 @@
-"""`scas4d evaluate --states`: states of a file, scored on a capture's test cameras and ground truth.
+"""`scas4d evaluate --states`: scores stored states on a capture's test cameras and ground truth.
 
-Nothing is reconstructed: a compact file, or an export with the ids of its Gaussians, is rendered as it is.
+Nothing is reconstructed: a compact file, or an export that contains Gaussian ids, is rendered as is.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from scas4d_core.storage.history import History
 
 SHOWN = (0, 1, -1)
-"""Frames whose comparison pictures are saved."""
+"""Frames whose comparison images are saved; negative values count from the end."""
 
 
 def evaluate_states(
@@ -47,15 +47,20 @@ def evaluate_states(
     rate: float | None = None,
     report: Report = print,
 ) -> Row:
-    """Scores of states, printed as a table; `out` gets the row, a line a frame, pictures and table.md.
+    """Scores stored states and prints the table; `out` receives the row, one line per frame, images and table.md.
 
     Args:
-        source: a compact file, the folder of one, or an export with ids. folder: of the capture.
-        out: folder. options: how the capture is read. frames: only the first so many. rate: frames a second of
-            numbered files. report: takes the printed lines.
+        source: a compact file, its folder, or an export with ids.
+        folder: folder of the capture.
+        out: output folder.
+        options: options for reading the capture.
+        frames: score only this many frames; None for all.
+        rate: frames per second of numbered files.
+        report: receives the printed lines.
 
     Raises:
-        InputError: the source cannot be read, or has no frame of the capture. CaptureError: nor can the capture.
+        InputError: the source cannot be read, or has no frame of the capture.
+        CaptureError: the capture cannot be read.
     """
     if not source.exists():
         raise InputError(f"there is no {str(source)!r}", "give a .s4d file, or an export with ids (docs/exports.md)")
@@ -79,7 +84,7 @@ def evaluate_states(
 
 
 def _measure(found: Source, truth: Capture, store: Store, frames: int | None, report: Report) -> Row:
-    # These bring the kernels; the command does not.
+    # Imported lazily: these load the kernels, which the command line alone does not need.
     from scas4d_core.engines.limits import rig_limits
     from scas4d_core.metrics.evaluation import measure_flicker, measure_parts, measure_pictures, measure_tracks
     from scas4d_core.query.committed import CommittedScene
@@ -119,7 +124,7 @@ def _measure(found: Source, truth: Capture, store: Store, frames: int | None, re
         "psnr_first": lines[0]["psnr"],
         **summary(lines),
     }
-    row.pop("alarms", None)  # files have none
+    row.pop("alarms", None)  # stored states have no alarms
     if len(chosen) > 1:
         if truth.ground_truth is not None:
             row |= measure_tracks(scene, truth, chosen)
@@ -132,7 +137,9 @@ def _measure(found: Source, truth: Capture, store: Store, frames: int | None, re
 
 
 def _with_ids(state: Gaussians, history: History) -> Gaussians:
-    """The state with the ids that the history gives: rows are the same, and nothing asks for ids of the file."""
+    """Returns the state with ids assigned by the history. Rows keep their order, and the file's own ids are not
+    needed.
+    """
     if not len(history):
         return state
     known = history.ids

@@ -1,4 +1,4 @@
-"""Optional packages: which extra installs a module that a command misses."""
+"""Optional packages: which extra installs a module that a command is missing."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ SERVER = (
     *("numba", "scipy", "sklearn", "threadpoolctl", "plyfile", "pycolmap", "flip_evaluator"),
     *("fastapi", "uvicorn", "pydantic_settings", "prometheus_client", "httptools", "blake3", "python_multipart"),
 )
-"""Modules of the extra `server`."""
+"""Modules that the extra `server` installs."""
 EXPORTS = ("gsply", "pxr")
-"""Modules of the extra `exports`."""
+"""Modules that the extra `exports` installs."""
 RERUN = ("rerun",)
-"""Modules of the extra `rerun`."""
+"""Modules that the extra `rerun` installs."""
 
 
 def need_server() -> None:
-    """Checks that the service is installed, for commands that start it in another process.
+    """Checks that the service is installed; for commands that start it in another process.
 
     Raises:
-        ModuleNotFoundError: something of the extra `server` is not installed.
+        ModuleNotFoundError: a module of the extra `server` is not installed.
     """
     for module in SERVER:
         if find_spec(module) is None:
@@ -27,7 +27,7 @@ def need_server() -> None:
 
 
 def install_hint(missing: ModuleNotFoundError) -> str | None:
-    """Says what to install, in a sentence; None where the module belongs to no extra."""
+    """Returns a sentence that says what to install, or None if the module belongs to no extra."""
     package = (missing.name or "").partition(".")[0]
     extras = {"server": SERVER, "exports": EXPORTS, "rerun": RERUN}
     extra = next((name for name, packages in extras.items() if package in packages), None)

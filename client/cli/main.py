@@ -1,4 +1,4 @@
-"""The `scas4d` command. Sub-commands that need the core or the server import them when they run."""
+"""The `scas4d` command line. Sub-commands that need the core or the server import it lazily, when they run."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def serve(
     config: Annotated[
         Path | None,
         typer.Option(
-            help=("TOML file of settings, listed in the documentation. Environment variables take precedence.")
+            help=("TOML file of settings, see docs/service-settings.md. Environment variables take precedence.")
         ),
     ] = None,
 ) -> None:
@@ -71,7 +71,7 @@ def demo(
     preset: Preset = "scas4d",
     changes: Changes = None,
 ) -> None:
-    """Starts a service, streams the sample capture through it, and leaves renders beside the truth."""
+    """Starts a service, streams the sample capture through it, and saves renders next to the ground-truth images."""
     from client.cli import demo as main_job
 
     given, settings = open_capture(capture, options), parse_changes(changes)
@@ -103,7 +103,7 @@ def reconstruct(
     videos: Annotated[bool, typer.Option("--videos", help="Also write an MP4 per camera.")] = False,
     changes: Changes = None,
 ) -> None:
-    """Reconstructs a capture in this process, without a service: pictures, states, and a .ply of the last frame."""
+    """Reconstructs a capture in this process, without a service: images, states, and a .ply of the last frame."""
     from client.cli.reconstruct import reconstruct as run
 
     given = parse_changes(changes)
@@ -128,9 +128,9 @@ def evaluate(
         float | None, typer.Option("--source-fps", help="Frames per second of numbered files in --states. [30]")
     ] = None,
 ) -> None:
-    """Prints a capture's scores on its test cameras and ground truth; reconstructs it unless `out` has them already.
+    """Prints a capture's scores on its test cameras and ground truth. Reconstructs it first if `out` has no scores yet.
 
-    Without test cameras (--test holds some out) the scores are those of the training cameras, and the table says so.
+    Without test cameras (--test holds some out), the training cameras are scored and the table is marked accordingly.
     """
     if states is not None:
         from client.cli.evaluate_states import evaluate_states
@@ -176,7 +176,8 @@ def export(
     url: commands.Url = DEFAULT_URL,
     token: commands.Token = None,
 ) -> None:
-    """Writes reconstructed frames in the formats of other tools (splats, glTF, USD, tables), or as a page that plays.
+    """Exports reconstructed frames to other tools' formats (splats, glTF, USD, tables), or to a page that plays
+    offline.
 
     Example: scas4d reconstruct samples/robot --out out/robot; scas4d export out/robot --player robot.html
     """
@@ -205,16 +206,17 @@ def options(version: Annotated[bool, typer.Option("--version", callback=_version
 
 
 def main() -> None:
-    """The entry point."""
+    """Runs the `scas4d` command line."""
     run(app, "scas4d", extras.install_hint)
 
 
 def run(commands: typer.Typer, name: str, remedy: Callable[[ModuleNotFoundError], str | None]) -> None:
-    """Runs a command line: an error that a user can mend becomes one line, not a traceback.
+    """Runs a command line and reports errors that the user can fix as one line instead of a traceback.
 
     Args:
-        commands: the command line. name: the command as a user writes it.
-        remedy: says what to install for a missing module; None where that would not help.
+        commands: the command line.
+        name: the command as the user types it.
+        remedy: returns what to install for a missing module, or None if installing would not help.
     """
     try:
         commands(prog_name=name)

@@ -1,4 +1,4 @@
-"""`scas4d reconstruct`: a capture reconstructed in this process, without a service."""
+"""`scas4d reconstruct`: reconstructs a capture in this process, without a service."""
 
 from __future__ import annotations
 
@@ -29,17 +29,18 @@ if TYPE_CHECKING:
     from scas4d_core.storage.history import History
 
 FRAME_ALARMS = (AlarmKind.FRAME_REJECTED, AlarmKind.FRAME_IN_PART)
-"""Alarms whose evidence is the report's ``degraded``."""
+"""Alarms whose evidence is already in the report's ``degraded`` text."""
 
 
 @dataclass(frozen=True)
 class ReconstructedFrame:
-    """One frame that was committed or held.
+    """One frame that was committed, or held because of an alarm.
 
     Attributes:
-        index: of the frame in the capture.
-        seconds: wall-clock time of this frame alone, decoding included. cpu_seconds: of the processor, all threads.
-        report: of the update; None for frame 0.
+        index: frame index in the capture.
+        seconds: wall-clock time of this frame alone, including decoding.
+        cpu_seconds: processor time of this frame, summed over all threads.
+        report: report of the update; None for frame 0.
     """
 
     index: int
@@ -57,14 +58,14 @@ def reconstruct_frames(
     static: StaticResult | None = None,
     progress: Callable[[str, int, int], None],
 ) -> Iterator[tuple[Reconstruction, ReconstructedFrame]]:
-    """Reconstructs the first `count` frames of a capture, one after another; yields after each.
+    """Reconstructs the first `count` frames of a capture in order, and yields after each one.
 
     Args:
-        capture: at full size; the reconstruction scales its pictures itself.
-        settings: of the reconstruction.
-        count: frames, at least 1.
-        history: of the states; in memory where None.
-        static: a fitted frame 0; fitted here where None.
+        capture: the capture at full size; the reconstruction resizes its images itself.
+        settings: reconstruction settings.
+        count: number of frames, at least 1.
+        history: history that stores the states; None keeps them in memory.
+        static: a frame 0 that is already fitted; None fits it here.
         progress: called with (stage, done, total).
     """
     from scas4d_core.reconstruction import Reconstruction
@@ -98,17 +99,18 @@ def reconstruct(
     changes: Mapping[str, Any],
     videos: bool = False,
 ) -> None:
-    """Reconstructs every frame; `out` gets pictures beside the truth, `states/`, `states.s4d` and `last.ply`.
+    """Reconstructs every frame and writes comparison images, `states/`, `states.s4d` and `last.ply` to `out`.
 
-    The truth is that of the test cameras or, where there are none, of one training camera, and the last line says so.
+    Renders are compared with the test cameras' images. If there are no test cameras, one training camera is used and
+    the last printed line says so.
 
     Args:
-        given: the capture, at full size: the reconstruction resizes its pictures.
-        out: folder; made when missing.
-        frames: how many; all where None.
-        preset: named settings.
-        changes: what differs from the preset, nested.
-        videos: the pictures of each camera are left as a video, too, at the capture's rate.
+        given: the capture at full size; the reconstruction resizes its images.
+        out: output folder; created if missing.
+        frames: number of frames; None for all.
+        preset: name of the preset.
+        changes: nested settings that override the preset.
+        videos: also write each camera's comparison images as a video at the capture's frame rate.
     """
     from scas4d_core.query.parts import parts
     from scas4d_core.query.ply import write_ply
@@ -124,7 +126,7 @@ def reconstruct(
     count = min(frames or capture.frame_count, capture.frame_count)
     rig = capture.test_rig or capture.rig
     cameras = rig.cameras if capture.test_rig is not None else rig.cameras[:1]
-    if (out / "states" / "fixed.npz").exists():  # of an earlier run, like the pictures beside it
+    if (out / "states" / "fixed.npz").exists():  # left over from an earlier run
         shutil.rmtree(out / "states")
     compact = out / "states.s4d"
     compact.unlink(missing_ok=True)
@@ -176,7 +178,7 @@ def reconstruct(
 
 
 def remarks_on(report: FrameReport | None) -> str:
-    """The lines on a frame that a person should read beside its figure: that it was held, and its alarms.
+    """Returns the printed lines that accompany a frame's PSNR: why the frame was held, and its alarms.
 
     >>> remarks_on(None)
     ''
@@ -185,13 +187,13 @@ def remarks_on(report: FrameReport | None) -> str:
         return ""
     parts = [] if report.degraded is None else [report.degraded]
     for alarm in report.alarms:
-        if alarm.kind not in FRAME_ALARMS:  # the sentence before says as much
+        if alarm.kind not in FRAME_ALARMS:  # `degraded` already contains it
             parts.append(alarm.evidence if alarm.camera is None else f"camera {alarm.camera}: {alarm.evidence}")
     return "".join(f"\n  ! {part}" for part in parts)
 
 
 def compile_kernels() -> None:
-    """Compiles the kernels in a process beside, unless the cache has them."""
+    """Compiles the kernels in a separate process, unless they are in the cache."""
     from scas4d_core.warm_up import EVERY, compile_in_processes
 
     with Bars() as bars:

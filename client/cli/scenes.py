@@ -1,4 +1,4 @@
-"""The commands `scas4d scenes …`: lists, renames, pauses, archives, puts to sleep, shares and deletes scenes."""
+"""The commands `scas4d scenes …`, which list, rename, pause, archive, put to sleep, share and delete scenes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,10 @@ HEAD = ("scene", "name", "state", "cameras", "next frame", "queued", "committed"
 
 
 def table(statuses: Sequence[SceneStatus]) -> list[str]:
-    """Scenes as lines of a table with a head; whole words, however narrow the terminal: programs read them too."""
+    """Formats scenes as lines of a table with a heading.
+
+    Words are never truncated to the terminal's width, because programs parse these lines too.
+    """
     rows: list[tuple[str, ...]] = [HEAD]
     for status in statuses:
         awake = "archived" if status.archived else "asleep" if status.asleep else "yes"
@@ -41,7 +44,7 @@ def listed(
     token: Token = None,
     all: Annotated[bool, typer.Option("--all", help="Include archived scenes.")] = False,
 ) -> None:
-    """Lists the scenes of the service, oldest first; SCENE in other commands is the id."""
+    """Lists the scenes of the service, oldest first. Other commands take the id as SCENE."""
     if context.invoked_subcommand is not None:
         return
     with Client(url, token=token, outage=0) as client:
@@ -61,14 +64,14 @@ def rename(
     url: Url = DEFAULT_URL,
     token: Token = None,
 ) -> None:
-    """Gives a scene another name."""
+    """Renames a scene."""
     with Client(url, token=token) as client:
         _told(client.edit_scene(scene, name=name))
 
 
 @app.command()
 def pause(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
-    """Pauses scenes after the frame at work: they take frames, and reconstruct none."""
+    """Pauses scenes after the current frame: they still accept frames, but do not reconstruct them."""
     with Client(url, token=token) as client:
         for scene in scenes:
             _told(client.pause(scene))
@@ -76,7 +79,7 @@ def pause(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
 
 @app.command()
 def resume(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
-    """Goes on with paused scenes."""
+    """Resumes paused scenes."""
     with Client(url, token=token) as client:
         for scene in scenes:
             _told(client.resume(scene))
@@ -84,7 +87,9 @@ def resume(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
 
 @app.command()
 def archive(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
-    """Archives scenes: they take no further frames, sleep unless they are looked at, and are listed with --all."""
+    """Archives scenes: they accept no further frames, sleep unless someone views them, and are listed only with
+    --all.
+    """
     with Client(url, token=token) as client:
         for scene in scenes:
             _told(client.edit_scene(scene, archived=True))
@@ -92,7 +97,7 @@ def archive(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None
 
 @app.command()
 def restore(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
-    """Takes scenes out of the archive."""
+    """Restores archived scenes."""
     with Client(url, token=token) as client:
         for scene in scenes:
             _told(client.edit_scene(scene, archived=False))
@@ -120,7 +125,7 @@ def keep(
     url: Url = DEFAULT_URL,
     token: Token = None,
 ) -> None:
-    """Changes how many pictures and committed states a scene keeps; it holds at once."""
+    """Changes how many images and committed states a scene keeps; takes effect immediately."""
     kept_frames, kept_states = _rule("--frames", frames), _rule("--states", states)
     with Client(url, token=token) as client:
         _told(client.edit_scene(scene, keep_frames=kept_frames, keep_states=kept_states, exact_states=exact))
@@ -128,7 +133,7 @@ def keep(
 
 @app.command()
 def sleep(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
-    """Ends the processes of idle scenes now; a scene wakes by itself when it is asked or sent something."""
+    """Ends the processes of idle scenes now; a scene wakes up on the next request or frame."""
     with Client(url, token=token) as client:
         for scene in scenes:
             _told(client.put_to_sleep(scene))
@@ -142,7 +147,7 @@ def share(
     url: Url = DEFAULT_URL,
     token: Token = None,
 ) -> None:
-    """Prints a link at which others may look at a scene, and change nothing; it cannot be taken back."""
+    """Prints a read-only link to a scene; the link cannot be revoked."""
     with Client(url, token=token) as client:
         made = client.share(None if scene == "all" else scene, round(3600 * hours))
     _say(made.token) if only_token else _say(url.rstrip("/") + made.address, f"holds until {made.ends}")
@@ -155,7 +160,7 @@ def delete(
     url: Url = DEFAULT_URL,
     token: Token = None,
 ) -> None:
-    """Deletes scenes and all they have on disk, for good."""
+    """Permanently deletes scenes and all their data on disk."""
     with Client(url, token=token) as client:
         for status in [client.scene(scene) for scene in scenes]:
             named = f"scene {status.id}" + (f" ({status.name})" if status.name else "")

@@ -1,4 +1,4 @@
-"""Scores of reconstructions: rows on disk, one file a row, and as Markdown tables."""
+"""Scores of reconstructions: rows on disk, one file per row, and Markdown tables of them."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 Row = dict[str, Any]
-"""What was measured, JSON values by name; ``key`` names the row."""
+"""Measured values as JSON, by name; ``key`` identifies the row."""
 
 
 def read_row(path: Path) -> Row | None:
-    """Reads the file of a row; None where there is none."""
+    """Reads the file of a row; returns None if it does not exist."""
     if not path.exists():
         return None
     row: Row = json.loads(path.read_text())
@@ -23,7 +23,7 @@ def read_row(path: Path) -> Row | None:
 
 
 def kept_row(path: Path, measured: Callable[[], Row], *, again: bool = False) -> Row:
-    """The row on disk; where there is none, or ``again``, the one that is measured now and written there."""
+    """Returns the row on disk. If it is missing, or with ``again``, measures the row and writes it first."""
     row = None if again else read_row(path)
     if row is None:
         row = measured()
@@ -32,7 +32,7 @@ def kept_row(path: Path, measured: Callable[[], Row], *, again: bool = False) ->
 
 
 def write_row(path: Path, row: Mapping[str, Any]) -> None:
-    """Writes the file of a row, and its folder where it is missing; the file is whole or not there."""
+    """Writes the file of a row atomically, and creates its folder if needed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_suffix(f".{os.getpid()}.part")
     beside.write_text(json.dumps(row, indent=1))
@@ -40,7 +40,9 @@ def write_row(path: Path, row: Mapping[str, Any]) -> None:
 
 
 class Store:
-    """The rows of one study: ``rows/<key>.json`` when done, ``frames/<key>.jsonl`` a line a frame as they come."""
+    """The rows of one study: ``rows/<key>.json`` when finished, ``frames/<key>.jsonl`` with one line per frame
+    meanwhile.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -48,49 +50,49 @@ class Store:
             (folder / name).mkdir(parents=True, exist_ok=True)
 
     def row(self, key: str) -> Row | None:
-        """A finished row; None where there is none, or where the last attempt failed."""
+        """Returns a finished row, or None if it does not exist or its last attempt failed."""
         row = read_row(self.folder / "rows" / f"{key}.json")
         return None if row is None or "error" in row else row
 
     def rows(self) -> Iterator[Row]:
-        """Every row on disk, failed ones too (they hold ``error``), by key."""
+        """Yields every row on disk, sorted by key; failed rows have an ``error``."""
         for path in sorted((self.folder / "rows").glob("*.json")):
             yield json.loads(path.read_text())
 
     def put(self, row: Mapping[str, Any]) -> None:
-        """Writes a row; the file is whole or not there."""
+        """Writes a row atomically."""
         write_row(self.folder / "rows" / f"{row['key']}.json", row)
 
     def start_frames(self, key: str) -> None:
-        """Begins the per-frame lines of a row anew."""
+        """Empties the file of a row's per-frame lines."""
         (self.folder / "frames" / f"{key}.jsonl").write_text("")
 
     def put_frame(self, key: str, frame: Mapping[str, Any]) -> None:
-        """Adds one frame's line."""
+        """Appends one frame's line."""
         with (self.folder / "frames" / f"{key}.jsonl").open("a") as file:
             file.write(json.dumps(frame) + "\n")
 
     def frames(self, key: str) -> list[Row]:
-        """The per-frame lines of a row."""
+        """Returns the per-frame lines of a row."""
         return [json.loads(line) for line in (self.folder / "frames" / f"{key}.jsonl").read_text().splitlines()]
 
 
 def digest(*parts: Any) -> str:
-    """Eight hexadecimal digits that change with any of the JSON values given."""
+    """Returns an eight-digit hexadecimal hash of the given JSON values."""
     text = json.dumps(parts, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()[:8]
 
 
 @dataclass(frozen=True)
 class Column:
-    """One column: its heading, the name of the value in a row, and how it is written."""
+    """One table column: its heading, the name of its value in a row, and its format."""
 
     heading: str
     name: str
     form: str = ".2f"
 
     def cell(self, row: Row) -> str:
-        """The value as text; a dash where there is none."""
+        """Formats the value as text; a missing value becomes a dash."""
         value: Any = row.get(self.name)
         if value is None or value == "":
             return "–"
@@ -124,7 +126,7 @@ QUALITY = (
 
 
 def markdown(rows: Iterable[Row], columns: Sequence[Column] = QUALITY) -> str:
-    """A Markdown table, one line a row; failed rows say so in the second half of the line."""
+    """Formats rows as a Markdown table, one line per row. The line of a failed row ends with its error."""
     lines = ["| " + " | ".join(c.heading for c in columns) + " |", "|" + "---|" * len(columns)]
     for row in rows:
         if "error" in row:
@@ -136,7 +138,10 @@ def markdown(rows: Iterable[Row], columns: Sequence[Column] = QUALITY) -> str:
 
 
 def stage_table(rows: Sequence[Row]) -> str:
-    """A Markdown table of the seconds by stage of the rows that have updates, slowest stage first; empty for none."""
+    """Formats the seconds per stage of all rows with updates as a Markdown table, slowest stage first.
+
+    Returns an empty string if no row has updates.
+    """
     timed = [row for row in rows if row.get("seconds_stages")]
     if not timed:
         return ""

@@ -1,4 +1,4 @@
-"""Commands that make something to look at of states: `scas4d video` and `scas4d rerun`."""
+"""Commands that turn states into something to watch: `scas4d video` and `scas4d rerun`."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def video(
     url: commands.Url = DEFAULT_URL,
     token: commands.Token = None,
 ) -> None:
-    """Renders frames as a video from a camera that circles, stands or follows key poses.
+    """Renders frames as a video from a camera that orbits, stays fixed or follows key poses.
 
     Example: scas4d reconstruct samples/robot --out out/robot; scas4d video out/robot --speed 0.25 --interpolate
     """
@@ -105,7 +105,7 @@ def rerun(
     url: commands.Url = DEFAULT_URL,
     token: commands.Token = None,
 ) -> None:
-    """Writes frames as a recording for the Rerun viewer (extra `rerun`): points, tracks, the rig, parts.
+    """Writes frames as a recording for the Rerun viewer (extra `rerun`): points, tracks, the rig and parts.
 
     Example: scas4d reconstruct samples/robot --out out/robot; scas4d rerun out/robot; rerun out/robot/states.rrd
     """
@@ -115,6 +115,6 @@ def rerun(
 
 
 def register(app: typer.Typer) -> None:
-    """Adds these commands."""
+    """Adds the commands of this module to the app."""
     app.command()(video)
     app.command()(rerun)

@@ -1,1 +1,1 @@
-"""Reads captures as calibration tools and cameras write them: rigs, lenses, pictures, videos."""
+"""Importers for captures in the layouts of calibration tools and cameras: rigs, lenses, images and videos."""

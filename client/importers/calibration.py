@@ -1,4 +1,4 @@
-"""`Calibration`: the cameras of a rig as a calibration tool left them, whichever it was. Numpy only."""
+"""`Calibration`: the cameras of a rig, independent of the calibration tool that wrote them. Needs only numpy."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from scas4d_core.cameras import CAMERA_NAME
 from scas4d_core.captures import CaptureError, InitialPoints
 
 STATIC_TOLERANCE = 1e-6
-"""Largest change of an entry of a pose or of the intrinsics that still counts as a camera standing still."""
+"""Largest change of an entry of a static camera's pose, intrinsics or distortion, relative to the largest entry or
+1.
+"""
 
 
 NAMES = "a camera's name has letters, digits, dots, dashes and underscores, at most 64, and is not `time`"
@@ -22,12 +24,12 @@ NAMES = "a camera's name has letters, digits, dots, dashes and underscores, at m
 
 @dataclass(frozen=True, eq=False)
 class CalibratedImage:
-    """One picture that a calibration names, with its camera.
+    """One image that a calibration names, with its camera.
 
     Attributes:
-        path: as the file names it.
-        lens: the camera that took it; `calibration` gives it its name.
-        time: seconds, where the file says.
+        path: path as written in the calibration file.
+        lens: the camera that took the image; `calibration` assigns its name.
+        time: seconds, if the file has it.
     """
 
     path: PurePosixPath
@@ -37,16 +39,16 @@ class CalibratedImage:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A rig with its lenses.
+    """A calibrated rig with lens distortion.
 
     Attributes:
-        source: the file or folder it was read from.
-        cameras: in natural order of their names.
-        views: by camera name the pictures that the calibration speaks of, in order of time.
-        points: a cloud that came with it, or None.
-        fps: frames per second, where the file says.
-        remarks: what a person should know of the reading.
-        left_out: cameras that the file has and the rig has not; a remark names them.
+        source: the file or folder that the calibration was read from.
+        cameras: cameras in natural order of their names.
+        views: the images that the calibration names, by camera name, in temporal order.
+        points: point cloud that came with the calibration, or None.
+        fps: frames per second, if the file has it.
+        remarks: messages about the reading, for the user.
+        left_out: cameras that are in the file but not in the rig; a remark names them.
     """
 
     source: Path
@@ -59,12 +61,12 @@ class Calibration:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the cameras."""
+        """Names of the cameras."""
         return tuple(camera.name for camera in self.cameras)
 
 
 def natural(text: str) -> list[tuple[int, int, str]]:
-    """A key that puts cam2 before cam10."""
+    """Returns a sort key for natural order, in which cam2 precedes cam10."""
     parts = re.split(r"(\d+)", text)
     return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts if part]
 
@@ -72,10 +74,12 @@ def natural(text: str) -> list[tuple[int, int, str]]:
 def calibration(
     source: Path, views: Sequence[CalibratedImage], *, points: InitialPoints | None = None, fps: float | None = None
 ) -> Calibration:
-    """Groups pictures by camera. A camera is named by its pictures' folder or, where all lie in one, by its picture.
+    """Groups images by camera.
+
+    A camera is named after the folder of its images or, if all images are in one folder, after its image.
 
     Raises:
-        CaptureError: no views, a camera that moves, or a name that cannot be.
+        CaptureError: there are no views, a camera moves, or a camera name is invalid.
     """
     if not views:
         raise CaptureError(f"{source}: lists no camera")
@@ -99,13 +103,18 @@ def calibration(
 def calibration_of_cameras(
     source: Path, cameras: Sequence[LensCamera], left_out: Sequence[str] = (), why: str = ""
 ) -> Calibration:
-    """A calibration that names its cameras and no pictures: these lie in `images/<camera>/` or `videos/<camera>.mp4`.
+    """Builds a calibration from cameras without image names.
+
+    Their images are expected in `images/<camera>/` or `videos/<camera>.mp4`.
 
     Args:
-        left_out: cameras that the file has and the rig has not. why: begins the remark that names them.
+        source: the file or folder that the calibration was read from.
+        cameras: the cameras of the rig.
+        left_out: cameras that are in the file but not in the rig.
+        why: start of the remark that names the cameras left out.
 
     Raises:
-        CaptureError: no cameras, one name twice, or a name that cannot be.
+        CaptureError: there are no cameras, a name occurs twice, or a name is invalid.
     """
     if not cameras:
         raise CaptureError(f"{source}: lists no camera with a pose; calibrate the rig's poses (extrinsics) too")
@@ -122,7 +131,7 @@ def calibration_of_cameras(
 
 
 def can_be_named(name: str) -> bool:
-    """True for a name that the service takes; none of these leads out of a folder."""
+    """Returns whether the service accepts a camera name. No accepted name can escape its folder."""
     return bool(re.fullmatch(CAMERA_NAME, name)) and name != "time" and not name.startswith("mask.")
 
 

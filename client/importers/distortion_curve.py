@@ -1,4 +1,6 @@
-"""`DistortionCurve`: how a lens bends rays, and back, as far as its polynomial rises. Numpy only."""
+"""`DistortionCurve`: applies and inverts a lens's distortion as far as its polynomial is monotonic. Needs only
+numpy.
+"""
 
 from __future__ import annotations
 
@@ -12,28 +14,34 @@ from client.importers.lens import LensCamera
 Float = NDArray[np.float64]
 
 FLAT = np.radians(89.0)
-"""Angle from the axis beyond which no plane before the camera is met."""
+"""Angle from the optical axis beyond which a ray counts as never meeting the plane at distance 1."""
 SAMPLES = 8192
 STEEP = 0.1
-"""Of the slope on the axis. A polynomial that turns back has no points of its calibration near its top, and there a
-tenth of a pixel of the lens would fill a pixel: it is not believed where it is flatter."""
+"""Smallest trusted slope of the radial profile, relative to the slope on the axis.
+
+A polynomial that turns back is not constrained by calibration points near its maximum. Where it is flatter than this,
+a tenth of a pixel in the lens's image would be stretched over more than a pixel.
+"""
 NEWTON = 8
 ROUNDS = 60
-"""Of the tangential part, which is small: rounds shrink its error by its size."""
+"""Fixed-point iterations for the tangential part. It is small, so each iteration shrinks the error by about its
+size.
+"""
 CLOSE = 1e-7
-"""At distance 1: a ray that bends back to its pixel this well is found."""
+"""Largest residual, on the plane at distance 1, of a ray that counts as a solution."""
 
 
 @dataclass(frozen=True, eq=False)
 class DistortionCurve:
-    """The bending of a lens: by the ray's radius at distance 1 or, of a fisheye, by its angle from the axis.
+    """Radial distortion profile of a lens, over the ray's radius at distance 1 or, for a fisheye, its angle from the
+    axis.
 
     Attributes:
-        lens: whose.
-        reach: radius (angle) up to which it is believed.
-        turns: true where the picture goes on beyond it: the polynomial turns back before the farthest corner.
+        lens: the lens.
+        reach: largest radius (fisheye: angle) at which the profile is trusted.
+        turns: True if the image extends beyond `reach`, that is, the polynomial turns back before the farthest corner.
         samples: [S] radii (angles) from 0 to `reach`.
-        bends: [S] bent radii, rising.
+        bends: [S] distorted radii at `samples`, increasing.
     """
 
     lens: LensCamera
@@ -44,12 +52,12 @@ class DistortionCurve:
 
     @classmethod
     def of(cls, lens: LensCamera) -> DistortionCurve:
-        """Measures a lens that is not straight."""
+        """Samples the profile of a lens with distortion."""
         samples = np.linspace(0, np.pi, SAMPLES) if lens.fisheye else np.tan(np.linspace(0, FLAT, SAMPLES))
         bends, slopes = _profile(lens, samples)
         corners = np.array([[0, 0], [lens.width, 0], [0, lens.height], [lens.width, lens.height]])
         distorted = (corners - lens.intrinsics[:2, 2]) / lens.intrinsics.diagonal()[:2]
-        # The tangential part may bend a corner's ray farther than its pixel is.
+        # The tangential part may move a corner's ray outwards, beyond the corner's own radius.
         needed = np.linalg.norm(distorted, axis=-1).max() * (1 + 4 * np.abs(_tangential(lens)).sum())
         with np.errstate(invalid="ignore"):
             rises = (np.diff(bends, prepend=-1.0) > 0) & (slopes > 0)
@@ -64,20 +72,23 @@ class DistortionCurve:
 
     @property
     def max_radius(self) -> float:
-        """Radius of a ray at distance 1 up to which the lens is believed; infinite beyond 89°."""
+        """Largest trusted radius of a ray at distance 1; infinite beyond 89° of a fisheye."""
         if not self.lens.fisheye:
             return self.reach
         return float(np.tan(self.reach)) if self.reach < FLAT else np.inf
 
     def distort(self, rays: Float) -> Float:
-        """Rays (x/z, y/z) [P, 2], within `widest`, to where the lens's plane at distance 1 shows them [P, 2]."""
+        """Maps rays (x/z, y/z) [P, 2] within `max_radius` to distorted points [P, 2] on the plane at distance 1."""
         radius = np.linalg.norm(rays, axis=-1, keepdims=True)
         of = np.arctan(radius) if self.lens.fisheye else radius
         bends, _ = _profile(self.lens, of)
         return rays * np.where(radius > 0, bends / np.maximum(radius, 1e-12), 1.0) + _tangential_offset(self.lens, rays)
 
     def undistort(self, bent: Float) -> Float:
-        """Undoes `bent`, [P, 2] to [P, 2]: ±infinity beyond 89° of a fisheye, NaN where no ray is believed."""
+        """Inverts `distort`, [P, 2] to [P, 2].
+
+        Returns ±infinity beyond 89° of a fisheye, and NaN for points that no trusted ray reaches.
+        """
         if self.lens.fisheye or not _tangential(self.lens).any():
             return self._undistort_radial(bent)
         rays = self._undistort_radial(bent)
@@ -87,7 +98,7 @@ class DistortionCurve:
         return np.where(close[:, None], rays, np.nan)
 
     def _undistort_radial(self, bent: Float) -> Float:
-        """Undoes the radial part alone."""
+        """Inverts the radial part alone."""
         radius = np.linalg.norm(bent, axis=-1)
         of = np.interp(radius, self.bends, self.samples)
         for _ in range(NEWTON):
@@ -105,7 +116,9 @@ class DistortionCurve:
 
 
 def _profile(lens: LensCamera, of: Float) -> tuple[Float, Float]:
-    """Bent radii of radii (angles of a fisheye), and the slopes there; both of the shape given."""
+    """Returns distorted radii and the profile's slopes at the given radii (fisheye: angles), both of the input's
+    shape.
+    """
     s = of * of
     if lens.fisheye:
         k1, k2, k3, k4 = lens.distortion
@@ -120,12 +133,12 @@ def _profile(lens: LensCamera, of: Float) -> tuple[Float, Float]:
 
 
 def _tangential(lens: LensCamera) -> Float:
-    """p1 and p2 of OpenCV, [2]."""
+    """Returns OpenCV's p1 and p2, [2]."""
     return np.zeros(2) if lens.fisheye else lens.distortion[2:4]
 
 
 def _tangential_offset(lens: LensCamera, rays: Float) -> Float:
-    """The tangential part of the bending, [P, 2]."""
+    """Returns the offset due to tangential distortion, [P, 2]."""
     p1, p2 = _tangential(lens)
     x, y = rays[:, 0], rays[:, 1]
     r2 = x * x + y * y

@@ -1,4 +1,4 @@
-"""Packages that only the importers need, loaded on first use."""
+"""Packages that only the importers need, imported on first use."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ INSTALL = "in the project's folder: pip install -e '.[importers]'"
 
 
 class MissingExtraError(RuntimeError):
-    """A package of the extra `importers` is not installed."""
+    """Raised if a package of the extra `importers` is not installed."""
 
 
 def load(module: str, *, needed: str) -> Any:
-    """Imports a module; `needed` names its purpose in the error.
+    """Imports a module; `needed` names its purpose in the error message.
 
     Raises:
-        MissingExtraError: it is not installed; the message names the extra.
+        MissingExtraError: the module is not installed; the message names the extra.
     """
     try:
         return importlib.import_module(module)
@@ -28,10 +28,10 @@ def load(module: str, *, needed: str) -> Any:
 
 
 def opencv() -> Any:
-    """Imports OpenCV, for lenses with distortion."""
+    """Imports OpenCV, which undistorts images."""
     return load("cv2", needed="undoing a lens's distortion")
 
 
 def pyav() -> Any:
-    """Imports PyAV, for video."""
+    """Imports PyAV, which decodes videos."""
     return load("av", needed="video")

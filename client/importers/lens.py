@@ -1,6 +1,6 @@
-"""Lenses: the camera models of calibration tools, and cameras that have one. Numpy only.
+"""Lenses: the camera models of calibration tools, and cameras that use them. Needs only numpy.
 
-Pixels are counted as everywhere here: the centre of the first pixel is (0.5, 0.5), as in COLMAP and nerfstudio.
+Pixel coordinates put the centre of the first pixel at (0.5, 0.5), as in COLMAP and nerfstudio.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from scas4d_core.captures import CaptureError
 Float = NDArray[np.float64]
 
 PERSPECTIVE = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-"""OpenCV's order; the radial factor is (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶)."""
+"""Coefficients in OpenCV's order. The radial factor is (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶)."""
 FISHEYE = ("k1", "k2", "k3", "k4")
-"""θ_d = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)."""
+"""Fisheye coefficients: θ_d = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸)."""
 
 MODELS: dict[str, tuple[str, ...]] = {
     "SIMPLE_PINHOLE": ("f", "cx", "cy"),
@@ -30,7 +30,7 @@ MODELS: dict[str, tuple[str, ...]] = {
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
     "FULL_OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
-"""The models that are read, with their parameters in COLMAP's order."""
+"""Supported camera models, with their parameters in COLMAP's order."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +40,10 @@ class LensCamera:
     Attributes:
         name: identifies the camera within its rig.
         model: one of `MODELS`.
-        intrinsics: [3, 3] in pixels, principal point from the upper left corner of the picture.
-        distortion: coefficients in OpenCV's order, [8] of `PERSPECTIVE` or [4] of `FISHEYE`.
+        intrinsics: [3, 3] in pixels, with the principal point relative to the upper left corner of the image.
+        distortion: coefficients in OpenCV's order, [8] as in `PERSPECTIVE` or [4] as in `FISHEYE`.
         world_to_camera: [4, 4], OpenCV axes.
-        width, height: picture size in pixels.
+        width, height: image size in pixels.
     """
 
     name: str
@@ -56,19 +56,19 @@ class LensCamera:
 
     @property
     def fisheye(self) -> bool:
-        """True where the distortion is one of the angle."""
+        """Whether the distortion is a function of the angle from the optical axis."""
         return self.model == "OPENCV_FISHEYE"
 
     @property
     def is_pinhole(self) -> bool:
-        """True for a pinhole camera. (A fisheye without coefficients is none.)"""
+        """Whether the camera is a pinhole camera. A fisheye with zero coefficients is not one."""
         return not self.fisheye and not self.distortion.any()
 
     def pinhole(self, intrinsics: Float | None = None) -> Camera:
-        """The pinhole camera in its place, with other intrinsics where given.
+        """Returns a pinhole camera at the same pose, with the given intrinsics or those of the lens.
 
         Raises:
-            CameraError: it cannot be.
+            CameraError: the camera is not valid.
         """
         k = self.intrinsics if intrinsics is None else intrinsics
         return Camera(self.name, k, self.world_to_camera, self.width, self.height)
@@ -83,18 +83,20 @@ def lens_camera(
     *,
     source: str,
 ) -> LensCamera:
-    """Makes a camera from the parameters of its model by name (`MODELS`), checked.
+    """Creates and validates a camera from the named parameters of its model (`MODELS`).
 
     Args:
-        name: of the camera.
-        model: of its lens.
-        parameters: by name, two focal lengths also where the model has one; coefficients that are not there are 0.
+        name: name of the camera.
+        model: name of the lens model.
+        parameters: parameters by name. Models with a single focal length also accept `fx` and `fy`; missing
+            coefficients
+            are 0.
         world_to_camera: [4, 4], OpenCV axes.
         size: (width, height) in pixels.
-        source: what to call the file in messages.
+        source: name of the file in messages.
 
     Raises:
-        CaptureError: the model is not one of those read, or the camera cannot be.
+        CaptureError: the model is not supported, or the camera is not valid.
     """
     if model not in MODELS:
         raise CaptureError(

@@ -1,4 +1,4 @@
-"""`open_source`: opens a capture of any known layout, recognized by the files in its folder."""
+"""`open_source`: opens a capture in any supported layout, recognized by the files in its folder."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PicturesFrom = Literal["images", "videos", "named"]
 
 @dataclass(frozen=True)
 class CaptureOptions:
-    """Options on how a capture is read, the same for every command and study; each is an argument of `open_source`."""
+    """Options for reading a capture, shared by all commands and studies; each is an argument of `open_source`."""
 
     calibration: Path | None = None
     pictures: PicturesFrom | None = None
@@ -40,12 +40,16 @@ class CaptureOptions:
     encoding: Encoding = "jpeg"
 
     def open(self, folder: Path | str, **more: Any) -> Capture:
-        """Opens a capture with these options; `more` goes to `open_source` too, and wins."""
+        """Opens a capture with these options; keyword arguments in `more` are passed to `open_source` and take
+        precedence.
+        """
         return open_source(folder, **(asdict(self) | more))
 
     @property
     def changed(self) -> dict[str, Any]:
-        """The options that are not the default, as JSON values, without the encoding, which changes no pixel here."""
+        """Options that differ from the default, as JSON values. Excludes the encoding, which does not affect decoded
+        pixels.
+        """
         usual, own = asdict(CaptureOptions()), asdict(self)
         changes = {name: value for name, value in own.items() if value != usual[name] and name != "encoding"}
         return {
@@ -67,27 +71,28 @@ def open_source(
     test: tuple[str, ...] = (),
     size_mismatch: SizeMismatch | None = None,
 ) -> Capture:
-    """Opens a capture of any layout that is known (docs/captures.md): all commands and studies open theirs here.
+    """Opens a capture in any supported layout (docs/captures.md). All commands and studies use this function.
 
-    Lenses are undone when a picture is read, in memory.
+    Lens distortion is removed in memory when an image is read.
 
     Args:
-        folder: of the capture.
+        folder: folder of the capture.
         calibration: a transforms.json, the folder of a COLMAP model, or a file of another tool
-            (`client/importers/formats/`); found in the folder where None.
-        pictures: from where: folders `images/<camera>/`, `videos/<camera>.mp4`, or the files that the calibration
-            names; where None, the latter if it names several a camera, else from what is there.
-        fps: frames per second, where the files do not say.
-        encoding: of pictures that have to be encoded to be sent or written: undistorted ones, and frames of videos.
-        use_masks: False to leave `masks/` (`seg/`) alone.
-        use_points: False to leave the cloud alone.
-        image_scale: pictures, masks and cameras are resized by this when they are read.
-        test: cameras held out for measuring, beside those that the layout holds out.
-        size_mismatch: how pictures of another shape than calibrated were made (`adapt_intrinsics`); None refuses them.
+            (`client/importers/formats/`); None searches the folder.
+        pictures: source of the images: `images/<camera>/`, `videos/<camera>.mp4`, or the files that the calibration
+            names. None uses the named files if there are several per camera, else whatever exists.
+        fps: frames per second, overriding the files; None uses theirs, or 30 if they have none.
+        encoding: format for images that must be encoded to be sent or written: undistorted images and video frames.
+        use_masks: False ignores `masks/` (`seg/`).
+        use_points: False ignores the point cloud.
+        image_scale: factor by which images, masks and cameras are resized when they are read.
+        test: cameras held out for evaluation, in addition to those that the layout holds out.
+        size_mismatch: how images with another aspect ratio than calibrated were made (`adapt_intrinsics`); None rejects
+            such images.
 
     Raises:
-        CaptureError: no known layout, or a fault in one of the files; the message says what is missing.
-        MissingExtraError: a lens or a video needs a package of the extra `importers`.
+        CaptureError: the layout is unknown, or a file is invalid; the message names the problem.
+        MissingExtraError: a lens or a video needs a package from the extra `importers`.
 
     >>> capture = open_source(folder)
     >>> capture.rig.names, capture.frame_count
@@ -152,12 +157,13 @@ def _imported(
 
 
 def read_calibration(folder: Path, given: Path | None = None) -> Calibration:
-    """Reads the given calibration, else transforms.json, else a COLMAP model in one of the usual places, else the one
-    file of another tool that is there.
+    """Reads the given calibration or finds one in the folder.
+
+    The search order is transforms.json, a COLMAP model in one of the usual places, then a single file of another tool.
 
     Raises:
-        CaptureError: there is none, there are several, or it cannot be read.
-        MissingExtraError: it needs a package of the extra `importers`.
+        CaptureError: there is no calibration, there are several, or it cannot be read.
+        MissingExtraError: the format needs a package from the extra `importers`.
     """
     if given is not None:
         if given.is_file() and given.suffix == ".json":
@@ -183,7 +189,7 @@ def read_calibration(folder: Path, given: Path | None = None) -> Calibration:
 
 
 def _with_unread_remark(others: list[Path], folder: Path, found: Calibration) -> Calibration:
-    """The calibration, with a remark on others that are there and not read."""
+    """Returns the calibration with a remark that names other calibrations in the folder, which are not read."""
     if not others:
         return found
     listed = ", ".join(str(path.relative_to(folder)) for path in others)
@@ -192,14 +198,14 @@ def _with_unread_remark(others: list[Path], folder: Path, found: Calibration) ->
 
 
 def uncalibrated_remark(folder: Path, calibration: Calibration) -> list[str]:
-    """A remark on cameras that have pictures or a video, and are not in the calibration; none where all are."""
+    """Returns a remark that names cameras with images or a video but no calibration; empty if there are none."""
     images, videos = folder / "images", folder / "videos"
     there = {path.name for path in images.iterdir() if path.is_dir()} if images.is_dir() else set[str]()
     if not there and videos.is_dir():
         there = {path.stem for path in videos.iterdir() if path.suffix.lower() in ENDS}
     unknown = there.difference(calibration.names, calibration.left_out)
     left = sorted(name for name in unknown if not name.startswith("."))
-    if not left or not there.intersection(calibration.names):  # else these are no folders of cameras
+    if not left or not there.intersection(calibration.names):  # otherwise these folders are not cameras
         return []
     return [f"left out, {calibration.source.name} has no such camera: {', '.join(left)}"]
 

@@ -1,7 +1,7 @@
-"""Frames from picture files: a folder a camera, or the files that the calibration names. Numpy and Pillow only.
+"""Frames from image files: one folder per camera, or files named by the calibration. Needs only numpy and Pillow.
 
-``images/<camera>/<frame>.jpg``: frames are in natural order of their names, and a frame's pictures are those of one
-name, whatever they end in.
+In ``images/<camera>/<frame>.jpg``, frames are in natural order of their names. The images of one frame have the same
+name, with any extension.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ from scas4d_core.captures import CaptureError, ImageError, decode_image
 from scas4d_core.captures.images import describe_pictures, picture_size
 
 SENT = (".jpg", ".jpeg", ".png", ".webp")
-"""What the service takes as it is."""
+"""Extensions that the service accepts without re-encoding."""
 READ = (*SENT, ".bmp")
 PICTURE_LIKE = (*READ, ".tif", ".tiff", ".exr", ".dng", ".raw", ".heic", ".gif", ".jp2", ".avif")
 SHOWN = 3
 
 
 class PictureFiles:
-    """Picture files of T frames by camera; all of a camera have the size of its first.
+    """Image files of T frames, by camera; all images of a camera have the size of its first one.
 
     Raises:
-        CaptureError: the first picture of a camera cannot be read.
+        CaptureError: the first image of a camera cannot be read.
     """
 
     fps: float | None = None
@@ -42,27 +42,27 @@ class PictureFiles:
             raise CaptureError(str(fault)) from fault
 
     def time(self, index: int) -> float | None:
-        """Seconds, where the calibration says."""
+        """Returns the frame's time in seconds, or None if the calibration has no times."""
         return self._times[index] if self._times else None
 
     def path(self, camera: str) -> Path:
-        """The camera's first file."""
+        """Returns the camera's first file."""
         return self._files[0][camera]
 
     def file(self, index: int, camera: str) -> Path | None:
-        """The file, if the service takes its kind."""
+        """Returns the image file, or None if the service does not accept its format."""
         path = self._files[index][camera]
         return path if path.suffix.lower() in SENT else None
 
     def decoded(self, index: int, camera: str) -> Picture:
-        """Decodes a picture, [H, W, 3]."""
+        """Decodes an image, [H, W, 3]."""
         return decode_image(self._files[index][camera], size=self.sizes[camera])
 
     def check_same_frames(self, masks: Sequence[Mapping[str, Path]]) -> None:
-        """Refuses masks that are not named like the pictures.
+        """Checks that the masks have the same frame names as the images.
 
         Raises:
-            CaptureError: a mask or a picture is without the other.
+            CaptureError: an image has no mask, or a mask has no image.
         """
         for index in range(max(len(masks), len(self._files))):
             picture = next(iter(self._files[index].values())) if index < len(self._files) else None
@@ -75,10 +75,10 @@ class PictureFiles:
 
 
 def folders_of(root: Path, calibration: Calibration, *, what: str = "pictures") -> list[dict[str, Path]]:
-    """The files of ``root/<camera>/`` by frame, [T]: one a camera.
+    """Returns the files in ``root/<camera>/`` by frame, [T], one file per camera.
 
     Raises:
-        CaptureError: a camera has no folder, or a folder lacks a frame that others have.
+        CaptureError: a camera has no folder, or a folder lacks a frame that another folder has.
     """
     by_camera: dict[str, dict[str, Path]] = {}
     for camera in calibration.names:
@@ -119,10 +119,12 @@ def _pictures_in(folder: Path) -> dict[str, Path]:
 
 
 def named_files(folder: Path, calibration: Calibration) -> tuple[list[dict[str, Path]], list[float]]:
-    """The files that the calibration names by frame, [T], and their times if any; frame t is each camera's t-th.
+    """Returns the files that the calibration names, by frame [T], and their times if given.
+
+    Frame t consists of the t-th image of each camera.
 
     Raises:
-        CaptureError: a file is not there, cameras have different numbers of pictures, or times differ.
+        CaptureError: a file is missing, cameras have different numbers of images, or the times within a frame differ.
     """
     counts = {camera: len(views) for camera, views in calibration.views.items()}
     most = max(counts, key=lambda camera: counts[camera])

@@ -1,4 +1,4 @@
-"""Pictures of a calibrated rig as its pinhole cameras would have taken them: the reader behind an imported capture."""
+"""The reader behind an imported capture: images of a calibrated rig, undistorted to those of its pinhole cameras."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ JPEG_QUALITY = 95
 
 
 class RawReader(Protocol):
-    """Reads the pictures as the cameras took them, from files or videos."""
+    """Reads the original, distorted images from files or videos."""
 
     @property
     def frame_count(self) -> int:
@@ -36,43 +36,43 @@ class RawReader(Protocol):
 
     @property
     def fps(self) -> float | None:
-        """Frames per second, where the pictures say."""
+        """Frames per second, or None if unknown."""
 
     @property
     def remarks(self) -> Sequence[str]:
-        """Remarks on the reading, for a person."""
+        """Messages about the reading, for the user."""
 
     @property
     def sizes(self) -> Mapping[str, Size]:
-        """(width, height) of each camera's pictures."""
+        """(width, height) of each camera's images."""
 
     def time(self, index: int) -> float | None:
-        """Seconds, where the pictures say."""
+        """Returns the frame's time in seconds, or None if unknown."""
 
     def path(self, camera: str) -> Path:
-        """The camera's first file, for messages."""
+        """Returns the camera's first file, for messages."""
 
     def file(self, index: int, camera: str) -> Path | None:
-        """The picture's own file, if it has one of a kind that the service takes."""
+        """Returns the image's own file, or None if there is none in a format that the service accepts."""
 
     def decoded(self, index: int, camera: str) -> Picture:
-        """Decodes a picture, [H, W, 3]."""
+        """Decodes an image, [H, W, 3]."""
 
 
 class ImportedPictures:
-    """Pictures of a calibrated rig, their lenses undone: a `PictureReader`.
+    """Undistorted images of a calibrated rig; implements `PictureReader`.
 
-    In a file, a picture of a straight lens goes as it is; every other is encoded anew.
+    Image files from cameras without distortion are passed through unchanged; all other images are re-encoded.
 
     Args:
-        calibration: of the rig, for pictures of the size that `raw` has (`fit_to_pictures`).
-        raw: pictures of all its cameras.
-        masks: [T] files by camera, or none.
-        encoding: of pictures that are encoded anew; JPEG has quality 95 and no subsampling.
+        calibration: calibration for images of the size that `raw` has (see `fit_to_pictures`).
+        raw: images of all cameras.
+        masks: [T] mask files by camera, or empty.
+        encoding: format of re-encoded images; JPEG uses quality 95 without chroma subsampling.
 
     Raises:
-        CaptureError: a lens cannot be undone.
-        MissingExtraError: a lens has to be undone and OpenCV is not there.
+        CaptureError: a lens cannot be undistorted.
+        MissingExtraError: a lens has distortion and OpenCV is not installed.
     """
 
     def __init__(
@@ -91,35 +91,35 @@ class ImportedPictures:
 
     @cached_property
     def rig(self) -> Rig:
-        """Pinhole cameras, as large as the pictures."""
+        """Rig of pinhole cameras at the images' size."""
         return Rig(tuple(undistorter.camera for undistorter in self._undistorters.values()))
 
     @property
     def remarks(self) -> tuple[str, ...]:
-        """Remarks on the files and the lenses, for a person."""
+        """Remarks on the files and the lenses, for the user."""
         lenses = (undistorter.remark for undistorter in self._undistorters.values())
         return (*self._raw.remarks, *(remark for remark in lenses if remark is not None))
 
     def time(self, index: int) -> float | None:
-        """Seconds, where the pictures say."""
+        """Returns the frame's time in seconds, or None if unknown."""
         return self._raw.time(index)
 
     def image(self, index: int, camera: str) -> Picture:
-        """[H, W, 3] as the pinhole camera of the rig would have seen it."""
+        """Returns the undistorted image [H, W, 3], as seen by the rig's pinhole camera."""
         return self._undistorters[camera].picture(self._raw.decoded(index, camera))
 
     def has_mask(self, index: int, camera: str) -> bool:
-        """True where there is a file."""
+        """Returns whether the image has a mask file."""
         return bool(self._masks) and camera in self._masks[index]
 
     def mask(self, index: int, camera: str) -> Picture:
-        """The undistorted mask, [H, W]."""
+        """Returns the undistorted mask, [H, W]."""
         undistorter = self._undistorters[camera]
         size = (undistorter.lens.width, undistorter.lens.height)
         return undistorter.mask(decode_mask(self._masks[index][camera], size=size))
 
     def encoded_image(self, index: int, camera: str) -> bytes:
-        """The file as it is, or the undistorted picture encoded; 16 bits are rounded to 8."""
+        """Returns the unchanged file, or the undistorted image re-encoded; 16-bit images are rounded to 8 bits."""
         if self._undistorters[camera].lens.is_pinhole:
             file = self._raw.file(index, camera)
             if file is not None:
@@ -127,17 +127,19 @@ class ImportedPictures:
         return encode(self.image(index, camera), self._encoding)
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
-        """The undistorted mask, as PNG."""
+        """Returns the undistorted mask as PNG, or None if there is no mask."""
         return encode(255 * self.mask(index, camera), "png") if self.has_mask(index, camera) else None
 
 
 def fit_to_pictures(
     calibration: Calibration, raw: RawReader, size_mismatch: SizeMismatch | None
 ) -> tuple[Calibration, list[str]]:
-    """The calibration for pictures of the size that they have, and remarks on cameras where that is another.
+    """Adapts the calibration to the actual size of the images.
+
+    Returns the calibration and a remark for each camera whose images have another size than calibrated.
 
     Raises:
-        CaptureError: pictures of another shape than calibrated, and `size_mismatch` does not say how they came about.
+        CaptureError: images have another aspect ratio than calibrated, and `size_mismatch` does not say why.
     """
     cameras, remarks = [], []
     for lens in calibration.cameras:
@@ -156,10 +158,10 @@ def fit_to_pictures(
 
 
 def check_times(name: str, times: Sequence[float]) -> None:
-    """Refuses times [T] of frames that do not rise.
+    """Checks that the frame times [T] are strictly increasing.
 
     Raises:
-        CaptureError: names the frame.
+        CaptureError: a frame is not later than the one before; the message names it.
     """
     for index, (before, now) in enumerate(pairwise(times), 1):
         if now <= before:
@@ -167,7 +169,7 @@ def check_times(name: str, times: Sequence[float]) -> None:
 
 
 def encode(picture: Picture, encoding: Encoding) -> bytes:
-    """Encodes a picture or mask as the bytes of a file."""
+    """Encodes an image or mask as the bytes of an image file."""
     if encoding == "png":
         return imageio.imwrite("<bytes>", picture, extension=".png", compress_level=1)
     return imageio.imwrite("<bytes>", picture, extension=".jpg", quality=JPEG_QUALITY, subsampling=0)

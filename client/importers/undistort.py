@@ -1,11 +1,12 @@
-"""Undoes distortion and fisheye with OpenCV: from a lens to a pinhole camera of the same place and picture size.
+"""Removes perspective and fisheye distortion with OpenCV: maps a lens to a pinhole camera of the same pose and image
+size.
 
-The pinhole looks at the largest part of the picture, of the picture's own shape, in which every pixel was seen: no
-black corners. Its pixels are as square as the lens's, its principal point follows. Where the lens's polynomial turns
-back before a corner, the pinhole is narrowed to the rays on which it still rises.
+The pinhole camera covers the largest region with the image's aspect ratio in which every pixel was seen, so there are
+no black corners. It keeps the lens's pixel aspect ratio; the principal point follows from the region. If the lens's
+polynomial turns back before a corner, the field of view is narrowed to the rays on which the polynomial increases.
 
-OpenCV puts the centre of the first pixel at (0, 0), we and COLMAP at (0.5, 0.5): principal points lose half a pixel on
-their way to it. Left out, the picture would lie half a pixel beside its camera.
+OpenCV puts the centre of the first pixel at (0, 0), whereas this project and COLMAP put it at (0.5, 0.5). Principal
+points passed to OpenCV are therefore reduced by half a pixel; otherwise images would be shifted by half a pixel.
 """
 
 from __future__ import annotations
@@ -26,41 +27,45 @@ Float = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 WIDEST_DEGREES = 120.0
-"""A pinhole's field at most: beyond, a fisheye's picture is stretched over pixels that hold nothing."""
+"""Largest field of view of a pinhole camera; beyond it, a fisheye image is stretched over pixels without
+information.
+"""
 BORDER_POINTS = 64
 TOLERANCE_PIXELS = 0.01
-"""Farthest that a pinhole's border may lie outside of the picture: less than is interpolated over."""
+"""Largest distance that the pinhole's border may lie outside the image; interpolation hides smaller distances."""
 NARROWING = 1.005
-"""Step of the focal length by which a lens that turns back is cut: half a per cent of the picture's side."""
+"""Factor per step by which the focal length grows while a lens that turns back is cropped: 0.5 % of the image's
+side.
+"""
 MOST_NARROWED = 50.0
-"""Times the lens's focal length at which the search for a pinhole ends."""
+"""Multiple of the lens's focal length at which the search for a pinhole camera stops."""
 LEAST_KEPT = 0.25
-"""Share of its picture below which a lens that turns back is refused: its calibration is wrong, not imprecise."""
+"""Share of the image below which a lens that turns back is rejected, because its calibration must be wrong."""
 HALF = 0.5
 
 
 @dataclass(frozen=True, eq=False)
 class Undistorter:
-    """Undistorts the pictures of one camera. A straight lens needs nothing, and no OpenCV.
+    """Undistorts the images of one camera. A lens without distortion needs neither processing nor OpenCV.
 
     Args:
-        lens: as calibrated.
+        lens: the calibrated lens.
 
     Raises:
-        CaptureError: the distortion cannot be undone in a quarter of the picture or more.
-        MissingExtraError: OpenCV is needed and not there.
+        CaptureError: less than a quarter of the image can be undistorted.
+        MissingExtraError: OpenCV is needed and not installed.
     """
 
     lens: LensCamera
 
     @cached_property
     def camera(self) -> Camera:
-        """The pinhole camera that the undistorted picture belongs to."""
+        """Pinhole camera of the undistorted images."""
         return self.lens.pinhole() if self.lens.is_pinhole else self.lens.pinhole(self._view.intrinsics)
 
     @cached_property
     def remark(self) -> str | None:
-        """A sentence on a lens that is cut, because its polynomial turns back; None for others."""
+        """Message about a lens that is cropped because its polynomial turns back; None for other lenses."""
         if self.lens.is_pinhole or self._view.kept is None:
             return None
         return (
@@ -88,20 +93,21 @@ class Undistorter:
         """Mask [H, W] of the undistorted pixels that the camera saw."""
         if self.lens.is_pinhole:
             return np.ones((self.lens.height, self.lens.width), dtype=bool)
-        u, v = self._maps  # of OpenCV: the picture's edges are at −0.5 and size − 0.5
+        u, v = self._maps  # OpenCV's pixels: image edges at −0.5 and size − 0.5
         inside = (u >= -HALF) & (u <= self.lens.width - HALF) & (v >= -HALF) & (v <= self.lens.height - HALF)
         return np.asarray(inside)
 
     def picture(self, picture: Picture) -> Picture:
-        """Undistorts a picture: [H, W, 3] of the lens to [H, W, 3] of the pinhole camera.
+        """Undistorts an image [H, W, 3] of the lens to an image [H, W, 3] of the pinhole camera.
 
-        Lanczos: painted dots land within 0.02 pixels of where they belong; cubic interpolation moves them by up to
-        0.08 and linear blurs.
+        Uses Lanczos interpolation, which keeps painted dots within 0.02 pixels of their true position. Cubic
+        interpolation
+        shifts them by up to 0.08 pixels, and linear interpolation blurs.
         """
         return self._remapped(picture, "INTER_LANCZOS4")
 
     def mask(self, mask: Picture) -> Picture:
-        """Undistorts a mask of labels [H, W]; each pixel takes the nearest one's."""
+        """Undistorts a mask of labels [H, W] with nearest-neighbour interpolation."""
         return self._remapped(mask, "INTER_NEAREST")
 
     def _remapped(self, picture: Picture, how: str) -> Picture:
@@ -118,7 +124,7 @@ class Undistorter:
 
 
 def _shifted(intrinsics: Float) -> Float:
-    """The same intrinsics for OpenCV's pixel centres, which are at whole numbers."""
+    """Returns the intrinsics for OpenCV's pixel coordinates, whose pixel centres are at integers."""
     shifted = intrinsics.copy()
     shifted[:2, 2] -= HALF
     return shifted
@@ -126,11 +132,11 @@ def _shifted(intrinsics: Float) -> Float:
 
 @dataclass(frozen=True, eq=False)
 class _View:
-    """The pinhole of a lens.
+    """The pinhole camera that replaces a lens.
 
     Attributes:
         intrinsics: [3, 3] in pixels.
-        kept: share of the lens's picture that it shows, where the lens is cut because its polynomial turns back.
+        kept: share of the lens's image that the pinhole camera covers; None unless the lens is cropped.
     """
 
     intrinsics: Float
@@ -138,11 +144,11 @@ class _View:
 
 
 def _inscribed(lens: LensCamera) -> _View:
-    """The pinhole whose whole picture the lens saw; its pixels have the shape of the lens's."""
+    """Returns the pinhole camera whose whole image the lens saw; it keeps the lens's pixel aspect ratio."""
     curve = DistortionCurve.of(lens)
     left, top, right, bottom = _inner_rectangle(lens, curve)
     fx, fy = lens.intrinsics[0, 0], lens.intrinsics[1, 1]
-    # One factor for both focal lengths keeps the pixels' shape.
+    # One factor for both focal lengths preserves the pixel aspect ratio.
     factor = max(lens.width / ((right - left) * fx), lens.height / ((bottom - top) * fy))
     k = np.diag([factor * fx, factor * fy, 1.0])
     k[0, 2] = lens.width / 2 - k[0, 0] * (left + right) / 2
@@ -151,10 +157,10 @@ def _inscribed(lens: LensCamera) -> _View:
 
 
 def _within(lens: LensCamera, curve: DistortionCurve, k: Float) -> _View:
-    """Narrows a pinhole about the lens's axis until all that it shows lies where the lens's polynomial rises.
+    """Narrows a pinhole camera about the lens's axis until its whole image lies where the lens's polynomial increases.
 
     Raises:
-        CaptureError: too little of the picture is left.
+        CaptureError: too little of the image is left.
     """
     border, size = np.concatenate(list(_edges(lens).values())), np.array([lens.width, lens.height])
     kept = 0.0
@@ -177,7 +183,7 @@ def _within(lens: LensCamera, curve: DistortionCurve, k: Float) -> _View:
 
 
 def _edges(lens: LensCamera) -> dict[str, Float]:
-    """Pixels [P, 2] along each edge of the lens's picture, once around it."""
+    """Returns the pixels [P, 2] along each edge of the lens's image, in order around the image."""
     x, y = (np.linspace(0, length, BORDER_POINTS) for length in (lens.width, lens.height))
     return {
         "top": np.stack([x, np.zeros_like(x)], axis=-1),
@@ -188,10 +194,10 @@ def _edges(lens: LensCamera) -> dict[str, Float]:
 
 
 def _inner_rectangle(lens: LensCamera, curve: DistortionCurve) -> tuple[float, float, float, float]:
-    """Left, top, right, bottom at distance 1 of a rectangle that lies within what the lens saw.
+    """Returns (left, top, right, bottom), at distance 1, of a rectangle inside the region that the lens saw.
 
-    No edge of the picture, bent as it is, comes into the rectangle: it ends where each edge's innermost point lies. Of
-    a lens that turns back, `_within` cuts the corners.
+    Each side lies at the innermost point of the corresponding undistorted image edge. For a lens that turns back,
+    `_within` crops the corners afterwards.
     """
     limit = min(np.tan(np.radians(WIDEST_DEGREES / 2)), curve.max_radius)
     rays = {side: undistort_pixels(lens, pixels, curve) for side, pixels in _edges(lens).items()}
@@ -207,10 +213,10 @@ def _inner_rectangle(lens: LensCamera, curve: DistortionCurve) -> tuple[float, f
 
 
 def undistort_pixels(lens: LensCamera, pixels: Float, curve: DistortionCurve | None = None) -> Float:
-    """[P, 2] pixels of the lens to rays (x/z, y/z) [P, 2].
+    """Maps pixels [P, 2] of the lens to rays (x/z, y/z) [P, 2].
 
-    Rays are ±infinity beyond 89° from the axis of a fisheye, and NaN where the lens has none: its polynomial turns back
-    before the pixel.
+    Rays are ±infinity beyond 89° from the axis of a fisheye. They are NaN where the lens's polynomial turns back before
+    the pixel.
     """
     curve = curve or DistortionCurve.of(lens)
     return curve.undistort((pixels - lens.intrinsics[:2, 2]) / lens.intrinsics.diagonal()[:2])

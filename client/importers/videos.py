@@ -1,7 +1,7 @@
-"""Frames from one video a camera, each decoded by PyAV when it is asked for.
+"""Frames from one video per camera, decoded on demand with PyAV.
 
-The times of all frames are read from the packets, without decoding. A frame is found by going back to the key frame
-before it and decoding on until its own time comes; going forward frame by frame decodes each once.
+Frame times are read from the packets, without decoding. To decode a frame, the reader seeks to the key frame before it
+and decodes up to the frame's time stamp. Sequential access decodes each frame once.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from scas4d_core.captures.images import mixed_colours
 
 ENDS = (".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v", ".mts", ".ts")
 RATE_TOLERANCE = 1e-3
-"""Largest relative difference of two cameras' rates: 29.97 and 30 differ by it."""
+"""Largest relative difference between the frame rates of two cameras, about that between 29.97 and 30."""
 NEAR = 8
-"""Frames ahead that are decoded on to; farther ahead there may be a key frame to begin with."""
+"""Largest number of frames to decode forward; for larger steps, seeking to a key frame is usually faster."""
 ALIKE = 0.05
-"""Intervals between frames that differ by less are meant to be the same: stamps are rounded."""
+"""Relative difference below which two frame intervals count as equal, because time stamps are rounded."""
 
 
 class Video:
     """One video file.
 
     Attributes:
-        times: [T] seconds of each frame since the first.
+        times: [T] time of each frame in seconds, relative to the first.
         fps: mean frames per second.
         size: (width, height) in pixels.
-        grey: true where it has no colours.
+        grey: True if the pixel format is greyscale.
 
     Raises:
-        CaptureError: no video, damaged, turned by its metadata, or fewer than one frame.
-        MissingExtraError: PyAV is not there.
+        CaptureError: the file has no video stream, is damaged, or has no frame with a time stamp.
+        MissingExtraError: PyAV is not installed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -75,17 +75,18 @@ class Video:
 
     @property
     def interval(self) -> float:
-        """Seconds between most frames and the next: dropped frames do not change it."""
+        """Median seconds between consecutive frames; dropped frames do not affect it."""
         return float(np.median(np.diff(self.times))) if len(self) > 1 else 0.0
 
     def frame(self, index: int) -> Picture:
         """Decodes frame `index`: [H, W, 3] sRGB values, read-only.
 
-        The last frame is kept, and one that was asked for again after others: scores compare every frame with frame 0,
-        and going back to it would cost all frames since the last key frame each time.
+        Caches the last frame, and the last one that was requested by stepping back. Scoring compares every frame with
+        frame 0,
+        and decoding it again would decode everything since its key frame each time.
 
         Raises:
-            CaptureError: it cannot be decoded.
+            CaptureError: the frame cannot be decoded, or the video's metadata rotates it.
         """
         with self._lock:
             for cached in (self._last, self._kept):
@@ -132,10 +133,11 @@ class Video:
 
 
 class Videos:
-    """One video a camera, of one rate, begun at one moment. The shortest gives the number of frames.
+    """One video per camera, with a common frame rate and start time. The shortest video determines the number of
+    frames.
 
     Raises:
-        CaptureError: a camera without a video, or rates that differ.
+        CaptureError: the frame rates differ, or frames of two videos are more than half a frame apart.
     """
 
     def __init__(self, calibration: Calibration, files: Mapping[str, Path]) -> None:
@@ -171,27 +173,27 @@ class Videos:
             )
 
     def time(self, index: int) -> float | None:
-        """Seconds since the first frame."""
+        """Returns the seconds since the first frame."""
         return float(self._times[index])
 
     def path(self, camera: str) -> Path:
-        """The camera's video."""
+        """Returns the camera's video."""
         return self._videos[camera].path
 
     def file(self, index: int, camera: str) -> Path | None:
-        """None: a frame of a video has no file."""
+        """Returns None, because a video frame has no file of its own."""
         return None
 
     def decoded(self, index: int, camera: str) -> Picture:
-        """Decodes a picture, [H, W, 3]."""
+        """Decodes an image, [H, W, 3]."""
         return self._videos[camera].frame(index)
 
 
 def find_videos(folder: Path, calibration: Calibration) -> dict[str, Path]:
-    """Finds ``folder/<camera>.mp4`` (or another of `ENDS`) by camera.
+    """Returns the path of ``folder/<camera>.mp4`` (or another extension in `ENDS`) for each camera.
 
     Raises:
-        CaptureError: a camera has none, or two.
+        CaptureError: a camera has no video, or more than one.
     """
     there = sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDS)
     videos = {}

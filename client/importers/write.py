@@ -1,4 +1,4 @@
-"""Writes an imported capture in the layout of Dynamic3DGaussians, which every command reads without any extra."""
+"""Writes a capture in the Dynamic3DGaussians layout, which every command reads without optional packages."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from scas4d_core.captures import Capture, CaptureError
 OnProgress = Callable[[str, int, int], None]
 
 UNEVEN = 0.1
-"""Frames by which a time may be off an even rate: stamps of videos are rounded."""
+"""Largest deviation in frames from a constant frame rate; time stamps of videos are rounded."""
 
 
 def write_dynamic3dgs(
@@ -27,18 +27,18 @@ def write_dynamic3dgs(
     frames: int | None = None,
     on_progress: OnProgress | None = None,
 ) -> None:
-    """Writes a capture: pictures under `ims/`, masks under `seg/`, cameras in `train_meta.json` and `test_meta.json`.
+    """Writes a capture: images to `ims/`, masks to `seg/`, cameras to `train_meta.json` and `test_meta.json`.
 
-    The cameras' files come last: a folder that was not finished is no capture.
+    The camera files are written last, so an incomplete folder is not recognized as a capture.
 
     Args:
-        source: what is written; its test cameras go into `test_meta.json`.
-        out: folder, new or empty.
-        frames: how many; all where None.
-        on_progress: hears ("frames", done, total).
+        source: the capture; its test cameras are written to `test_meta.json`.
+        out: output folder, new or empty.
+        frames: number of frames; None for all.
+        on_progress: called with ("frames", done, total).
 
     Raises:
-        CaptureError: the folder is not empty.
+        CaptureError: the folder is not empty, or the frames are not evenly spaced in time.
 
     >>> from client.importers.open_source import open_source
     >>> write_dynamic3dgs(open_source(folder, test=("1",)), out, frames=2)
@@ -75,10 +75,10 @@ def write_dynamic3dgs(
 
 
 def _rate(source: Capture, count: int) -> float:
-    """Frames a second, which is all that the layout has of times.
+    """Returns the frames per second; the layout stores no individual times.
 
     Raises:
-        CaptureError: the frames are not a fixed time apart.
+        CaptureError: the frames are not evenly spaced in time.
     """
     times = np.array([source.time(index) for index in range(count)])
     if count < 2:
@@ -109,7 +109,9 @@ def _write_meta(
 
 
 def _one_or_all(sizes: list[int]) -> int | list[int]:
-    """The size that all cameras have, as the layout has it; else one each, which is this project's extension."""
+    """Returns one size if all cameras share it, as the layout defines, else a list per camera, an extension of this
+    project.
+    """
     return sizes[0] if len(set(sizes)) == 1 else sizes
 
 

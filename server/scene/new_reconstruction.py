@@ -63,7 +63,7 @@ class NewReconstruction:
 
         Raises:
             Problem: 409, another number is next, the reconstruction cannot start with the frame, the scene is archived,
-                or committed frames would be discarded without consent; 422, the rig's scale is unknown.
+                or committed frames would be discarded without consent; 422, depth cannot be determined.
         """
         if self._is_repeated(ledger):
             return None

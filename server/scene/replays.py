@@ -1,4 +1,4 @@
-"""Replays a scene's last frames with other budgets, one replay at a time; the results stay in memory."""
+"""Replays of a scene's newest frames with other budgets, one at a time; the results stay in memory."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from server.scene.status import effective_budget
 from server.storage.ledger import Ledger
 
 KEPT = 32
-"""Points that are kept: those measured last."""
+"""Maximum number of trade-off points kept; the oldest measurements are dropped."""
 
 log = logging.getLogger("scas4d.server")
 
@@ -25,12 +25,15 @@ class Replays:
     """Replays of one scene.
 
     Args:
-        spec, ledger, background: of the scene. placement: starts the process of a replay.
-        damaged: called with files that could not be read, by name with the reason.
+        spec: specification of the scene.
+        ledger: ledger of the scene.
+        placement: placement that starts the replay processes.
+        damaged: called with unreadable files, as a mapping from name to reason.
+        background: background tasks of the scene.
 
     Attributes:
-        status: of the replay that was asked for last. points: by iterations, as they were measured last; the
-            milliseconds of each lack the writing of a commit.
+        status: status of the newest replay.
+        points: latest measurement per number of iterations. The milliseconds exclude the time to write a commit.
     """
 
     def __init__(
@@ -53,14 +56,15 @@ class Replays:
 
     @property
     def busy(self) -> bool:
-        """True while a replay runs."""
+        """Whether a replay is running."""
         return self._process is not None
 
     def start(self, request: ReplayRequest) -> None:
-        """Starts a replay in a process of its own.
+        """Starts a replay in a separate process.
 
         Raises:
-            Problem: 409, one is running; or the frames, their pictures or the state before them are not here.
+            Problem: 409, a replay is already running, or the frames, their images or the preceding state are not
+                available.
         """
         id = self._ledger.scene
         if self._process is not None:
@@ -93,7 +97,7 @@ class Replays:
         )
 
     def _chosen(self, count: int) -> tuple[int, list[int]]:
-        """Returns the commit to start from, and the frames after it; the first of them warms up."""
+        """Returns the commit to start from and the frames after it, the first of which is the warm-up."""
         committed, frames = self._ledger.committed, self._ledger.frames
         if len(committed) < count + 2:
             raise Problem(
@@ -129,15 +133,16 @@ class Replays:
         return base, indices
 
     def _own_iterations(self) -> int:
-        """Returns the iterations that the scene runs: as its budget says, or as many as fitted into its time last.
+        """Returns the number of iterations that the scene currently runs per update.
 
-        A skipped or rejected frame says nothing about that.
+        This is the budgeted number, or, with a time budget, the number that fitted into it most recently. Degraded
+        frames are ignored.
         """
         budget = effective_budget(self._spec.settings, self._ledger.budgets[-1][1])
         if budget.budget_ms is not None:
             for index in reversed(self._ledger.committed[1:]):
                 report = self._ledger.frames[index].report
-                if report.iterations is None:  # older than the records in memory
+                if report.iterations is None:  # the commit record is no longer in memory
                     break
                 if report.iterations and report.degraded is None:
                     return report.iterations
@@ -146,7 +151,7 @@ class Replays:
     def _message(self, index: int) -> FrameReady:
         entry = self._ledger.frames[index]
         receipt = entry.receipt
-        assert receipt is not None  # it has files
+        assert receipt is not None  # always set for a frame with files
         return FrameReady(index, receipt.time, entry.files, receipt.identity)
 
     def _on_message(self, life: object, message: Any) -> None:
@@ -189,14 +194,14 @@ class Replays:
             self._background.run(process.stop(1.0))
 
     async def end(self) -> None:
-        """Ends the replay that is running, if one is; its points so far stay."""
+        """Stops the running replay on request, if any, and keeps the points measured so far."""
         if self._process is None:
             return
         await self.stop()
         self.status.state, self.status.error = ReplayState.FAILED, "it was ended on request"
 
     async def stop(self) -> None:
-        """Ends the replay that is running, because the scene ends."""
+        """Stops the running replay, if any, when the scene stops."""
         self._life = None
         process, self._process = self._process, None
         if process is not None:

@@ -1,4 +1,4 @@
-"""A scene: wires its log, ingest, updates and readers, and answers questions about it. On the event loop."""
+"""Scene: connects log, ingest, updates and readers, and answers queries. All methods run on the event loop."""
 
 from __future__ import annotations
 
@@ -42,25 +42,34 @@ log = logging.getLogger("scas4d.server")
 
 
 class Scene:
-    """One rig, one reconstruction.
+    """Reconstruction of one rig.
 
-    Frames are numbered from 0 without gaps; a frame is acknowledged, waits in a bounded queue, and ends committed, set
-    aside, missing or skipped. The ledger has all that is known of them; acknowledged changes are journalled first.
+    Frames are numbered from 0 without gaps. A frame is acknowledged, waits in a bounded queue, and is finally
+    committed, failed, missing or skipped. The ledger contains the state of all frames, and acknowledged changes are
+    journalled first.
 
-    The way of a frame: `Ingest.acknowledge` journals it, `Updates.begin` sends it to the worker, `Updates._commit`
-    records that it is committed, and `Publisher.publish_frame` publishes its report.
+    A frame passes through the following steps. `Ingest.acknowledge` journals it, `Updates.begin` sends it to the
+    worker, `Updates._commit` records the commit, and `Publisher.publish_frame` publishes its report.
 
     Args:
-        found: the content of its folder, of a new scene too.
-        server: settings of the service. placement: starts its processes. hub: publishes its events.
+        found: scene as stored in its folder, also for a new scene.
+        server: settings of the service.
+        placement: placement that starts the scene's processes.
+        hub: hub that publishes the scene's events.
 
     Attributes:
-        has_place: it has a place among the scenes that may have processes; else it is asleep. users: requests that are
-            being answered, and connections. used: when the last of them ended, `time.monotonic`.
-        log: journal, ledger and frame log. ingest: accepts whole frames. open_frames: accepts them camera by camera.
-        updates: gives frames to the worker. mending: of damaged files. readers: answer queries. replays: of its last
-            frames.
-        points_sha256: of the initial cloud. warnings: what looks wrong with the rig, a sentence each.
+        has_place: whether the scene has a slot and may have processes; otherwise, it is asleep.
+        users: number of active requests and connections.
+        used: end of the last request or connection, from `time.monotonic`.
+        log: journal, ledger and frame log.
+        ingest: ingest of complete frames.
+        open_frames: ingest of frames sent camera by camera.
+        updates: updates of the scene.
+        repair_queue: repair queue for damaged files.
+        readers: reader processes that answer queries.
+        replays: replays of the newest frames.
+        points_sha256: SHA-256 of the uploaded initial point cloud, or None.
+        warnings: warnings about the rig.
     """
 
     def __init__(
@@ -90,7 +99,7 @@ class Scene:
             request.nodes,
         )
 
-        # Events of the scene, and its log.
+        # Events and log of the scene.
         self._publisher = Publisher(hub, self.id)
         self._trouble = Trouble(self._publisher, last_trouble(self.ledger))
         self._background = Background(self._failed)
@@ -102,7 +111,7 @@ class Scene:
             self._trouble.report,
         )
 
-        # Updates. Readers report damaged files to `mending`, which asks the worker to write them again.
+        # Updates. Readers report damaged files to the repair queue, which asks the worker to rewrite them.
         worker = WorkerProcess(self.spec, placement)
         self.repair_queue = RepairQueue(
             self.log, self._damage, self._background, to_worker=worker.send, recompute=content.recompute
@@ -123,7 +132,7 @@ class Scene:
             first=found.first,
         )
 
-        # Frames that come in.
+        # Incoming frames.
         self.ingest = Ingest(self.log, self.rules, self.updates, self._publisher, can_begin=self._check_start)
         self.open_frames = OpenFrames(self.ingest, self._background)
         self.updates.on_queue_room(self.open_frames.close_due)
@@ -143,13 +152,13 @@ class Scene:
         self._background.run(scrub.run(), endless=True)
 
     def _check_start(self) -> None:
-        """Refuses to begin where distances are unknown: 422."""
+        """Raises Problem (422) if the scene cannot start because depth cannot be determined."""
         try:
             check_start(self.rig, self.points_sha256 is not None)
         except RigError as error:
             raise rig_problem(error) from None
 
-    # Questions.
+    # Queries.
 
     @property
     def frames(self) -> FrameTable:
@@ -158,12 +167,12 @@ class Scene:
 
     @property
     def committed(self) -> Sequence[int]:
-        """Frames whose state can be read, rising."""
+        """Indices of frames with a readable committed state, in ascending order."""
         return self.ledger.committed
 
     @property
     def next_frame(self) -> int:
-        """Index of the frame that is accepted next."""
+        """Index of the next frame to be accepted."""
         return self.ledger.next_frame
 
     @property
@@ -187,7 +196,7 @@ class Scene:
 
     @property
     def error(self) -> str | None:
-        """Sentence that says why the scene is failed or degraded, or None."""
+        """Reason why the scene has failed or is degraded, or None."""
         return self._facts.error
 
     @property
@@ -196,25 +205,25 @@ class Scene:
         return self._facts.state
 
     def status(self) -> SceneStatus:
-        """Describes the scene as it is now."""
+        """Returns the current status of the scene."""
         return self._facts.status()
 
     @property
     def idle(self) -> bool:
-        """True where nothing is under way that would be lost or delayed if its processes ended."""
+        """Whether stopping the scene's processes would neither lose nor delay any work."""
         closing = bool(self.ledger.open) and self.rules.open_frame_seconds is not None
         busy = self.updates.has_work or self.readers.busy or self.replays.busy or self._background.busy
         return not (self.users or closing or busy or self.log.lock.locked() or self._publisher.listeners)
 
     def camera(self, name: str) -> Camera:
-        """Returns a camera of the rig, as frame 0 refined it where that was asked for; see `camera_of`."""
+        """Returns a camera of the rig, with the refined calibration of frame 0 if enabled; see `camera_of`."""
         return camera_of(effective_rig(self.rig, self.updates.first), name)
 
     def committed_frame(self, index: int | None, field: str = "frame") -> int:
-        """Returns the index, or the last one for None, once it is checked that its state can be read.
+        """Checks that a frame's state is readable and returns its index; None selects the last committed frame.
 
         Raises:
-            Problem: 404 or 409, it cannot; 503, it is being made again.
+            Problem: 404 or 409, there is no readable state; 503, the state is being recomputed.
         """
         frames = self.ledger.frames
         if not frames.committed:
@@ -258,7 +267,7 @@ class Scene:
         return await self._reports.of(index)
 
     def budget(self) -> SceneBudget:
-        """Describes the budget of frames that are not begun."""
+        """Returns the budget of frames whose update has not started."""
         since, asked = self.ledger.budgets[-1]
         effective = effective_budget(self.spec.settings, asked)
         return SceneBudget(scene=self.id, requested=asked, effective=effective, since=since)
@@ -266,10 +275,12 @@ class Scene:
     # Changes.
 
     async def set_budget(self, budget: Budget) -> None:
-        """Sets the budget from the first frame on that is not begun; none begins while it is journalled.
+        """Sets the budget from the first frame on whose update has not started.
+
+        No update starts while the change is journalled.
 
         Raises:
-            Problem: 409 for a failed scene, 507 when the disk is full.
+            Problem: 409 for a failed scene; 507 if the disk is full.
         """
 
         async def change() -> None:
@@ -283,7 +294,7 @@ class Scene:
         await shield_and_wait(change())
 
     async def pause(self, paused: bool) -> None:
-        """Begins no frame after the one at work, or goes on; holds over a restart."""
+        """Pauses updates after the current frame, or resumes them; the setting survives a service restart."""
 
         async def change() -> None:
             async with self.log.lock:
@@ -294,10 +305,10 @@ class Scene:
         self.updates.begin()
 
     async def edit(self, edit: SceneEdit) -> None:
-        """Changes name, archive or retention; they hold over a restart.
+        """Changes the name, archive flag or retention rules; the changes survive a service restart.
 
         Raises:
-            Problem: 409, the scene is to be archived and frames of it wait; 507, the disk is full.
+            Problem: 409, the scene cannot be archived because frames are unfinished; 507, the disk is full.
         """
 
         async def change() -> None:
@@ -324,23 +335,23 @@ class Scene:
             )
 
     def start(self) -> None:
-        """Starts the processes before there is anything to do: a new scene is quick with its first frame and view."""
+        """Starts the processes in advance, so that the first frame and view of a new scene are not delayed."""
         self.updates.worker.start()
         self.readers.start()
 
     async def stop(self, seconds: float = STOP_SECONDS) -> None:
-        """Ends the processes of the scene; its folder stays. They have `seconds` to end by themselves."""
+        """Stops the scene's processes, which have `seconds` to exit by themselves; the folder is kept."""
         self.open_frames.stop()
         self.updates.stop()
         self._background.cancel()
         await asyncio.gather(self.updates.worker.stop(seconds), self.readers.stop(seconds), self.replays.stop())
-        self._background.cancel()  # what the last messages of the processes began
+        self._background.cancel()  # tasks started by the last messages of the processes
         await self.log.journal.close()
 
     # Events.
 
     def _all_events(self) -> Iterator[JournalEvent]:
-        """Snapshot for the journal; see `Journal`."""
+        """Returns all known events as a snapshot for `Journal`."""
         return chain((SceneCreated(definition=self._definition.as_json()),), events_of(self.ledger.copy()))
 
     def _journal_renewed(self, fault: str) -> None:

@@ -1,4 +1,4 @@
-"""All scenes of the service: creates, wakes, begins again and deletes them; no power cut leaves half a scene."""
+"""Registry of all scenes: creates, wakes, restarts and deletes them, safe against power failures at any point."""
 
 from __future__ import annotations
 
@@ -34,12 +34,13 @@ log = logging.getLogger("scas4d.server")
 
 
 class Scenes:
-    """All scenes of the service.
+    """Registry of all scenes of the service.
 
     Attributes:
-        by_id: scenes that are awake, or at least in memory. asleep: the others.
-        recovering: those that were found at the start.
-        unreadable: folders whose scene cannot be read, with the reason; they are left as they are.
+        awake: scenes that are in memory, with or without a slot for processes, by ID.
+        asleep: all other recovered scenes, by ID.
+        recovering: scenes found at startup that are not recovered yet.
+        unreadable: folders whose scene cannot be read, with the reason; they are left unchanged.
     """
 
     def __init__(self, server: ServerSettings, placement: Placement, hub: Hub) -> None:
@@ -53,17 +54,19 @@ class Scenes:
         self.recovering = StartupRecovery(self._data, self._restore)
         self._lock: FolderLock | None = None
         self._promised = 0
-        """Places that are given to scenes which are not in `by_id` yet."""
+        """Number of slots reserved for scenes that are not in `awake` yet."""
         self._beginning: dict[str, asyncio.Task[None]] = {}
-        """Scenes whose reconstruction is being begun anew."""
+        """Tasks of scenes whose reconstruction is being restarted, by scene ID."""
         self._turns = Transitions()
         self._tasks: set[asyncio.Task[None]] = set()
 
     async def open(self) -> None:
-        """Finds the scenes of the data folder; recovers them in the background, as a journal may be that of a day.
+        """Locks the data folder, finds its scenes and recovers them in the background.
+
+        Recovery runs in the background because a journal may cover a whole day.
 
         Raises:
-            RuntimeError: another service is at work in the data folder.
+            RuntimeError: another service is using the data folder.
         """
         for folder in (self._data.scenes, self._data.deleted):
             folder.mkdir(parents=True, exist_ok=True)
@@ -71,23 +74,23 @@ class Scenes:
         await self.recovering.begin()
         self._run(self._put_idle_to_sleep())
 
-    # Awake, asleep.
+    # Awake and sleeping scenes.
 
     def __len__(self) -> int:
-        """Number of scenes, awake or asleep."""
+        """Returns the number of scenes, awake or asleep."""
         return len(self.awake.keys() | self.asleep.keys())
 
     def __contains__(self, id: str) -> bool:
         return any(id in known for known in (self.awake, self.asleep, self.unreadable, self.recovering))
 
     def statuses(self) -> list[SceneStatus]:
-        """The status of every scene that is recovered, oldest first; none is woken."""
+        """Returns the status of every recovered scene, oldest first, without waking any."""
         entries = [(scene.created, scene.status) for id, scene in self.asleep.items() if id not in self.awake]
         entries += [(scene.created, scene.status()) for scene in self.awake.values()]
         return [status for _, status in sorted(entries, key=lambda one: one[0])]
 
     def status(self, id: str) -> SceneStatus:
-        """The status of a scene, which is not woken.
+        """Returns the status of a scene without waking it.
 
         Raises:
             Problem: see `refuse`.
@@ -98,13 +101,14 @@ class Scenes:
 
     @asynccontextmanager
     async def use(self, id: str, *, place: bool = True) -> AsyncIterator[Scene]:
-        """A scene for a request or a connection, woken where it is asleep; it does not fall asleep inside.
+        """Yields a scene for a request or a connection; wakes it if necessary and keeps it awake inside the context.
 
         Args:
-            place: give it a place among those that may have processes; without, what needs none is answered.
+            id: scene ID.
+            place: whether to give the scene a slot for processes; requests that need no processes pass False.
 
         Raises:
-            Problem: see `refuse`; 429, it needs a place and there is none.
+            Problem: see `refuse`; 429, the scene needs a slot and none is free.
         """
         scene = await self._awake(id, place)
         scene.users += 1
@@ -133,10 +137,10 @@ class Scenes:
         return self.server.max_scenes - sum(scene.has_place for scene in self.awake.values()) - self._promised
 
     async def _reserve_place(self) -> None:
-        """Promises a place to a scene; another one falls asleep for it where there is none.
+        """Reserves a slot for a scene and puts an idle scene to sleep if none is free.
 
         Raises:
-            Problem: 429, none is idle.
+            Problem: 429, no scene is idle.
         """
         while self._free_places <= 0:
             if falling := [id for id in self._turns if id in self.awake]:
@@ -146,7 +150,7 @@ class Scenes:
         self._promised += 1
 
     async def put_to_sleep(self, scene: Scene) -> None:
-        """Ends the processes of a scene that is idle still, and gives its place back; its folder has all that it is."""
+        """Stops the processes of a scene and releases its slot if it is still idle; its folder has all its data."""
         if self.awake.get(scene.id) is scene and scene.id not in self._turns and scene.idle:
             self._turns.begin(scene.id, self._fall_asleep(scene))
         await self._turns.end(scene.id)
@@ -156,7 +160,7 @@ class Scenes:
         try:
             await scene.stop()
             await asyncio.to_thread(write_status_cache, scene.spec.folder, status)
-        except Exception:  # its folder has all that it is
+        except Exception:  # the folder has all data of the scene
             log.exception("scene %s did not end as it should", scene.id)
         del self.awake[scene.id]
         log.info("scene %s sleeps", scene.id)
@@ -170,22 +174,24 @@ class Scenes:
         del self.asleep[id]
 
     async def _put_idle_to_sleep(self) -> None:
-        """Puts scenes to sleep that have been idle for long enough."""
+        """Periodically puts scenes to sleep that have been idle long enough."""
         while (seconds := sleep.check_interval(self.server)) is not None:
             await asyncio.sleep(seconds)
             for scene in sleep.idle_scenes(tuple(self.awake.values()), self.server):
                 try:
                     await self.put_to_sleep(scene)
-                except Exception:  # one that cannot fall asleep keeps no other awake
+                except Exception:  # a failure must not keep other scenes awake
                     log.exception("scene %s did not fall asleep", scene.id)
 
     async def _restore(self, folder: SceneFolder, said: Sequence[str] = (), *, wake: bool = False) -> bool:
-        """Reads a scene back from its folder; returns False, and notes why, where that cannot be done.
+        """Loads a scene from its folder; returns False and records the reason if it cannot be read.
 
-        One with work gets a place whether there is one or not; so does one that was used lately, if there is one.
+        A scene with pending work always gets a slot, even above the limit. A recently used scene gets one if available.
 
         Args:
-            folder: of the scene. said: of damage that was found before. wake: have it in memory in any case.
+            folder: folder of the scene.
+            said: messages about damage that was found earlier.
+            wake: whether to load the scene into memory in any case.
         """
         try:
             if (
@@ -206,7 +212,7 @@ class Scenes:
             else:
                 self._note_asleep(status := restored.facts(self.server.queue_frames).status())
                 await asyncio.to_thread(write_status_cache, folder, status)
-        except Exception as error:  # a fault of one scene is no fault of the others
+        except Exception as error:  # a faulty scene must not affect the others
             known = isinstance(error, DefinitionError | OSError)
             reason = message_of(error) if known else f"the service failed: {type(error).__name__}: {message_of(error)}"
             self.unreadable[folder.name] = reason
@@ -217,23 +223,23 @@ class Scenes:
                 log.warning("scene %s: %s", folder.name, sentence)
         return True
 
-    # Begun again.
+    # Restarted reconstructions.
 
     def check_current(self, scene: Scene) -> None:
-        """Refuses what was meant for a scene as it was before its reconstruction was begun anew.
+        """Refuses a request that arrived before the scene's reconstruction was restarted.
 
         Raises:
-            Problem: 503, to send it again.
+            Problem: 503, the request must be sent again.
         """
         if self[scene.id] is not scene:
             fault = "the reconstruction of this scene was begun anew while this request came"
             raise Problem(503, fault, field="id", value=scene.id, remedy="send the request again")
 
     async def begin_again(self, scene: Scene, beginning: NewReconstruction) -> SceneStatus:
-        """Begins the reconstruction of a scene anew; the same request again returns the scene as it is.
+        """Restarts the reconstruction of a scene and returns its status; a repeated request changes nothing.
 
-        The scene is stopped, the event journalled, and the scene recovered from its folder, as after a crash; until
-        then it answers 503. A refusal leaves it as it was.
+        The scene is stopped, the event is journalled, and the scene is recovered from its folder as after a crash.
+        Requests get 503 in the meantime. If the restart is refused, the scene is unchanged.
 
         Raises:
             Problem: see `NewReconstruction.event`; 507, the disk is full.
@@ -249,7 +255,7 @@ class Scenes:
 
     async def _begin_again(self, scene: Scene, beginning: NewReconstruction) -> None:
         self.hub.restart(scene.id)
-        async with scene.log.lock:  # points that are being written are whole, and later ones are refused
+        async with scene.log.lock:  # a write of points in progress completes, and later ones are refused
             pass
         await scene.stop(0)
         folder, said = self._data.scene(scene.id), scene.status().damage
@@ -263,16 +269,16 @@ class Scenes:
                 del self.awake[scene.id]
         self._run(asyncio.to_thread(self._data.remove_deleted))
 
-    # Created, deleted.
+    # Creation and deletion.
 
     async def create(self, request: SceneCreate, settings: Settings) -> Scene:
-        """Creates a scene and starts its processes; the scene is on disk when this returns.
+        """Creates a scene on disk and starts its processes.
 
         Raises:
-            Problem: 429, as many scenes are awake as may, or are here; 503, those found at the start are still being
-                recovered; 507, the disk is full.
+            Problem: 429, all slots are in use; 503, the scenes found at startup are still being recovered; 507, the
+                disk is full.
         """
-        self.recovering.check()  # they may need places
+        self.recovering.check()  # they may need slots
         await self._reserve_place()
         definition = Definition(secrets.token_hex(6), datetime.now(UTC), request, settings)
         folder = self._data.scene(definition.id)
@@ -292,10 +298,10 @@ class Scenes:
         return scene
 
     def __getitem__(self, id: str) -> Scene:
-        """Returns a scene that is awake.
+        """Returns an awake scene.
 
         Raises:
-            Problem: see `refuse`; 503, its reconstruction is being begun anew.
+            Problem: see `refuse`; 503, its reconstruction is being restarted.
         """
         if id in self._beginning:
             raise restarting_problem(id)
@@ -304,23 +310,23 @@ class Scenes:
         return self.awake[id]
 
     def refuse(self, id: str) -> NoReturn:
-        """Says why there is no such scene.
+        """Raises the Problem that explains why a scene does not exist.
 
         Raises:
-            Problem: 404, or 503 while scenes are still recovered.
+            Problem: 404, or 503 while scenes are still being recovered.
         """
         self.recovering.check(id)
         reason = f": {self.unreadable[id]}" if id in self.unreadable else ""
         raise Problem(404, f"no scene {id!r}{reason}", field="id", value=id, remedy="GET /v1/scenes lists the scenes")
 
     async def delete(self, id: str) -> None:
-        """Ends the scene's processes and removes its folder. The scene is gone once the folder is renamed.
+        """Stops the scene's processes and removes its folder; the deletion takes effect when the folder is renamed.
 
         Raises:
             Problem: see `refuse`.
         """
-        while id in self._turns:  # another task that waits for the same turn may begin one
-            with suppress(Problem):  # it cannot wake: no reason to keep it
+        while id in self._turns:  # another task that waits for the same transition may start a new one
+            with suppress(Problem):  # a scene that cannot be woken can still be deleted
                 await self._turns.end(id)
         folder = self._data.scene(id).path
         if id in self.asleep and id not in self._beginning:
@@ -340,7 +346,7 @@ class Scenes:
         return task
 
     async def stop(self) -> None:
-        """Ends all processes; the folders stay."""
+        """Stops all processes and keeps the scene folders."""
         await self.recovering.stop()
         await asyncio.gather(*self._turns.values(), return_exceptions=True)
         if self._beginning:

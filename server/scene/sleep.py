@@ -1,6 +1,7 @@
-"""Sleep: idle scenes give up their processes and their place, and are woken by the next request.
+"""Sleep of idle scenes, which release their processes and their slot until the next request wakes them.
 
-A scene that is asleep is its status in memory and its folder on disk. Waking reads the folder, as after a crash.
+A sleeping scene consists of its status in memory and its folder on disk. To wake it, the service reads the folder as
+after a crash.
 """
 
 from __future__ import annotations
@@ -20,17 +21,19 @@ from server.settings import ServerSettings
 from server.storage.layout import SceneFolder
 
 GRACE_S = 30.0
-"""A scene that was used so lately does not make room for another one: a rig may send a frame in a moment."""
+"""Seconds after its last use during which a scene keeps its slot, because its rig may be about to send a frame."""
 CHECK_S = 5.0
-"""Seconds between looks for scenes that have been idle for long enough; more often where they sleep sooner."""
+"""Maximum number of seconds between checks for idle scenes; checks are more frequent for short sleep timeouts."""
 
 
 @dataclass(frozen=True, slots=True)
 class SleepingScene:
-    """A scene that is asleep, as far as it is known without waking it.
+    """Sleeping scene with the information that is available without waking it.
 
     Attributes:
-        status: as it was when it fell asleep, or as it was found on disk.
+        id: scene ID.
+        created: time at which the scene was created.
+        status: status from when the scene fell asleep, or as found on disk.
     """
 
     id: str
@@ -39,43 +42,49 @@ class SleepingScene:
 
 
 class Transitions(dict[str, asyncio.Task[None]]):
-    """Scenes that are falling asleep or waking, by id: each is at one turn at a time."""
+    """Tasks of scenes that are falling asleep or waking, by scene ID, at most one per scene."""
 
     def begin(self, id: str, coroutine: Coroutine[Any, Any, None]) -> None:
-        """Begins a turn; the caller may leave meanwhile."""
+        """Starts a transition of a scene; it continues even if the caller is cancelled."""
 
         async def turn() -> None:
             try:
                 await coroutine
             finally:
-                del self[id]  # before the task is done: who waits for it looks again at once
+                del self[id]  # before the task is done, because waiting callers check again immediately
 
         self[id] = asyncio.create_task(turn())
 
     async def end(self, id: str) -> None:
-        """Waits for the end of a scene's turn, where it is at one; raises what that raises."""
+        """Waits for the end of a scene's transition, if any, and re-raises its exception."""
         if (task := self.get(id)) is not None:
             await asyncio.shield(task)
 
 
 def check_interval(settings: ServerSettings) -> float | None:
-    """Seconds between looks for scenes that may fall asleep; None: none ever does by itself."""
+    """Returns the seconds between checks for idle scenes, or None if scenes never fall asleep automatically."""
     return min(CHECK_S, settings.sleep_seconds / 2) or None
 
 
 def idle_scenes(scenes: Iterable[Scene], settings: ServerSettings) -> list[Scene]:
-    """Lists the scenes that have been idle for long enough; archived ones are at once."""
+    """Returns the scenes that have been idle long enough to fall asleep; the limit is shorter for archived scenes."""
     now = time.monotonic()
     return [scene for scene in scenes if now - scene.used >= _idle_limit(scene, settings.sleep_seconds) and scene.idle]
 
 
 def was_awake(used: float, settings: ServerSettings) -> bool:
-    """True for a scene that would be awake had the service not been away; `used`: seconds since the epoch."""
+    """Returns whether a scene would still be awake if the service had not been down.
+
+    `used` is the time of its last use in seconds since the epoch.
+    """
     return settings.sleep_seconds == 0 or time.time() - used < settings.sleep_seconds
 
 
 def status_if_still_asleep(folder: SceneFolder, settings: ServerSettings) -> SceneStatus | None:
-    """Returns the status on the card of a scene that would have slept on had the service not been away. Blocking."""
+    """Returns the cached status of a scene that would still be asleep if the service had not been down, or None.
+
+    Blocks.
+    """
     if folder.journal.exists() and was_awake(folder.journal.stat().st_mtime, settings):
         return None
     if (status := read_status_cache(folder)) is None:
@@ -88,10 +97,10 @@ def _idle_limit(scene: Scene, seconds: float) -> float:
 
 
 def scene_to_put_to_sleep(scenes: Iterable[Scene], settings: ServerSettings) -> Scene:
-    """Returns the scene that makes room for another one: of those that are idle, the one used least lately.
+    """Returns the least recently used idle scene, whose slot can be given to another scene.
 
     Raises:
-        Problem: 429, none is.
+        Problem: 429, no scene is idle.
     """
     here = [scene for scene in scenes if scene.has_place]
     grace = min(GRACE_S, settings.sleep_seconds)
@@ -111,6 +120,6 @@ def scene_to_put_to_sleep(scenes: Iterable[Scene], settings: ServerSettings) -> 
 
 
 def cannot_wake_problem(id: str, reason: str) -> Problem:
-    """Makes the answer, 503, for a scene whose folder cannot be read: it sleeps on, as the disk may be what fails."""
+    """Returns the 503 response for an unreadable scene, which stays asleep because the fault may be temporary."""
     remedy = "look after the scene's folder in the data folder, then ask again"
     return Problem(503, f"the scene cannot be read: {reason}", field="id", value=id, remedy=remedy)

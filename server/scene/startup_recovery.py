@@ -1,4 +1,4 @@
-"""Finds the scenes of the data folder when the service starts, and reads them back in the background."""
+"""Startup recovery: finds the scenes in the data folder and loads them in the background."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ from server.storage.layout import DataFolder, SceneFolder
 
 
 class StartupRecovery:
-    """The scenes that were found at the start, until they are recovered.
+    """Recovery of the scenes that were found at startup.
 
     Args:
-        data: folder of the service. read: reads a scene back, and raises nothing.
+        data: data folder of the service.
+        read: loads a scene from its folder; it must not raise.
     """
 
     def __init__(self, data: DataFolder, read: Callable[[SceneFolder], Awaitable[object]]) -> None:
@@ -27,26 +28,26 @@ class StartupRecovery:
         self._task: asyncio.Task[None] | None = None
 
     def __contains__(self, id: str) -> bool:
-        """Returns whether a scene was found, and is not recovered yet."""
+        """Returns whether a scene was found and is not recovered yet."""
         return id in self._left
 
     async def begin(self) -> None:
-        """Lists the scenes; a journal may be that of a day, so they are read in the background."""
+        """Lists the scenes and starts to load them in the background, because a journal may cover a whole day."""
         self._left = await asyncio.to_thread(self._folders)
         self._count = len(self._left)
         self._task = asyncio.create_task(self._run())
 
     async def stop(self) -> None:
-        """Ends it."""
+        """Cancels the recovery."""
         if self._task is not None:
             self._task.cancel()
             await asyncio.wait([self._task])
 
     def check(self, id: str | None = None) -> None:
-        """Checks that all scenes, or one of them, are recovered.
+        """Checks that one scene, or all scenes if `id` is None, are recovered.
 
         Raises:
-            Problem: 503, with the number of those that are.
+            Problem: 503 with the number of recovered scenes.
         """
         if id not in self._left and (id is not None or not self._left):
             return
@@ -67,7 +68,10 @@ class StartupRecovery:
         await asyncio.to_thread(self._data.remove_deleted)
 
     def _folders(self) -> list[str]:
-        """Lists the folders of scenes, newest journal first; moves those never acknowledged to the deleted ones."""
+        """Returns the names of the scene folders, newest journal first.
+
+        Folders of scenes that were never acknowledged are moved to the `deleted` folder.
+        """
         folders = []
         for path in sorted(path for path in self._data.scenes.iterdir() if path.is_dir()):
             folder = SceneFolder(path)

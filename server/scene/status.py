@@ -1,4 +1,4 @@
-"""Answers questions about a scene: its state, its budget, its cameras, its committed frames and their reports."""
+"""Status of a scene: its state, effective budget, effects and cameras."""
 
 from __future__ import annotations
 
@@ -44,13 +44,22 @@ def state_of(ledger: Ledger, *, at_work: bool, degraded: bool) -> SceneState:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneFacts:
-    """All that the status of a scene is made of.
+    """Data from which the status of a scene is computed.
 
     Attributes:
-        definition, ledger, pictures: of the scene. has_points: it has an initial cloud. queue_limit: in frames.
-        first: see `first_frame_facts`. damage, warnings: sentences; the warnings, about the rig.
-        trouble: why it is degraded, or None. at_work: a frame is. progress: of frame 0, while it is at work.
-        worker_deaths: since it was taken up. asleep: it has no place among those that may have processes.
+        definition: definition of the scene.
+        ledger: ledger of the scene.
+        pictures: index of the scene's frame log.
+        has_points: whether the scene has an initial point cloud.
+        queue_limit: maximum number of queued frames.
+        first: see `first_frame_facts`.
+        damage: damage messages.
+        warnings: warnings about the rig.
+        trouble: reason why the scene is degraded, or None.
+        at_work: whether a frame is being updated.
+        progress: progress of frame 0 during its reconstruction, otherwise None.
+        worker_deaths: number of worker crashes since the scene was loaded.
+        asleep: whether the scene has no slot and therefore no processes.
     """
 
     definition: Definition
@@ -69,7 +78,7 @@ class SceneFacts:
 
     @property
     def error(self) -> str | None:
-        """Sentence that says why the scene is failed or degraded, or None."""
+        """Reason why the scene has failed or is degraded, or None."""
         fatal = self.ledger.fatal
         return self.trouble if fatal is None else f"{fatal}; {restart_remedy(self.ledger)}"
 
@@ -79,7 +88,7 @@ class SceneFacts:
         return state_of(self.ledger, at_work=self.at_work, degraded=self.error is not None)
 
     def status(self) -> SceneStatus:
-        """Describes the scene."""
+        """Returns the API status of the scene."""
         ledger, request, settings = self.ledger, self.definition.request, self.definition.settings
         committed, counts = ledger.committed, ledger.counts
         entry = ledger.frames.get(committed[-1]) if committed else None
@@ -125,16 +134,17 @@ class SceneFacts:
 
 
 def effective_budget(settings: Settings, asked: Budget) -> EffectiveBudget:
-    """Fills the open fields of a budget from the settings of the scene."""
+    """Returns a budget with missing fields filled in from the scene's settings."""
     fields = {name: getattr(settings.update, name) if value is None else value for name, value in asked}
     return EffectiveBudget(**fields)
 
 
 def effects_of(settings: Settings, record: Mapping[str, Any] | None) -> dict[str, EffectStatus]:
-    """Describes the effects of a scene.
+    """Returns the status of each effect of a scene.
 
     Args:
-        record: of the newest commit; None, or one that says nothing of effects: as before the first frame.
+        settings: settings of the scene.
+        record: newest commit record. If it is None or lacks effects, the initial switches are used.
     """
     switches = decode_switches((record or {}).get("effects", {})) or first_switches(settings, 0)
     return {
@@ -147,7 +157,7 @@ def camera_of(rig: Rig, name: str) -> Camera:
     """Returns a camera of the rig by name.
 
     Raises:
-        Problem: 422, the rig has none of that name.
+        Problem: 422, the rig has no camera of that name.
     """
     if name not in rig.names:
         raise Problem(

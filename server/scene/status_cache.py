@@ -1,7 +1,6 @@
-"""The card of a sleeping scene: its status beside its folder's other files, so that a start need not read those.
+"""Status cache of a sleeping scene, stored in its folder so that startup need not read the other files.
 
-A card is worth no more than the time it saves: it is believed only while every name, size and time of change in the
-scene's folder is what it was, and ignored otherwise.
+The cache is used only if every name, size and modification time in the scene's folder is unchanged.
 """
 
 from __future__ import annotations
@@ -21,12 +20,13 @@ from server.storage.layout import EXPORT, SceneFolder
 
 
 def write_status_cache(folder: SceneFolder, status: SceneStatus) -> None:
-    """Writes the card of a scene that has fallen asleep, or was found asleep. Blocking; a full disk costs no more.
+    """Writes the status cache of a sleeping scene and ignores disk errors. Blocks.
 
-    A scene with damage gets none: each start looks again.
+    A scene with damage gets no cache, so that every startup checks it again.
 
     Args:
-        folder: of the scene. status: as reported while the scene sleeps.
+        folder: folder of the scene.
+        status: status that is reported while the scene sleeps.
     """
     if status.damage:
         return
@@ -39,7 +39,7 @@ def write_status_cache(folder: SceneFolder, status: SceneStatus) -> None:
 
 
 def read_status_cache(folder: SceneFolder) -> SceneStatus | None:
-    """Reads a scene's status from its card; None where there is none that can be believed. Blocking."""
+    """Returns a scene's status from its cache, or None if the cache is missing or invalid. Blocks."""
     try:
         data = json.loads(folder.status_cache.read_bytes())
         if blake3(data["card"].encode()).hexdigest() != data["blake3"]:
@@ -54,12 +54,15 @@ def read_status_cache(folder: SceneFolder) -> SceneStatus | None:
 
 
 def _of(folder: SceneFolder) -> dict[str, Any]:
-    """Version of the service, format of the folder, and its content: a card of another one is not believed."""
+    """Returns the service version, folder format and folder fingerprint, which must all match for a valid cache."""
     return {"version": __version__, "format": FORMAT, "content": _fingerprint(folder)}
 
 
 def _fingerprint(folder: SceneFolder) -> list[Any]:
-    """Names, sizes and times of change of what lies in the folder; those of a folder in it change with its names."""
+    """Returns name, size and modification time of each entry in the folder.
+
+    The modification time of a subfolder changes when files are added or removed in it.
+    """
     own = {folder.status_cache.name, folder.status_cache.with_suffix(".part").name, folder.worker_lock.name}
     with os.scandir(folder.path) as entries:
         others = [entry for entry in entries if entry.name not in own and not entry.name.startswith(f"{EXPORT}.")]

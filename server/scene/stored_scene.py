@@ -1,4 +1,4 @@
-"""Reads a scene back from its folder, or makes the folder of a new one; reports its status and whether it has work."""
+"""Scene as stored in its folder: creates a new folder, or loads a scene with its status and pending work."""
 
 from __future__ import annotations
 
@@ -26,12 +26,15 @@ from server.updates.trouble import last_trouble
 
 @dataclass(frozen=True)
 class StoredScene:
-    """A scene as it lies in its folder.
+    """Scene as stored in its folder.
 
     Attributes:
-        definition: with the settings of the reconstruction that was begun last. content: of its folder.
-        points_sha256: of the initial cloud, or None. warnings: what looks wrong with the rig, a sentence each.
-        first: see `first_frame_facts`. used: when its journal was last written, seconds since the epoch.
+        definition: definition with the settings of the latest reconstruction.
+        content: recovered content of the folder.
+        points_sha256: SHA-256 of the uploaded initial point cloud, or None.
+        warnings: warnings about the rig.
+        first: see `first_frame_facts`.
+        used: time of the last journal write, in seconds since the epoch.
     """
 
     definition: Definition
@@ -43,13 +46,16 @@ class StoredScene:
 
     @property
     def has_work(self) -> bool:
-        """True where something is to be done without anybody's asking."""
+        """Whether the scene has work that does not depend on a request."""
         ledger = self.content.ledger
         waits = ledger.unfinished > 0 and not ledger.paused and ledger.fatal is None
         return waits or bool(self.content.events or self.content.recompute or ledger.open)
 
     def facts(self, queue_limit: int) -> SceneFacts:
-        """Returns the facts for its status while it is asleep. `queue_limit`: of the service, in frames."""
+        """Returns the data for the status of the sleeping scene.
+
+        `queue_limit` is the service's default for the maximum number of queued frames.
+        """
         ledger = self.content.ledger
         return SceneFacts(
             definition=self.definition,
@@ -66,10 +72,10 @@ class StoredScene:
 
 
 async def create_folder(folder: SceneFolder, definition: Definition) -> StoredScene:
-    """Makes the folder of a new scene: its journal, and last the definition, which makes it a scene.
+    """Creates the folder of a new scene with its journal and, as the last step, its definition.
 
     Raises:
-        OSError: the disk does not do; what was made is to be removed.
+        OSError: a disk operation failed; the caller must remove the folder.
     """
     folder.frames.mkdir(parents=True)
     journal = Journal(folder.journal)
@@ -87,14 +93,16 @@ async def create_folder(folder: SceneFolder, definition: Definition) -> StoredSc
 def read_stored_scene(
     folder: SceneFolder, bury: Callable[[Path, str], object], said: Sequence[str] = ()
 ) -> StoredScene:
-    """Reads a scene back from its folder. Blocking.
+    """Loads a scene from its folder. Blocks.
 
     Args:
-        folder: of the scene. said: of damage that was found before.
-        bury: moves a file or folder that no reconstruction uses any more to the deleted ones, under a name.
+        folder: folder of the scene.
+        bury: moves a file or folder that is no longer used to the `deleted` folder under a given name.
+        said: messages about damage that was found earlier.
 
     Raises:
-        DefinitionError: the folder holds no scene that can be read. OSError: the disk does not do.
+        DefinitionError: the folder does not contain a readable scene.
+        OSError: a disk operation failed.
     """
     used = folder.journal.stat().st_mtime if folder.journal.exists() else 0.0
     definition, damage = read_definition(folder)
@@ -109,11 +117,11 @@ def read_stored_scene(
     if (now := definition.with_reconstruction(begun)) is not definition:
         try:
             write_definition(folder, now)
-        except OSError as error:  # the journal has it, and the next start writes it
+        except OSError as error:  # the journal has the event, and the next load writes the file
             if not no_room(error):
                 raise
     for path in folder.leftovers(begun):
-        with contextlib.suppress(FileNotFoundError):  # states of a worker before: they are swept a minute after it
+        with contextlib.suppress(FileNotFoundError):  # concurrently removed states of an earlier worker
             bury(path, f"{folder.name}-{path.name}")
     rig, settings, positions = now.request.rig.rig(), now.settings, points_positions(folder.points)
     return StoredScene(

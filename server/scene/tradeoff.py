@@ -1,4 +1,4 @@
-"""Accuracy against time, computed from the reports of a scene's newest frames and from its replays."""
+"""Trade-off between accuracy and time, computed from a scene's newest frame reports and its replays."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ from client.wire import CurveMean, FrameReportModel, FrameState, PointKind, Time
 from scas4d_core.frame_outcome import OTHER_ORDERS
 
 NEWEST = 64
-"""Frames whose reports are used: the newest."""
+"""Number of newest frames whose reports are used."""
 LADDER = (10, 25, 50, 100, 200, 300, 500)
-"""Iterations that are extrapolated where they were not measured."""
+"""Numbers of iterations that are extrapolated if they were not measured."""
 NEAR = 0.1
-"""Iterations that differ by no more than this share are not extrapolated beside measured ones."""
+"""Relative difference to a measured number of iterations up to which no point is extrapolated."""
 
 
 def usable_reports(reports: Iterable[FrameReportModel], first: int) -> list[FrameReportModel]:
-    """Selects the updates that measure their iterations: committed whole at the first attempt, and not frame 0.
+    """Returns the reports of updates that are valid time measurements.
 
-    Nor the first update, which ran several times.
+    These were fully committed at the first attempt. The first frame is excluded, and so is the first update, which ran
+    several times.
     """
     return [
         report
@@ -38,13 +39,13 @@ def usable_reports(reports: Iterable[FrameReportModel], first: int) -> list[Fram
 
 
 def commit_milliseconds(reports: Iterable[FrameReportModel]) -> float:
-    """Returns the median milliseconds of writing a commit; 0 where it is not known."""
+    """Returns the median time to write a commit in milliseconds, or 0 if unknown."""
     known = [report.write_seconds for report in reports if report.write_seconds is not None]
     return 1000 * median(known) if known else 0.0
 
 
 def measured_points(reports: Sequence[FrameReportModel]) -> list[TradeoffPoint]:
-    """Makes a point for each number of iterations that frames ran, to two digits, and of threads."""
+    """Returns one point per number of iterations, rounded to two significant digits, and number of threads."""
     write = commit_milliseconds(reports)
     points = []
     for (iterations, threads), group in _groups(reports, lambda report: (_rounded(report.iterations), report.threads)):
@@ -64,7 +65,7 @@ def measured_points(reports: Sequence[FrameReportModel]) -> list[TradeoffPoint]:
 
 
 def mean_curves(reports: Sequence[FrameReportModel]) -> list[CurveMean]:
-    """Averages the curves of updates that had the same number of iterations."""
+    """Returns the mean loss curve of updates with the same number of iterations."""
     steps = [
         (_rounded(report.iterations), _rounded(point.iterations), point)
         for report in reports
@@ -84,7 +85,10 @@ def mean_curves(reports: Sequence[FrameReportModel]) -> list[CurveMean]:
 
 
 def time_model(reports: Sequence[FrameReportModel]) -> TimeModel | None:
-    """Fits a time linear in the iterations: the slope from within the updates, the rest is fixed."""
+    """Fits a time model that is linear in the iterations, or returns None without loss curves.
+
+    The slope comes from the times within each update; the remaining time is the fixed part.
+    """
     slopes = []
     for report in reports:
         if len(report.curve) > 1:
@@ -102,7 +106,7 @@ def time_model(reports: Sequence[FrameReportModel]) -> TimeModel | None:
 def extrapolated_points(
     model: TimeModel | None, known: Sequence[TradeoffPoint], threads: int | None
 ) -> list[TradeoffPoint]:
-    """Makes points for iterations not measured on as many threads: the model's time, and no accuracy."""
+    """Returns points for iterations not measured with this number of threads, with times but no accuracy."""
     if model is None:
         return []
     there = [point.iterations for point in known if point.threads == threads]
@@ -131,7 +135,7 @@ def _groups(items: Sequence[Any], key: Any) -> list[tuple[Any, list[Any]]]:
 
 
 def _rounded(iterations: int | None) -> int:
-    """Rounds to two significant digits: a budget of milliseconds gives a frame 97 iterations and the next 98."""
+    """Rounds to two significant digits, because the number of iterations varies slightly under a time budget."""
     if not iterations:
         return 0
     return round(iterations, min(0, 1 - floor(log10(iterations))))

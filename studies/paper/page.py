@@ -41,7 +41,7 @@ def write_paper_page(
     there = [name for name in captures if any(point.capture == name for point in points)]
     outcomes = {experiment.title: compare(experiment, ours) for experiment in EXPERIMENTS}
     sections = "\n\n".join(
-        section(experiment, outcomes[experiment.title], ours, captures, ratio) for experiment in EXPERIMENTS
+        section(experiment, ours, captures, ratio) for experiment in EXPERIMENTS if experiment.score != "ssim"
     )
     text = f"""# The paper's tables
 
@@ -63,7 +63,7 @@ The gain is the first setting's mean less the second's, over the captures of bot
 are within a factor of {FACTOR:g}; gains that are small on both sides
 ({", ".join(f"{name} {value:g}" for name, value in SMALL.items() if name in DIGITS)}) agree as well, and a small gain
 does not agree with one that is not. If the paper shows only a picture, the claim is the sign. The last column
-counts the captures whose own gain has the sign of the claim.
+counts the captures whose own gain has the sign of the claim. SSIM is in this table only.
 
 {sections}
 
@@ -80,12 +80,11 @@ counts the captures whose own gain has the sign of the claim.
 
 def section(
     experiment: Experiment,
-    outcomes: Sequence[ClaimResult],
     ours: Measured,
     captures: Sequence[str],
     ratio: float | None,
 ) -> str:
-    """An experiment as Markdown: table, outcome, note."""
+    """An experiment as Markdown: table and note."""
     names = [name for name in SCENES if name in captures]
     digits = DIGITS[experiment.score]
     unit = f" {experiment.unit}" if experiment.unit else ""
@@ -108,7 +107,7 @@ def section(
 
 
 def summary(outcomes: Sequence[ClaimResult], by_title: Mapping[str, Sequence[ClaimResult]]) -> str:
-    """Counts, and a line for each claim that does not agree."""
+    """Counts, and a table of all claims."""
     known = [outcome for outcome in outcomes if outcome.agrees != "not measured"]
     counts = {word: sum(o.agrees == word for o in known) for word in ("sign and size", "sign", "no")}
     lines = [

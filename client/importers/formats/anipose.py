@@ -1,9 +1,9 @@
-"""Reads anipose's `calibration.toml` (aniposelib), and Pose2Sim's and FreeMoCap's files, which have the same fields.
+"""Reads anipose's `calibration.toml` (aniposelib), and the files of Pose2Sim and FreeMoCap, which have the same fields.
 
-A table a camera: `name`, `size` (width, height), `matrix` [3][3], `distortions` [5] or [4], `rotation` [3] (Rodrigues'
-vector) and `translation` [3], world to camera; `fisheye = true` for coefficients of `cv2.fisheye`. `[metadata]` says
-nothing of the rig. Anipose starts from (width − 1)/2 as the principal point: OpenCV's pixels.
-(github.com/lambdaloop/aniposelib, `aniposelib/cameras.py`; github.com/perfanalytics/pose2sim,
+Each camera has a table with `name`, `size` (width, height), `matrix` [3][3], `distortions` [5] or [4], `rotation` [3]
+(Rodrigues vector) and `translation` [3], world to camera; `fisheye = true` marks coefficients of `cv2.fisheye`.
+`[metadata]` does not describe the rig. Anipose initializes the principal point to (width − 1)/2, which implies OpenCV's
+pixel coordinates. (github.com/lambdaloop/aniposelib, `aniposelib/cameras.py`; github.com/perfanalytics/pose2sim,
 `Pose2Sim/calibration.py`.)
 """
 
@@ -19,19 +19,19 @@ from client.importers.formats.opencv_camera import opencv_camera, picture_size
 from scas4d_core.captures import CaptureError
 
 INTRINSICS_FOLDER = re.compile(r"int_(.+)_img")
-"""Pose2Sim names a camera by the folder of its calibration pictures; its videos are called by what is within."""
+"""Folder name from which Pose2Sim names a camera; the group is the name of the camera's videos."""
 
 
 def is_anipose(document: Mapping[str, Any]) -> bool:
-    """True where a table of the file has a camera's matrix and pose."""
+    """Returns whether a table of the file has a camera matrix and a pose."""
     return any(isinstance(table, Mapping) and {"matrix", "rotation"} <= table.keys() for table in document.values())
 
 
 def read_anipose(path: Path, document: Mapping[str, Any]) -> Calibration:
-    """Reads the rig of a parsed file.
+    """Reads the rig from a parsed file.
 
     Raises:
-        CaptureError: a field is missing or cannot be; the message names file, camera, field and remedy.
+        CaptureError: a field is missing or invalid; the message names file, camera, field and remedy.
     """
     cameras = []
     for key, table in document.items():

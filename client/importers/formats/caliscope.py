@@ -1,10 +1,11 @@
 """Reads caliscope's `camera_array.toml`.
 
-A table `[cameras.<id>]` a camera: `size` (width, height), `matrix`, `distortions` (5, of a `fisheye` 4), `rotation` as
-a matrix [3][3] or Rodrigues' vector [3], and `translation`, world to camera. Its videos are `cam_<id>.mp4`, those of
-earlier versions, which wrote `port` for `cam_id`, `port_<id>.mp4`; the camera has that name. `rotation_count` turns
-pictures for its trackers only, not for the calibration. Cameras that are marked as ignored, or that have no pose, are
-left out, with a remark. (github.com/mprib/caliscope, `src/caliscope/cameras/camera_array.py`.)
+Each camera has a table `[cameras.<id>]` with `size` (width, height), `matrix`, `distortions` (5, or 4 if `fisheye`),
+`rotation` as a matrix [3][3] or Rodrigues vector [3], and `translation`, world to camera. A camera is named after its
+video, `cam_<id>.mp4`, or `port_<id>.mp4` in earlier versions, which wrote `port` instead of `cam_id`.
+`rotation_count` rotates images only for caliscope's trackers, not for the calibration, so it is not used. Cameras that
+are marked as ignored or have no pose are left out, with a remark.
+(github.com/mprib/caliscope, `src/caliscope/cameras/camera_array.py`.)
 """
 
 from __future__ import annotations
@@ -19,15 +20,15 @@ from scas4d_core.captures import CaptureError
 
 
 def is_caliscope(document: Mapping[str, Any]) -> bool:
-    """True where the file has a table of cameras."""
+    """Returns whether the file has a table of cameras."""
     return isinstance(document.get("cameras"), Mapping)
 
 
 def read_caliscope(path: Path, document: Mapping[str, Any]) -> Calibration:
-    """Reads the rig of a parsed file.
+    """Reads the rig from a parsed file.
 
     Raises:
-        CaptureError: a field is missing or cannot be; the message names file, camera, field and remedy.
+        CaptureError: a field is missing or invalid; the message names file, camera, field and remedy.
     """
     cameras, left_out = [], []
     for key, table in document["cameras"].items():
@@ -55,5 +56,5 @@ def read_caliscope(path: Path, document: Mapping[str, Any]) -> Calibration:
 
 
 def _calibrated(table: Mapping[str, Any]) -> bool:
-    """True where intrinsics and a pose are there; rtoml wrote the text "null" for none."""
+    """Returns whether the camera has intrinsics and a pose; rtoml wrote missing values as the text "null"."""
     return all(isinstance(table.get(field), list) for field in ("matrix", "rotation", "translation"))

@@ -1,7 +1,8 @@
-"""Reads COLMAP models, text or binary: `cameras`, `images` and, where there is one, `points3D`. Numpy only.
+"""Reads COLMAP models, text or binary: `cameras`, `images` and, if present, `points3D`. Needs only numpy.
 
-Poses are world to camera with OpenCV axes, as quaternion (w, x, y, z) and translation; principal points count from the
-upper left corner of the picture: both as here. (colmap.github.io/format.html; `src/colmap/scene/reconstruction_io.cc`.)
+Poses are world to camera with OpenCV axes, as a quaternion (w, x, y, z) and a translation. Principal points are
+relative to the upper left corner of the image. Both conventions match this project's.
+(colmap.github.io/format.html; `src/colmap/scene/reconstruction_io.cc`.)
 """
 
 from __future__ import annotations
@@ -55,15 +56,16 @@ class _Image:
 
 
 def is_model(folder: Path) -> bool:
-    """True where the files of a model lie in the folder."""
+    """Returns whether the folder contains a COLMAP model."""
     return any((folder / f"cameras{end}").is_file() for end in (".bin", ".txt"))
 
 
 def read_colmap(folder: Path) -> Calibration:
-    """Reads the rig of a model, and its cloud.
+    """Reads the rig and the point cloud of a model.
 
     Raises:
-        CaptureError: a file is missing or broken, or a camera cannot be; the message names the file and the fault.
+        CaptureError: a file is missing or malformed, or a camera is invalid; the message names the file and the
+            problem.
     """
     end = ".bin" if (folder / "cameras.bin").is_file() else ".txt"
     files = {name: folder / f"{name}{end}" for name in ("cameras", "images", "points3D")}
@@ -127,7 +129,7 @@ def _cloud(rows: list[tuple[float, ...]]) -> InitialPoints | None:
     return InitialPoints(array[:, :3], np.clip(array[:, 3:] / 255, 0, 1).astype(np.float32))
 
 
-# Text.
+# Text format.
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -141,7 +143,10 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _fields(path: Path, number: int, line: str, kinds: str, what: str) -> list[Any]:
-    """Reads the words of a line: `i` whole number, `f` number, `s` text; the last kind holds for all that follow."""
+    """Parses the fields of a line.
+
+    `kinds` has one letter per field: `i` integer, `f` float, `s` text. The last letter applies to all remaining fields.
+    """
     words = line.split(maxsplit=len(kinds) - 1 if kinds.endswith("s") else -1)
     if len(words) < len(kinds):
         raise CaptureError(f"{path}: line {number} has {len(words)} fields; needed: {what}")
@@ -165,7 +170,7 @@ def _text_cameras(path: Path) -> dict[int, _Camera]:
 
 
 def _text_images(path: Path) -> Iterator[_Image]:
-    # Every second line lists the picture's points, and may be empty.
+    # Every second line lists the image's points, and may be empty.
     is_image = True
     for number, line in _lines(path):
         if is_image and not line:
@@ -182,11 +187,11 @@ def _text_points(path: Path) -> Iterator[tuple[float, ...]]:
             yield tuple(_fields(path, number, line, "ifffffff", "id x y z r g b error …")[1:7])
 
 
-# Binary, little-endian.
+# Binary format, little-endian.
 
 
 class _Bytes:
-    """A binary file read piece by piece; its errors name the place where it ends too early."""
+    """Sequential reader of a binary file whose errors say where the file ends prematurely."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -226,7 +231,7 @@ def _binary_cameras(path: Path) -> dict[int, _Camera]:
         what = f"camera {number + 1} of {count}"
         id, model, width, height = file.take("iiQQ", what)
         name = MODEL_IDS.get(model)
-        if name not in MODELS:  # how many parameters follow is known only of models that are read
+        if name not in MODELS:  # the parameter count is known only for supported models
             raise CaptureError(
                 f"{path}: camera {id} has the model {name or f'number {model}'}, which is not read; calibrate with one "
                 f"of {', '.join(MODELS)}"

@@ -1,8 +1,8 @@
-"""Reads EasyMocap's `intri.yml` and `extri.yml`, files of OpenCV's FileStorage; `scas4d[importers]` has OpenCV.
+"""Reads EasyMocap's `intri.yml` and `extri.yml`, which are OpenCV FileStorage files; `scas4d[importers]` has OpenCV.
 
-`names` lists the cameras. `intri.yml` has by camera `K_<name>` [3, 3] and `dist_<name>` (or `D_<name>`), and in some
-versions `H_<name>`, `W_<name>`; without these the size is that of the camera's pictures. `extri.yml` has `Rot_<name>`
-[3, 3], or only `R_<name>` [3] (Rodrigues' vector), and `T_<name>` [3], world to camera. A camera without a pose is left
+`names` lists the cameras. Per camera, `intri.yml` has `K_<name>` [3, 3], `dist_<name>` (or `D_<name>`) and, in some
+versions, `H_<name>` and `W_<name>`; without them, the size is that of the camera's images. `extri.yml` has `Rot_<name>`
+[3, 3], or only `R_<name>` [3] (Rodrigues vector), and `T_<name>` [3], world to camera. A camera without a pose is left
 out, with a remark.
 (github.com/zju3dv/EasyMocap, `easymocap/mytools/camera_utils.py`.)
 """
@@ -22,23 +22,24 @@ from scas4d_core.captures import CaptureError
 
 INTRINSICS, EXTRINSICS = "intri.yml", "extri.yml"
 APART = 1e-3
-"""Largest entry by which a rotation and its vector may differ: EasyMocap writes six digits."""
+"""Largest entry-wise difference between a rotation matrix and its Rodrigues vector; EasyMocap writes six digits."""
 
 
 def is_easymocap(folder: Path) -> bool:
-    """True where both files lie in the folder."""
+    """Returns whether the folder contains both files."""
     return all((folder / name).is_file() for name in (INTRINSICS, EXTRINSICS))
 
 
 def read_easymocap(folder: Path, capture: Path) -> Calibration:
-    """Reads the rig of a folder.
+    """Reads the rig from a folder.
 
     Args:
-        folder: of the two files. capture: folder with `images/` or `videos/`, for the pictures' sizes.
+        folder: folder of the two files.
+        capture: folder with `images/` or `videos/`, from which missing image sizes are read.
 
     Raises:
-        CaptureError: a file or field is missing or cannot be; the message names it and the remedy.
-        MissingExtraError: OpenCV is not there.
+        CaptureError: a file or field is missing or invalid; the message names it and the remedy.
+        MissingExtraError: OpenCV is not installed.
     """
     for name in (INTRINSICS, EXTRINSICS):
         if not (folder / name).is_file():

@@ -1,6 +1,6 @@
-"""Reads OpenCV's FileStorage, YAML or XML, with OpenCV: no other library reads its `%YAML:1.0` and `!!opencv-matrix`.
+"""Reads OpenCV's FileStorage format, YAML or XML, and the sizes of images that such files often omit.
 
-Beside it, the size of a camera's pictures, which such files often lack.
+This needs OpenCV, because no other library parses its `%YAML:1.0` header and `!!opencv-matrix` tags.
 """
 
 from __future__ import annotations
@@ -24,15 +24,17 @@ LEVELS = np.zeros(256, np.int8)
 LEVELS[[ord("["), ord("{")]], LEVELS[[ord("]"), ord("}")]] = 1, -1
 DASHES = re.compile(rb" *(?:- )+")
 DEEPEST = 32
-"""Levels of nesting: OpenCV reads each by calling itself, and dies of some ten thousand."""
+"""Maximum nesting depth. OpenCV parses recursively and crashes at some ten thousand levels."""
 
 
 def read_storage(path: Path) -> dict[str, Any]:
-    """The top of a file by name: matrices as arrays [rows, cols], lists, numbers and texts; anything else as None.
+    """Returns the top-level fields of a file by name.
+
+    Values are matrices as arrays [rows, cols], lists, numbers and strings; anything else is None.
 
     Raises:
-        CaptureError: it cannot be read.
-        MissingExtraError: OpenCV is not there.
+        CaptureError: the file cannot be read.
+        MissingExtraError: OpenCV is not installed.
     """
     cv2 = load("cv2", needed="reading OpenCV's YAML and XML files")
     try:
@@ -51,11 +53,11 @@ def read_storage(path: Path) -> dict[str, Any]:
 
 
 def _depth(data: bytes) -> int:
-    """Levels of brackets, of indentation (YAML) or of tags (XML), whichever are most."""
+    """Returns the nesting depth of brackets, indentation (YAML) or tags (XML), whichever is largest."""
     brackets = np.cumsum(LEVELS[np.frombuffer(data, np.uint8)], dtype=np.int64)
     tags = np.cumsum([-1 if tag.startswith(b"</") else 1 for tag in TAG.findall(data)])
     lines = [line for line in data.splitlines() if line.strip()]
-    if len(tags):  # XML may be indented at will
+    if len(tags):  # indentation has no meaning in XML
         return int(max(brackets.max(), tags.max()))
     dashes = max((len(match[0]) // 2 for match in map(DASHES.match, lines) if match), default=0)
     return int(max(brackets.max(initial=0), len({len(line) - len(line.lstrip()) for line in lines}), dashes))
@@ -69,24 +71,26 @@ def _value(node: Any) -> Any:
     if node.isSeq():
         return [_value(node.at(i)) for i in range(node.size())]
     if node.isMap():
-        return node.mat()  # None where the map is no matrix
+        return node.mat()  # None if the map is not a matrix
     return None
 
 
 def first_field(stored: Mapping[str, Any], names: tuple[str, ...]) -> Any:
-    """The first field of these names that is there; None where there is none."""
+    """Returns the first of the named fields that has a value, or None."""
     return next((stored[name] for name in names if stored.get(name) is not None), None)
 
 
 def size_of_pictures(folder: Path, camera: str, where: str) -> tuple[int, int]:
-    """(width, height) of the first picture in ``images/<camera>/``, or of ``videos/<camera>.mp4``.
+    """Returns (width, height) of the first image in ``images/<camera>/``, or of ``videos/<camera>.mp4``.
 
     Args:
-        folder: of the capture. where: the place in the calibration that names no size, for messages.
+        folder: folder of the capture.
+        camera: name of the camera.
+        where: position in the calibration that lacks the size, for messages.
 
     Raises:
-        CaptureError: there is neither, or it cannot be read.
-        MissingExtraError: a video has to be read and PyAV is not there.
+        CaptureError: there is neither an image nor a video, or it cannot be read.
+        MissingExtraError: a video must be read and PyAV is not installed.
     """
     images = folder / "images" / camera
     if images.is_dir():

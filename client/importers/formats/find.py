@@ -1,4 +1,4 @@
-"""Finds the calibrations of laboratory tools in a folder, and reads one, whichever tool wrote it."""
+"""Finds calibrations of supported tools in a folder, and reads them with the matching reader."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from client.importers.formats.qualisys import read_qualisys
 from scas4d_core.captures import CaptureError
 
 FOLDERS = (".", "calibration")
-"""Where they are looked for in a capture."""
+"""Subfolders of a capture that are searched for calibrations."""
 CALISCOPE = "camera_array.toml"
 READ = (
     f"caliscope's {CALISCOPE}, anipose's calibration.toml, FreeMoCap's *_calibration.toml, Pose2Sim's Calib*.toml, "
@@ -25,7 +25,7 @@ READ = (
 
 
 def find_calibrations(capture: Path) -> list[Path]:
-    """The calibrations in a capture's folder: a file each, or the folder of several that belong together."""
+    """Returns the calibrations in a capture's folder: files, or folders whose files form one calibration."""
     return [path for name in FOLDERS for path in _calibrations_in(capture / name)]
 
 
@@ -43,27 +43,28 @@ def _calibrations_in(folder: Path) -> list[Path]:
 
 
 def _is_toml(path: Path) -> bool:
-    """True for calibration.toml, Calib*.toml, and FreeMoCap's <recording>_camera_calibration.toml."""
+    """Returns whether the name is calibration.toml, Calib*.toml, or FreeMoCap's <recording>_camera_calibration.toml."""
     name = path.name.lower()
     return name.endswith("_calibration.toml") or (name.startswith("calib") and name.endswith(".toml"))
 
 
 def is_calibration(path: Path) -> bool:
-    """True where `read_calibration_file` knows the kind of a file or folder by its name."""
+    """Returns whether `read_calibration_file` supports a file or folder, judging by its name."""
     if path.is_dir():
         return bool(_calibrations_in(path))
     return path.is_file() and (path.suffix.lower() in (".toml", *ENDS) or path.name.lower().endswith(QUALISYS))
 
 
 def read_calibration_file(path: Path, capture: Path) -> Calibration:
-    """Reads a calibration.
+    """Reads a calibration file, or the only calibration in a folder.
 
     Args:
-        path: a file, or a folder with one calibration. capture: folder of the pictures, for sizes that files lack.
+        path: a file, or a folder with one calibration.
+        capture: folder of the images, from which image sizes missing in the file are read.
 
     Raises:
-        CaptureError: of no known kind, several in the folder, or it cannot be read.
-        MissingExtraError: it needs a package of the extra `importers`.
+        CaptureError: the format is unknown, the folder has several calibrations, or the file cannot be read.
+        MissingExtraError: the format needs a package from the extra `importers`.
     """
     if path.is_dir():
         here = _calibrations_in(path)
@@ -80,7 +81,7 @@ def read_calibration_file(path: Path, capture: Path) -> Calibration:
 
 
 def single_calibration(found: list[Path], folder: Path) -> Path:
-    """The one calibration that was found.
+    """Returns the only calibration found.
 
     Raises:
         CaptureError: there are several, or none.
@@ -99,7 +100,7 @@ def _read_toml(path: Path) -> Calibration:
     try:
         with path.open("rb") as file:
             document: dict[str, Any] = tomllib.load(file)
-    except (OSError, ValueError, RecursionError) as fault:  # broken, no UTF-8, or nested without end
+    except (OSError, ValueError, RecursionError) as fault:  # malformed, not UTF-8, or nested too deeply
         raise CaptureError(f"{path}: cannot be read as TOML ({fault})") from fault
     if is_caliscope(document):
         return read_caliscope(path, document)

@@ -1,10 +1,10 @@
-"""Reads nerfstudio's `transforms.json` (also instant-ngp's). Numpy only.
+"""Reads nerfstudio's `transforms.json`, also written by instant-ngp. Needs only numpy.
 
-Per picture: `file_path`, `transform_matrix` (camera to world, OpenGL axes: x right, y up, z back), and optionally
-`time`. The intrinsics `camera_model`, `w`, `h`, `fl_x`, `fl_y` (or `camera_angle_x`, radians), `cx`, `cy`, `k1` … stand
-at the top or with a picture, which wins. `applied_transform` (3×4, of the world) and `applied_scale` are undone, so
-that the rig stands in the world that was calibrated. `mask_path` says what to ignore, not what the foreground is, and
-`ply_file_path` is a cloud: neither is read.
+Each image has `file_path`, `transform_matrix` (camera to world, OpenGL axes: x right, y up, z back), and optionally
+`time`. The intrinsics `camera_model`, `w`, `h`, `fl_x`, `fl_y` (or `camera_angle_x`, radians), `cx`, `cy`, `k1` … are
+at the top level or in an image's entry, which takes precedence. `applied_transform` (3×4, on the world) and
+`applied_scale` are undone, so the rig is in the coordinates that were calibrated. `mask_path` and `ply_file_path` are
+not read: the former marks pixels to ignore instead of the foreground, the latter is a point cloud.
 (docs.nerf.studio, "Data conventions"; `nerfstudio/data/dataparsers/nerfstudio_dataparser.py`.)
 """
 
@@ -27,15 +27,15 @@ Float = NDArray[np.float64]
 
 FILE = "transforms.json"
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
-"""OpenGL's camera axes to OpenCV's."""
+"""Converts OpenGL's camera axes to OpenCV's."""
 COEFFICIENTS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 
 
 def read_transforms(path: Path) -> Calibration:
-    """Reads the rig of a `transforms.json`.
+    """Reads the rig from a `transforms.json`.
 
     Raises:
-        CaptureError: a field is missing or cannot be; the message names file, picture, field and remedy.
+        CaptureError: a field is missing or invalid; the message names file, image, field and remedy.
     """
     meta = read_json(path)
     frames = meta.get("frames")
@@ -59,7 +59,7 @@ def _view(where: str, meta: Mapping[str, Any], frame: Mapping[str, Any], undo: F
     if not isinstance(file, str) or not PurePosixPath(file).name:
         raise CaptureError(f"{where} has no file_path")
     where = f"{where} ({file})"
-    file = file.replace("\\", "/")  # written on Windows
+    file = file.replace("\\", "/")  # paths written on Windows
     to_world = _matrix(where, frame, "transform_matrix")
     to_world[:3, 3] /= scale
     given = {**meta, **frame}
@@ -86,7 +86,9 @@ def _view(where: str, meta: Mapping[str, Any], frame: Mapping[str, Any], undo: F
 
 
 def _default_model(given: Mapping[str, Any]) -> str:
-    """The model where the file names none, as of instant-ngp: by `is_fisheye` and the coefficients."""
+    """Infers the camera model from `is_fisheye` and the coefficients if the file names none, as in instant-ngp's
+    files.
+    """
     if given.get("is_fisheye"):
         return "OPENCV_FISHEYE"
     return "OPENCV" if any(given.get(key) for key in COEFFICIENTS) else "PINHOLE"

@@ -1,8 +1,8 @@
-"""A camera as OpenCV calibrates it, which most laboratory tools write in a file format of their own. Numpy only.
+"""Cameras in OpenCV's conventions, which most laboratory tools store in their own file formats. Needs only numpy.
 
-`matrix` [3, 3] with the first pixel's centre at (0, 0), so principal points gain half a pixel here; `distortions` in
-OpenCV's order; world to camera as a rotation, a matrix or Rodrigues' vector, and a translation: `X_cam = R X_world + t`
-with x right, y down, z forward. (docs.opencv.org, "Camera Calibration and 3D Reconstruction".)
+`matrix` is [3, 3] with the centre of the first pixel at (0, 0), so half a pixel is added to principal points here.
+`distortions` are in OpenCV's order. World to camera is a rotation (matrix or Rodrigues vector) and a translation:
+`X_cam = R X_world + t` with x right, y down, z forward. (docs.opencv.org, "Camera Calibration and 3D Reconstruction".)
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from scas4d_core.captures import CaptureError
 Float = NDArray[np.float64]
 
 HALF = 0.5
-"""OpenCV's centre of the first pixel is (0, 0), ours (0.5, 0.5)."""
+"""Offset of the pixel grid: OpenCV's first pixel centre is (0, 0), this project's is (0.5, 0.5)."""
 COUNTS = (0, 4, 5, 8, 12, 14)
-"""Numbers of coefficients that OpenCV has; those beyond the eighth, of thin prisms and tilted sensors, must be 0."""
+"""Valid numbers of OpenCV coefficients. Those beyond the eighth (thin prism, tilted sensor) must be 0."""
 SKEW = 1e-6
-"""Largest skew, of the focal length, that is rounding."""
+"""Largest skew, relative to the focal length, that counts as a rounding error."""
 LARGEST_SIDE = 1 << 16
 
 
@@ -38,18 +38,20 @@ def opencv_camera(
     size: tuple[int, int],
     fisheye: bool = False,
 ) -> LensCamera:
-    """Makes a camera of what a tool stored, checked.
+    """Creates and validates a camera from the values that a tool stored.
 
     Args:
-        where: file and place in it, for messages.
-        name: of the camera.
-        matrix: [3, 3]. distortions: 4, 5 or 8 coefficients, 4 of a fisheye, or None.
-        rotation: [3, 3], or Rodrigues' vector [3]; world to camera. translation: [3].
+        where: file and position in the file, for messages.
+        name: name of the camera.
+        matrix: camera matrix [3, 3].
+        distortions: 4, 5 or 8 coefficients (4 for a fisheye), or None. Further coefficients must be 0.
+        rotation: world-to-camera rotation, [3, 3] or a Rodrigues vector [3].
+        translation: world-to-camera translation [3].
         size: (width, height) in pixels.
-        fisheye: the coefficients are of `cv2.fisheye`.
+        fisheye: whether the coefficients are those of `cv2.fisheye`.
 
     Raises:
-        CaptureError: a field cannot be; the message names it and the remedy.
+        CaptureError: a field is invalid; the message names it and the remedy.
 
     >>> lens = [[100, 0, 31.5], [0, 100, 23.5], [0, 0, 1]]
     >>> camera = opencv_camera("rig.toml", "front", matrix=lens, distortions=[0, 0, 0, 0, 0], rotation=[0, 0, np.pi],
@@ -76,7 +78,7 @@ def opencv_camera(
 
 
 def _distortion(where: str, given: Any, fisheye: bool) -> tuple[str, dict[str, float]]:
-    """The model of a lens, and its coefficients by name."""
+    """Returns the lens model and its coefficients by name."""
     values = numbers(where, "distortions", [] if given is None else given, (4,) if fisheye else COUNTS)
     if fisheye:
         return "OPENCV_FISHEYE", dict(zip(FISHEYE, values, strict=True))
@@ -97,7 +99,7 @@ def _rotation(where: str, given: Any) -> Float:
 
 
 def rodrigues(vector: Float) -> Float:
-    """The rotation [3, 3] about a vector [3] by its length in radians.
+    """Returns the rotation matrix [3, 3] for a Rodrigues vector [3], whose length is the angle in radians.
 
     >>> np.round(rodrigues(np.array([0, 0, np.pi / 2])))[0].tolist()
     [0.0, -1.0, 0.0]
@@ -112,10 +114,10 @@ def rodrigues(vector: Float) -> Float:
 
 
 def numbers(where: str, field: str, given: Any, counts: Sequence[int]) -> Float:
-    """The numbers of a nested list, flat, float64.
+    """Flattens a nested list of numbers to a float64 array.
 
     Raises:
-        CaptureError: they are no finite numbers, or another count of them.
+        CaptureError: a value is not a finite number, or the number of values is not in `counts`.
     """
     try:
         values = np.array(given, dtype=np.float64).ravel()
@@ -129,10 +131,10 @@ def numbers(where: str, field: str, given: Any, counts: Sequence[int]) -> Float:
 
 
 def picture_size(where: str, given: Any) -> tuple[int, int]:
-    """(width, height) in whole pixels; some tools write them as 1088.0.
+    """Returns (width, height) as integers; some tools write them as 1088.0.
 
     Raises:
-        CaptureError: it is not.
+        CaptureError: the size is invalid.
     """
     values = numbers(where, "size", given, (2,))
     if (values != np.round(values)).any() or values.min() < 1 or values.max() > LARGEST_SIDE:

@@ -1,9 +1,9 @@
-"""Reads a folder with one file of OpenCV's FileStorage a camera, `<camera>.yml`, `.yaml` or `.xml`.
+"""Reads a folder with one OpenCV FileStorage file per camera, `<camera>.yml`, `.yaml` or `.xml`.
 
-OpenCV itself has no layout for a rig; this is the one that its samples' fields lead to. In each file `camera_matrix`
-[3, 3], `distortion_coefficients`, `image_width`, `image_height` and, where true, `fisheye_model`, as its calibration
-sample writes them, and `R`, [3, 3] or Rodrigues' vector, and `T` [3], world to camera, as its stereo sample calls them.
-Other usual names are taken too. The sample's `extrinsic_parameters` are poses of the board, and no pose of the camera.
+OpenCV defines no layout for a rig; this one follows the field names in its samples. As in the calibration sample, each
+file has `camera_matrix` [3, 3], `distortion_coefficients`, `image_width`, `image_height` and, if true, `fisheye_model`.
+As in the stereo sample, `R` ([3, 3] or a Rodrigues vector) and `T` [3] are world to camera. Other common names are
+accepted too. The sample's `extrinsic_parameters` are poses of the board, so they are not used.
 (docs.opencv.org, "Camera calibration With OpenCV"; `samples/cpp/.../camera_calibration.cpp`.)
 """
 
@@ -29,7 +29,9 @@ MATRIX_FIELD = re.compile(rb"^\s*<?(" + "|".join(MATRIX).encode() + rb")\s*[ :>]
 
 
 def camera_files(folder: Path) -> list[Path]:
-    """The files of the folder that hold a camera's matrix; those of EasyMocap have several, and are not among them."""
+    """Returns the files in the folder that contain a camera matrix. Excludes EasyMocap's files, which contain
+    several.
+    """
     if not folder.is_dir():
         return []
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDS and path.is_file())
@@ -47,14 +49,15 @@ def _is_camera(path: Path) -> bool:
 
 
 def read_opencv_files(folder: Path, capture: Path) -> Calibration:
-    """Reads the rig of a folder, a camera a file.
+    """Reads the rig from a folder with one file per camera.
 
     Args:
-        folder: of the files. capture: folder with `images/` or `videos/`, for sizes that the files lack.
+        folder: folder of the calibration files.
+        capture: folder with `images/` or `videos/`, from which missing image sizes are read.
 
     Raises:
-        CaptureError: a field is missing or cannot be; the message names file, field and remedy.
-        MissingExtraError: OpenCV is not there.
+        CaptureError: a field is missing or invalid; the message names file, field and remedy.
+        MissingExtraError: OpenCV is not installed.
     """
     return calibration_of_cameras(folder, [_camera(path, capture) for path in camera_files(folder)])
 

@@ -1,17 +1,17 @@
-"""Reads Qualisys' calibrations, exported from QTM as `*.qca.txt`: XML, of which only attributes count.
+"""Reads Qualisys calibrations, exported from QTM as `*.qca.txt`: XML whose data is in attributes only.
 
-By camera (`active`, `serial`, `model`):
+Per camera (`active`, `serial`, `model`):
 
-- `transform`: x, y, z, the camera's place in millimetres, and r11 … r33, rows of world to camera with OpenGL's axes (x
-  right, y up, z back). The world becomes one of metres.
-- `intrinsic`: focalLengthU, centerPointU, … in subpixels of the sensor, 64 a pixel; `sensorMaxU` over the width of
-  `fov_video_max` says how many of them are a pixel. `radialDistortion1` … and `tangentalDistortion1`, `2` are OpenCV's
-  k1, k2, k3, p1, p2. Pose2Sim divides them by 64 as well: on the rig of its demonstration they agree with those of a
-  checkerboard only undivided (k1 −0.046 to −0.048 here; −0.031, −0.047, −0.052, −0.053 there).
-- `fov_video`: the part of the sensor that is recorded; the principal point counts from its corner.
+- `transform`: x, y, z, the camera's position in millimetres, and r11 … r33, rows of world to camera with OpenGL axes
+  (x right, y up, z back). The position is converted to metres.
+- `intrinsic`: focalLengthU, centerPointU, … in subpixels of the sensor, 64 per pixel. The number of subpixels per
+  pixel is `sensorMaxU` divided by the width of `fov_video_max`. `radialDistortion1` … and `tangentalDistortion1`, `2`
+  are OpenCV's k1, k2, k3, p1, p2. Pose2Sim divides them by 64 as well, but on its demo rig they match a checkerboard
+  calibration only if undivided (k1 −0.046 to −0.048 here; −0.031, −0.047, −0.052, −0.053 there).
+- `fov_video`: the recorded part of the sensor; the principal point is relative to its corner.
 
-The first pixel's centre is taken to be (0, 0), as Pose2Sim takes it; Qualisys does not say. Cameras that record markers
-and no video are left out, with a remark.
+The centre of the first pixel is assumed to be (0, 0), as in Pose2Sim; Qualisys does not specify it. Cameras that
+record markers but no video are left out, with a remark.
 (github.com/perfanalytics/pose2sim, `read_qca` and `calib_qca_fun` in `Pose2Sim/calibration.py`.)
 """
 
@@ -37,25 +37,28 @@ END = ".qca.txt"
 PARTS = ("transform", "intrinsic", "fov_video", "fov_video_max")
 LARGEST_FILE = 16 << 20
 FLIP = np.diag([1.0, -1.0, -1.0])
-"""OpenGL's camera axes to OpenCV's."""
+"""Converts OpenGL's camera axes to OpenCV's."""
 METRES = 1e-3
 WHOLE = 0.1
-"""How far the subpixels of a pixel may be from a whole number; 69568 over 1087 and 122879 over 1919 are found."""
+"""Largest deviation of the subpixels per pixel from an integer. Real files have ratios such as 69568/1087 or
+122879/1919.
+"""
 
 
 @dataclass
 class _QualisysCamera:
-    """The attributes of one camera and of the elements in it."""
+    """The XML attributes of one camera and of its child elements."""
 
     own: Mapping[str, str]
     parts: dict[str, Mapping[str, str]] = field(default_factory=dict)
 
 
 def read_qualisys(path: Path) -> Calibration:
-    """Reads the rig of a `*.qca.txt`.
+    """Reads the rig from a `*.qca.txt`.
 
     Raises:
-        CaptureError: no XML, or a field is missing or cannot be; the message names file, camera, field and remedy.
+        CaptureError: the file is not XML, or a field is missing or invalid; the message names file, camera, field and
+            remedy.
     """
     cameras = [camera for camera in _cameras(path) if camera.own.get("active", "1") not in ("0", "false")]
     video = [camera for camera in cameras if _films(camera)] or cameras
@@ -70,7 +73,7 @@ def _films(camera: _QualisysCamera) -> bool:
 
 
 def _cameras(path: Path) -> list[_QualisysCamera]:
-    """The cameras of the file. Documents that define entities are refused: no calibration does."""
+    """Returns the cameras of the file. Files with a document type declaration are rejected, because QTM writes none."""
     cameras: list[_QualisysCamera] = []
 
     def started(name: str, attributes: dict[str, str]) -> None:

@@ -110,7 +110,7 @@ def test_a_black_frame_is_held_explained_and_over_with_the_next_good_one(served)
 def test_one_dark_camera_is_left_out_by_name(served):
     _, sdk, id, _ = served
     left_out = metric(sdk, "scas4d_cameras_left_out_total")
-    raised = metric(sdk, 'scas4d_alarms_total{what="camera_left_out"}')
+    raised = metric(sdk, 'scas4d_alarms_total{kind="camera_left_out"}')
     index = sdk.scene(id).next_frame
     report = put(sdk, id, index, ["c2"])
     assert report.degraded is None
@@ -119,7 +119,7 @@ def test_one_dark_camera_is_left_out_by_name(served):
     assert len(report.used_cameras) == 5
     assert "c2: it shows nothing" in sdk.scene(id).error
     assert metric(sdk, "scas4d_cameras_left_out_total") == left_out + 1
-    assert metric(sdk, 'scas4d_alarms_total{what="camera_left_out"}') == raised + 1
+    assert metric(sdk, 'scas4d_alarms_total{kind="camera_left_out"}') == raised + 1
     assert [(alarm.kind.value, alarm.camera) for alarm in report.alarms] == [("camera_left_out", "c2")]
     assert "shows nothing" in report.alarms[0].evidence
     assert [alarm.kind.value for alarm in sdk.frame(id, 3).alarms] == []

@@ -207,7 +207,7 @@ def test_the_command_writes_the_page(tmp_path):
     assert "- On: A Processor, 2 cores, 1 thread used, 8 GB, Linux." in text
     assert "| updates | robot | ≥ 31.00 dB | 31.38 | reached | 2 of 4 |" in text
     assert "| update over its rasterizer passes | robot | ≤ 3.00 × | 3.25 | **missed** | – |" in text
-    assert "| robot | scas4d | 100 | 3.500 | 2.000 | 1.000 |" in text
+    assert "| robot | scas4d | 100 | – | 20,000 | 2 | 36.00 | 31.38 |" in text
 
 
 def test_the_table_of_no_study_says_what_to_do(tmp_path):
