@@ -1,17 +1,17 @@
-"""Exceptions of the client: refusals of the service by kind, and a service that does not answer.
+"""Exceptions of the client for error responses and for a service that cannot be reached.
 
 ::
 
-    ServiceError            the service refused; `problem` is its problem document
-    ├── InvalidRequest      400, 405, 415, 422  a field that cannot be: change what `problem.field` names
-    ├── TooLarge            413                 more than the service takes
-    ├── NotAuthorized       401, 403            no token, or not one that is known
-    ├── NotFound            404, 410            no such scene, frame or camera
-    ├── Conflict            409                 what is there does not allow it
+    ServiceError            error response; `problem` is its problem document
+    ├── InvalidRequest      400, 405, 415, 422  a field is invalid; `problem.field` is its name
+    ├── TooLarge            413                 the request exceeds the size limit
+    ├── NotAuthorized       401, 403            the token is missing or unknown
+    ├── NotFound            404, 410            the scene, frame or camera does not exist
+    ├── Conflict            409                 the current state does not allow the request
     │   └── FrameGap                            … because another frame comes first: `expected` is its index
-    ├── Busy                429                 the queue stayed full for as long as the client was patient
-    └── ServiceFault        5xx                 the service, or a proxy before it, failed
-    ServiceUnreachable      nobody answered
+    ├── Busy                429                 the queue stayed full longer than the busy timeout
+    └── ServiceFault        5xx                 the service, or a proxy in front of it, failed
+    ServiceUnreachable      no response was received
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ import httpx
 from client.wire import ProblemDetails
 
 TEXT_LENGTH = 200
-"""So much is shown of an answer that is no problem document."""
+"""Maximum number of characters shown of a response that is not a problem document."""
 
 
 class ServiceError(RuntimeError):
-    """The service refused; `problem` says which field, which value, and what to do."""
+    """Error response of the service; `problem` contains the field, its value and a remedy."""
 
     def __init__(self, problem: ProblemDetails) -> None:
         remedy = f" ({problem.remedy})" if problem.remedy else ""
@@ -34,49 +34,49 @@ class ServiceError(RuntimeError):
 
     @property
     def status(self) -> int:
-        """HTTP status."""
+        """HTTP status code."""
         return self.problem.status
 
 
 class InvalidRequest(ServiceError):
-    """A field has a value that it cannot have."""
+    """Error raised if a field of the request is invalid."""
 
 
 class TooLarge(ServiceError):
-    """The request is larger than the service takes."""
+    """Error raised if the request exceeds the size limit of the service."""
 
 
 class NotAuthorized(ServiceError):
-    """The token is missing, or the service does not know it."""
+    """Error raised if the token is missing or unknown to the service."""
 
 
 class NotFound(ServiceError):
-    """There is no such scene, frame or camera."""
+    """Error raised if the scene, frame or camera does not exist."""
 
 
 class Conflict(ServiceError):
-    """The scene's present state does not allow it."""
+    """Error raised if the current state of the scene does not allow the request."""
 
 
 class FrameGap(Conflict):
-    """Another frame comes first."""
+    """Error raised if another frame must be sent first."""
 
     @property
     def expected(self) -> int:
-        """The index that the service takes next."""
+        """Index of the frame that the service expects next."""
         return int((self.problem.model_extra or {})["expected"])
 
 
 class Busy(ServiceError):
-    """The service has no room for it now."""
+    """Error raised if the service has no capacity for the request at the moment."""
 
 
 class ServiceFault(ServiceError):
-    """The service, or a proxy before it, failed."""
+    """Error raised if the service, or a proxy in front of it, failed."""
 
 
 class ServiceUnreachable(ConnectionError):
-    """Nobody answered, or the connection broke."""
+    """Error raised if there was no response or the connection was lost."""
 
 
 BY_STATUS: dict[int, type[ServiceError]] = {
@@ -95,19 +95,19 @@ BY_STATUS: dict[int, type[ServiceError]] = {
 
 
 def error_of(response: httpx.Response) -> ServiceError:
-    """The exception of an answer that is no success."""
+    """Returns the exception for an error response."""
     try:
         problem = ProblemDetails.model_validate_json(response.content)
-    except ValueError:  # not our service, or something before it
+    except ValueError:  # not from our service, e.g. from a proxy in front of it
         text = response.text[:TEXT_LENGTH]
         problem = ProblemDetails(title="unexpected answer", status=response.status_code, detail=text)
     return error_of_problem(problem)
 
 
 def error_of_problem(problem: ProblemDetails) -> ServiceError:
-    """The exception of a problem document."""
+    """Returns the exception for a problem document."""
     more = problem.model_extra or {}
-    # Other content under a known index says `expected` too, and `identity`: no frame that comes first mends that.
+    # A frame sent again with different content also has `expected`, plus `identity`; it is not a gap.
     if problem.status == 409 and isinstance(more.get("expected"), int) and "identity" not in more:
         return FrameGap(problem)
     fallback = ServiceFault if problem.status >= 500 else ServiceError

@@ -1,6 +1,6 @@
-"""`IngestSocket`: frames over one WebSocket, each a binary message of `client.wire.framing`, each acknowledged.
+"""Frame upload over a WebSocket with one acknowledged binary message of `client.wire.framing` per frame.
 
-The same retries as over HTTP: a connection that breaks is made anew and the frame sent again.
+The retry policy is the same as over HTTP: after a lost connection, the client reconnects and sends the frame again.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from client.sdk import Client
 from client.wire import CameraReceipt, FrameReceipt, IngestAnswer, frame_chunks
 
 ANSWER_S = 130.0
-"""How long an acknowledgement may take."""
+"""Maximum time in seconds to wait for an acknowledgement."""
 
 
 class IngestSocket:
-    """One sender's connection to a scene. Close it, or use it in a `with`. Not to be shared by threads.
+    """Connection of one sender to a scene, to be closed or used as a context manager; not thread-safe.
 
     Args:
-        client: whose service, token, busy timeout and `on_retry` are used.
-        scene: id.
+        client: client whose address, token, timeouts and `on_retry` are used.
+        scene: id of the scene.
 
     >>> n = client.scene(open_scene).next_frame
     >>> with IngestSocket(client, open_scene) as socket:
@@ -65,7 +65,7 @@ class IngestSocket:
         masks: Mapping[str, bytes] | None = None,
         time: float | None = None,
     ) -> FrameReceipt:
-        """As `Client.put_frame`."""
+        """Sends a frame with the images of all cameras, see `Client.put_frame`."""
         receipt = self._send(frame_chunks(index, images, masks, time))
         assert isinstance(receipt, FrameReceipt)
         return receipt
@@ -73,7 +73,7 @@ class IngestSocket:
     def put_camera(
         self, index: int, camera: str, image: bytes, mask: bytes | None = None, time: float | None = None
     ) -> CameraReceipt:
-        """As `Client.put_camera`."""
+        """Sends one camera's image of a frame, see `Client.put_camera`."""
         masks = {} if mask is None else {camera: mask}
         receipt = self._send(frame_chunks(index, {camera: image}, masks, time, part=True))
         assert isinstance(receipt, CameraReceipt)
@@ -112,7 +112,7 @@ class IngestSocket:
                 connect(
                     self._address,
                     additional_headers={} if token is None else {"Authorization": f"Bearer {token}"},
-                    compression=None,  # pictures are compressed already
+                    compression=None,  # images are already compressed
                     close_timeout=2,
                 )
             )
@@ -121,7 +121,7 @@ class IngestSocket:
 
 
 def _as_response(answer: IngestAnswer) -> httpx.Response:
-    """The answer as it would have come over HTTP, so that the same retries apply."""
+    """Returns the equivalent HTTP response, so that the same retry policy applies."""
     problem = {} if answer.problem is None else answer.problem.model_dump(mode="json", exclude_none=True)
     headers = {} if answer.retry_after is None else {"Retry-After": str(answer.retry_after)}
     return httpx.Response(answer.status, headers=headers, json=problem)

@@ -1,4 +1,4 @@
-"""Pictures that commands leave: renders beside the truth, written through imageio."""
+"""Images written by the commands: renderings next to ground truth, depth maps and part labels."""
 
 from __future__ import annotations
 
@@ -11,37 +11,37 @@ from numpy.typing import NDArray
 from client.wire import part_colour
 
 DIFFERENCE_GAIN = 4
-"""Differences are this much brighter, or nobody would see them."""
+"""Factor by which differences are amplified to make them visible."""
 
 Picture = NDArray[np.uint8]
 
 
 def eight_bit(colour: NDArray[np.floating]) -> Picture:
-    """Colour in 0…1, [H, W, 3], rounded to 0…255; what lies outside is clipped."""
+    """Returns colours [H, W, 3] in 0…1 as 8-bit values 0…255; values outside the range are clipped."""
     rounded: Picture = np.rint(255 * np.clip(colour, 0, 1)).astype(np.uint8)
     return rounded
 
 
 def comparison(truth: Picture, render: Picture) -> Picture:
-    """Truth | render | difference, [H, 3 W, 3]."""
+    """Returns ground truth, rendering and amplified difference side by side, [H, 3 W, 3]."""
     difference = np.abs(truth.astype(np.int16) - render.astype(np.int16)) * DIFFERENCE_GAIN
     return np.concatenate([truth, render, np.minimum(difference, 255).astype(np.uint8)], axis=1)
 
 
 def psnr(truth: Picture, render: Picture) -> float:
-    """Peak signal-to-noise ratio in dB over pixels and channels; infinite where there is no difference."""
+    """Returns the peak signal-to-noise ratio in dB over all pixels and channels; infinite for equal images."""
     error = np.mean(np.square(truth.astype(np.float64) - render))
     return float(10 * np.log10(255**2 / error)) if error > 0 else float("inf")
 
 
 def colour_labels(labels: NDArray[np.uint8]) -> Picture:
-    """Labels [H, W], one more than the part's and 0 for none, as [H, W, 3]: the service's colours, black for none."""
+    """Returns the colours [H, W, 3] of labels [H, W], where 0 is no part (black) and k is part k − 1."""
     palette = [(0, 0, 0), *(part_colour(label) for label in range(int(labels.max(initial=0))))]
     return np.array(palette, np.uint8)[labels]
 
 
 def depth_to_grey(depth: NDArray[np.floating]) -> Picture:
-    """Depth [H, W] as grey [H, W, 3], near is bright; black where there is none."""
+    """Returns depth [H, W] as a grey image [H, W, 3]: near is bright, pixels without depth are black."""
     met = np.isfinite(depth)
     if not met.any():
         return np.zeros((*depth.shape, 3), np.uint8)
@@ -51,7 +51,7 @@ def depth_to_grey(depth: NDArray[np.floating]) -> Picture:
 
 
 def save(path: Path, picture: Picture) -> Path:
-    """Saves a picture as PNG; folders are made."""
+    """Saves an image, creating missing folders, and returns the path; the suffix selects the format."""
     path.parent.mkdir(parents=True, exist_ok=True)
     imageio.imwrite(path, picture)
     return path

@@ -1,4 +1,4 @@
-"""Progress of long work: bars in a terminal, a line every few seconds elsewhere."""
+"""Progress display: bars in a terminal, otherwise a line every few seconds."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextC
 console = Console()
 
 LINE_S = 10.0
-"""Seconds between two lines about one stage, where there is no terminal."""
+"""Default interval in seconds between lines about one stage if the output is not a terminal."""
 
 
 class Bars:
-    """Progress bars, one a stage. Call it with (stage, done, total).
+    """Progress bars, one per stage, updated by calling the object with (stage, done, total).
 
     Args:
-        to: the terminal, or what stands in its place.
-        every: seconds between two lines about one stage.
+        to: console to write to; None for the default console.
+        every: interval in seconds between lines about one stage if the output is not a terminal.
     """
 
     def __init__(self, to: Console | None = None, every: float = LINE_S) -> None:
@@ -48,7 +48,7 @@ class Bars:
             self._progress.stop()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
-        """Moves the bar of a stage. Those before it are over."""
+        """Updates the bar of a stage and completes the bars of earlier stages."""
         if self._console.is_terminal:
             self._move(stage, done, total)
         else:

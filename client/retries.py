@@ -1,18 +1,18 @@
-"""Retries of calls: which answers are retried, after how long, and until when.
+"""Retry policy of calls: which responses are retried, after which delay, and for how long.
 
-Sent again is what does the same when it is done twice: reading, and every frame, which the service knows by its
+Idempotent calls are retried. These include reads and frame uploads, since the service recognizes a frame by its
 content.
 
 ============================  =====================================================================================
-429                           after the seconds that the service asks for, `busy` seconds in all; where it predicts
-                              them (`retry_after_seconds`), a long wait is asked about again at half of it
-502, 503, 504, 507, and a     after 0.2, 0.4, 0.8 … 5 s, each cut at random to 50…100 % so that many senders do not
-connection that breaks        return together, or later where the answer says so; until `outage` seconds after the
-or cannot be made             first failure of the call
+429                           after the delay that the service requests, for `busy` seconds in total; if the service
+                              predicts a long delay (`retry_after_seconds`), the client asks again after half of it
+502, 503, 504, 507, and a     after 0.2, 0.4, 0.8 … 5 s, each with a random factor of 0.5…1 so that many senders do
+connection that is lost       not retry at the same time, or later if the response says so; until `outage` seconds
+or cannot be made             after the first failure of the call
 every other 4xx, 500          never: the same request would be refused again
 ============================  =====================================================================================
 
-What is *not* the same when done twice (making a scene) is sent again only where no connection could be made at all.
+Calls that are *not* idempotent, such as creating a scene, are retried only if no connection could be established.
 """
 
 from __future__ import annotations
@@ -34,24 +34,26 @@ FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 5.0
 SHORTEST_BUSY_WAIT_S = 0.1
 SURE_S, LONGEST_BUSY_WAIT_S = 2.0, 10.0
-"""A prediction up to the first is waited for whole, a longer one by half and at most the second: frame 0 may end sooner
-than predicted, and then the rig should not sleep."""
+"""Predicted delay in seconds up to which the client waits in full, and maximum wait for longer predictions.
+
+For longer predictions the client waits half of the delay, because frame 0 may finish earlier than predicted.
+"""
 OUTAGE_STATUSES = (502, 503, 504, 507)
 
 BUSY_S = 3600.0
-"""How long a full queue is waited for: a first frame takes minutes."""
+"""Default time in seconds to wait for a full queue; a first frame takes minutes."""
 OUTAGE_S = 20.0
-"""How long a service that does not answer is waited for."""
+"""Default time in seconds to wait for a service that does not answer."""
 
 
 @dataclass(frozen=True)
 class Retry:
-    """A wait before a call is sent again, with its reason.
+    """Delay before a call is retried, with its reason.
 
     Attributes:
-        reason: "busy": the service is there and has no room; "outage": it does not answer.
-        seconds: that will be waited.
-        detail: one sentence.
+        reason: "busy" if the service has no capacity, "outage" if it does not answer.
+        seconds: delay in seconds.
+        detail: description in one sentence.
     """
 
     reason: Literal["busy", "outage"]
@@ -63,7 +65,7 @@ OnRetry = Callable[[Retry], None]
 
 
 class Retries:
-    """Retries of one call: computes the seconds until it may be sent again, or raises."""
+    """Retry state of one call, which computes the delay before the next attempt or raises the final error."""
 
     def __init__(
         self, call: Call[Any], url: str, *, busy: float, outage: float, on_retry: OnRetry | None = None
@@ -78,10 +80,10 @@ class Retries:
         self._lost = False
 
     def after_connection_error(self, error: httpx.TransportError) -> float:
-        """Seconds to wait after no answer came.
+        """Returns the delay in seconds before the next attempt after a connection error.
 
         Raises:
-            ServiceUnreachable: it is over.
+            ServiceUnreachable: the call is not retried any further.
         """
         unsent = isinstance(error, httpx.ConnectError | httpx.ConnectTimeout)
         wait = None
@@ -95,10 +97,10 @@ class Retries:
         return wait
 
     def after_response(self, response: httpx.Response) -> float | None:
-        """Seconds to wait after an answer; None: it stands.
+        """Returns the delay in seconds before the next attempt, or None if the response is final.
 
         Raises:
-            ServiceError: the service refused.
+            ServiceError: the service refused the request, and the call is not retried any further.
         """
         if response.is_success or (self.call.method == "DELETE" and self._lost and response.status_code == 404):
             return None
@@ -125,7 +127,7 @@ class Retries:
         wait = max(asked, SHORTEST_BUSY_WAIT_S) * random.uniform(1.0, 1.1)
         wait = min(wait, self._busy_left)
         self._busy_left -= wait
-        self._failed_at, self._failures = None, 0  # it answers
+        self._failed_at, self._failures = None, 0  # the service responds, so an outage has ended
         return self._notify(Retry("busy", wait, problem.detail))
 
     def _outage_wait(self, asked: float, detail: str) -> float | None:
@@ -135,7 +137,7 @@ class Retries:
         left = self._failed_at + self._outage - now
         if left <= 0:
             return None
-        # 2**n of a day without an answer would overflow a float.
+        # The exponent is limited because 2**n would overflow a float after a day of outage.
         grown = FIRST_WAIT_S * 2.0 ** min(self._failures - 1, 16)
         wait = max(min(grown, LONGEST_WAIT_S) * random.uniform(0.5, 1.0), asked)
         return self._notify(Retry("outage", min(wait, left), detail))
@@ -147,7 +149,7 @@ class Retries:
 
 
 def retry_after_seconds(header: str) -> float | None:
-    """Seconds that a Retry-After header asks for, a number or a date; None where it cannot be read."""
+    """Returns the delay in seconds of a Retry-After header (number or date), or None if it cannot be parsed."""
     if header.strip().isdigit():
         return float(header)
     try:

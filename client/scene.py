@@ -1,6 +1,7 @@
-"""A reconstruction as arrays: its states, tracks and parts, in the rig's world and unit, without a service or with one.
+"""Access to a reconstruction as arrays: states, tracks and parts in the rig's world frame and units.
 
-Axes are those of the rig's calibration, cameras are OpenCV's (x right, y down, z forward). Needs numpy and zstandard.
+It works on files or with a running service. World axes are those of the rig's calibration. Cameras follow the OpenCV
+convention (x right, y down, z forward). Requires numpy and zstandard.
 """
 
 from __future__ import annotations
@@ -29,10 +30,13 @@ Int = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """N Gaussians in one frame. Row i is the same Gaussian in every frame; rows are only ever added at the end.
+    """State of N Gaussians in one frame; row i is the same Gaussian in every frame, and new rows are appended.
 
     Attributes:
-        frame: its index. seconds: its time. gaussians: the state in the inside world, float32. world: from the user's.
+        frame: index of the frame.
+        seconds: time of the frame.
+        gaussians: state in the internal world frame, float32.
+        world: transform between the user's and the internal world frame.
     """
 
     frame: int
@@ -42,53 +46,57 @@ class State:
 
     @cached_property
     def means(self) -> Float:
-        """[N, 3] float64 centres, user's unit."""
+        """Centres [N, 3], float64, in the user's world and units."""
         return self.world.to_user(self.gaussians.means)
 
     @cached_property
     def covariances(self) -> Float:
-        """[N, 3, 3] float64, squares of the user's unit."""
+        """Covariances [N, 3, 3], float64, in squared units of the user's world."""
         factors = self.gaussians.factors.astype(np.float64) / self.world.metres_per_unit
         return factors @ np.swapaxes(factors, 1, 2)
 
     @property
     def rotations(self) -> NDArray[np.float32]:
-        """[N, 4] unit quaternions (w, x, y, z): how each has turned since frame 0, or since its birth."""
+        """Rotations [N, 4] as unit quaternions (w, x, y, z), relative to frame 0 or to the frame of creation."""
         return self.gaussians.rotations
 
     @property
     def colours(self) -> NDArray[np.float32]:
-        """[N, 3] RGB, nominally 0…1, on the curve of the pictures (sRGB); without gloss."""
+        """RGB colours [N, 3], nominally in 0…1, sRGB-encoded like the images; without specular reflections."""
         return self.gaussians.colours
 
     @property
     def opacities(self) -> NDArray[np.float32]:
-        """[N] in 0…1; 0 for what is not there."""
+        """Opacities [N] in 0…1; 0 for Gaussians that are not present."""
         return self.gaussians.opacities
 
     @property
     def ids(self) -> Int:
-        """[N] id of each, for ever."""
+        """Permanent ids [N]."""
         return self.gaussians.ids
 
     @property
     def present(self) -> Bool:
-        """[N] whether it is there; what has left the scene is not."""
+        """Mask [N] of Gaussians that are present in this frame; those that have left the scene are not."""
         return self.gaussians.present
 
     @property
     def moving(self) -> Bool:
-        """[N] whether it belongs to what moves, and is there."""
+        """Mask [N] of moving Gaussians that are present in this frame."""
         return self.gaussians.moving
 
 
 @dataclass(frozen=True, eq=False)
 class GaussianTracks:
-    """Centres of K Gaussians over T frames.
+    """Trajectories of K Gaussians over T frames.
 
     Attributes:
-        positions: [T, K, 3] float64, user's world and unit; NaN in frames in which a Gaussian is not there.
-        seconds: [T] time of the frames. frames: [T] their indices. ids: [K]. present: [T, K] bool.
+        positions: centres [T, K, 3], float64, in the user's world and units; NaN in frames in which a Gaussian is not
+            present.
+        seconds: times [T] of the frames.
+        frames: indices [T] of the frames.
+        ids: ids [K] of the Gaussians.
+        present: mask [T, K] of the frames in which a Gaussian is present.
     """
 
     positions: Float
@@ -98,19 +106,22 @@ class GaussianTracks:
 
     @property
     def present(self) -> Bool:
-        """[T, K] whether a Gaussian is there."""
+        """Mask [T, K] of the frames in which a Gaussian is present."""
         return np.isfinite(self.positions[..., 0])
 
 
 @dataclass(frozen=True, eq=False)
 class PartPoses:
-    """Rigid motion of P parts over T frames.
+    """Rigid motions of P parts over T frames.
 
     Attributes:
-        parts: [P] labels. frames: [T] indices. seconds: [T].
-        motions: [P, T, 4, 4] float64: ``motions[p, t] @ [x, y, z, 1]`` is where a point of the part is in frame t that
-            is at (x, y, z) in the first of the frames; user's unit. NaN where no Gaussian of the part is there.
-        residuals: [P, T] RMS distance that the rigid motion leaves, user's unit.
+        parts: labels [P] of the parts.
+        frames: indices [T] of the frames.
+        seconds: times [T] of the frames.
+        motions: rigid transforms [P, T, 4, 4], float64, in the user's units. A point of part p at (x, y, z) in the
+            first of the frames is at ``motions[p, t] @ [x, y, z, 1]`` in frame t. NaN if no Gaussian of the part is
+            present.
+        residuals: RMS distances [P, T] between the Gaussians and the rigid motion, in the user's units.
     """
 
     parts: Int
@@ -121,13 +132,14 @@ class PartPoses:
 
 
 class Scene:
-    """A reconstruction to compute with: a compact file, the folder that holds one, or a scene of the service.
+    """Reconstruction opened from a compact file, its folder, or a scene of the service.
 
-    One state is read at a time. Of a scene of the service the states are fetched when it is opened; close it then, or
-    use it in a ``with``.
+    States are read one at a time. The states of a scene of the service are downloaded on opening; in that case, close
+    the object or use it as a context manager.
 
     Attributes:
-        frames: indices of its frames. seconds: [T] their times.
+        frames: indices of the frames.
+        seconds: times [T] of the frames.
 
     >>> with Scene.open(scene, url=url) as given:  # a folder, a .s4d file, or an id
     ...     shapes = [(state.frame, state.means.shape) for state in given.states("0:1")]
@@ -148,12 +160,15 @@ class Scene:
         """Opens a reconstruction.
 
         Args:
-            source: a file that ends in .s4d, the folder of `scas4d reconstruct`, or the id of a scene of the service.
-            frames: ``A:B``, the frames from A to B, both counted in, as for `scas4d export`; None: all.
-            url, token: of the service.
+            source: .s4d file, output folder of `scas4d reconstruct`, export with Gaussian ids (docs/exports.md), or id
+                of a scene of the service.
+            frames: range ``A:B``, inclusive, as for `scas4d export`; None for all.
+            url: address of the service.
+            token: token of the service.
 
         Raises:
-            InputError: it is not there, or has none of these frames. ServiceError: the service refused.
+            InputError: the source does not exist, or has none of these frames.
+            ServiceError: the service refused the request.
         """
         low, high = frame_range(frames)
         with ExitStack() as stack:
@@ -172,37 +187,37 @@ class Scene:
         self.close()
 
     def close(self) -> None:
-        """Removes what was fetched from a service; it cannot be read any more."""
+        """Deletes the states downloaded from a service, which makes them unreadable."""
         self._closing.close()
 
     @property
     def frames(self) -> list[int]:
-        """Indices of the frames, rising."""
+        """Indices of the frames in ascending order."""
         return list(self._times)
 
     @property
     def seconds(self) -> Float:
-        """[T] times of the frames."""
+        """Times [T] of the frames in seconds."""
         return np.array(list(self._times.values()))
 
     @property
     def rig(self) -> Rig | None:
-        """The cameras in the user's world, as the reconstruction has refined them; None where the file has none."""
+        """Cameras in the user's world, as refined by the reconstruction; None if the file has none."""
         return self._given.head.rig
 
     @property
     def metres_per_unit(self) -> float:
-        """Metres in one of the user's units."""
+        """Length of one user unit in metres."""
         return self._given.head.world.metres_per_unit
 
     def states(self, frames: str | None = None) -> Iterator[State]:
-        """The states, one after the other.
+        """Yields the states in frame order.
 
         Args:
-            frames: ``A:B``; None: all.
+            frames: range ``A:B``, inclusive; None for all.
 
         Raises:
-            InputError: there is none of these frames.
+            InputError: none of these frames exists.
 
         >>> with Scene.open(scene, url=url) as given:
         ...     for state in given.states("2:2"):
@@ -215,13 +230,14 @@ class Scene:
             yield State(index, seconds, gaussians, world)
 
     def tracks(self, ids: ArrayLike | None = None, frames: str | None = None) -> GaussianTracks:
-        """Centres of Gaussians over time: 24 bytes for each of them and each frame.
+        """Returns the trajectories of Gaussians, which take 24 bytes per Gaussian and frame.
 
         Args:
-            ids: [K] of the Gaussians; None: all that move in the last of the frames. frames: ``A:B``; None: all.
+            ids: ids [K] of the Gaussians; None for all that are moving in the last of the frames.
+            frames: range ``A:B``, inclusive; None for all.
 
         Raises:
-            InputError: there is no Gaussian of an id, or none of these frames.
+            InputError: no Gaussian has one of the ids, or none of these frames exists.
 
         >>> with Scene.open(scene, url=url) as given:
         ...     tracks = given.tracks(ids=[0])
@@ -238,9 +254,10 @@ class Scene:
         return GaussianTracks(positions, np.array(list(chosen.values())), np.array(list(chosen), np.int64), known)
 
     def parts(self) -> Int:
-        """[N] part of each Gaussian by row, N as in the last frame; −1 for those that belong to none.
+        """Returns the part label of each Gaussian [N] of the last frame by row; −1 for no part.
 
-        Of a scene of the service they are those of its newest frame; the service looks for them, which takes seconds.
+        For a scene of the service, the labels are those of its newest frame. The service computes them on demand,
+        which takes seconds.
 
         >>> with Scene.open(scene, url=url) as given:
         ...     given.parts()
@@ -259,12 +276,12 @@ class Scene:
         return labels
 
     def part_poses(self, frames: str | None = None) -> PartPoses:
-        """Rigid motion of the parts since the first of the frames, fitted to their Gaussians (docs/exports.md).
+        """Returns the rigid motions of the parts since the first frame, fitted to their Gaussians (docs/exports.md).
 
-        Needs scipy, of the extra `server`.
+        Requires scipy, which the extra `server` installs.
 
         Raises:
-            InputError: there is no part, or none of these frames.
+            InputError: there are no parts, or none of these frames exists.
 
         >>> with Scene.open(scene, url=url) as given:
         ...     poses = given.part_poses()
@@ -298,7 +315,7 @@ class Scene:
         )
 
     def _within(self, frames: str | None) -> dict[int, float]:
-        """Index and time of the frames of a range, of those that were opened."""
+        """Returns the times of the opened frames in a range by index."""
         low, high = frame_range(frames)
         times = {index: time for index, time in self._times.items() if low <= index <= high}
         if not times:

@@ -1,7 +1,7 @@
-"""The typed SDK, sync (`Client`) and async (`AsyncClient`): the same methods, one of `client.calls` each.
+"""Typed SDK with a sync (`Client`) and an async (`AsyncClient`) client, which have the same methods.
 
-A method takes what the call of its name takes, and returns what that call's `parse` makes of the answer. When a call is
-sent again, and for how long, is in `client.retries`; what it raises in `client.errors`.
+Each method has the arguments of the function with the same name in `client.calls`, and returns its parsed response.
+`client.retries` describes the retry policy, and `client.errors` the exceptions.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ R = TypeVar("R")
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 TIMEOUT_S = 130.0
-"""How long an answer may take: the service itself gives up on a render after 120 s."""
+"""Response timeout in seconds; the service itself abandons a query after 120 s."""
 
 
 def _with_signature(method: Callable[..., R], build: Callable[..., Any]) -> Callable[..., R]:
-    """Gives a method the signature of its call, for `help` and editors."""
+    """Sets the signature of a method to that of its call, for `help` and editors."""
     signature = inspect.signature(build)
     self = inspect.Parameter("self", inspect.Parameter.POSITIONAL_ONLY)
     method.__signature__ = signature.replace(  # type: ignore[attr-defined]
@@ -59,7 +59,7 @@ def _sends_async(build: Callable[P, Call[T]]) -> Callable[Concatenate[AsyncClien
 
 
 class _ClientBase:
-    """Address, token and timeouts of both clients."""
+    """Common base of both clients, with address, token and timeouts."""
 
     def __init__(
         self, url: str, token: str | None, busy_timeout: float, outage: float, on_retry: OnRetry | None
@@ -80,19 +80,19 @@ class _ClientBase:
 
 
 class Client(_ClientBase):
-    """The service at `url`. Close it, or use it in a `with`. May be shared by threads.
+    """Synchronous client of the service at `url`, to be closed or used as a context manager; it is thread-safe.
 
     Args:
-        url: of the service.
-        token: of a service that asks for one.
-        busy_timeout: seconds to wait for room in a full queue (429), per call.
-        outage: seconds that a service that does not answer is waited for, in one call.
-        on_retry: hears why and how long a call waits before it is sent again.
-        transport: of httpx, instead of the network.
+        url: address of the service.
+        token: token, if the service requires one.
+        busy_timeout: seconds per call to wait for space in a full queue (429).
+        outage: seconds per call to wait for a service that does not answer.
+        on_retry: called with reason and delay before a call is retried.
+        transport: httpx transport that replaces the network.
 
     Raises:
-        ServiceError: the service refused; see `client.errors` for the kinds.
-        ServiceUnreachable: nobody answered.
+        ServiceError: the service refused a request; see `client.errors` for the subclasses.
+        ServiceUnreachable: the service did not answer.
 
     >>> with Client(url, busy_timeout=60) as client:
     ...     new = client.create_scene(rig)
@@ -124,7 +124,7 @@ class Client(_ClientBase):
         self.close()
 
     def close(self) -> None:
-        """Closes its connections.
+        """Closes the connections.
 
         >>> client = Client(url)
         >>> client.close()
@@ -132,7 +132,7 @@ class Client(_ClientBase):
         self._http.close()
 
     def send(self, call: Call[T]) -> T:
-        """Sends any call, with its retries.
+        """Sends a call with retries and returns its parsed response.
 
         >>> client.send(calls.scene(scene)).id == scene
         True
@@ -197,10 +197,16 @@ class Client(_ClientBase):
     end_replay = _sends(calls.end_replay)
 
     def watch(self, id: str, index: int, *, seconds: float = BUSY_S, every: float = 0.2) -> Iterator[SceneStatus]:
-        """The scene's status again and again, until the frame is finished or the scene failed.
+        """Yields the scene's status periodically until a frame is finished or the scene has failed.
+
+        Args:
+            id: id of the scene.
+            index: index of the frame.
+            seconds: timeout.
+            every: polling interval in seconds.
 
         Raises:
-            TimeoutError: neither within `seconds`.
+            TimeoutError: the frame was not finished within `seconds`.
 
         >>> [status.committed for status in client.watch(scene, 1)]
         [3]
@@ -216,10 +222,16 @@ class Client(_ClientBase):
             time.sleep(every)
 
     def wait(self, id: str, index: int, *, seconds: float = BUSY_S, every: float = 0.2) -> FrameReportModel:
-        """Waits until a frame is committed, failed, missing or skipped, or the scene failed.
+        """Waits until a frame is committed, failed, missing or skipped, or the scene has failed; returns its report.
+
+        Args:
+            id: id of the scene.
+            index: index of the frame.
+            seconds: timeout.
+            every: polling interval in seconds.
 
         Raises:
-            TimeoutError: none of these within `seconds`.
+            TimeoutError: the frame was not finished within `seconds`.
 
         >>> client.wait(scene, 1).psnr
         31.5
@@ -230,7 +242,7 @@ class Client(_ClientBase):
 
 
 class AsyncClient(_ClientBase):
-    """The service at `url` for asyncio: arguments and errors as of `Client`, whose every method it has.
+    """Asynchronous client of the service at `url`, with the same arguments, methods and errors as `Client`.
 
     >>> async def committed():
     ...     async with AsyncClient(url) as client:
@@ -260,11 +272,11 @@ class AsyncClient(_ClientBase):
         await self.close()
 
     async def close(self) -> None:
-        """Closes its connections."""
+        """Closes the connections."""
         await self._http.aclose()
 
     async def send(self, call: Call[T]) -> T:
-        """As `Client.send`."""
+        """Sends a call with retries, see `Client.send`."""
         retries = self._retries(call)
         while True:
             wait: float | None
@@ -327,7 +339,7 @@ class AsyncClient(_ClientBase):
     async def watch(
         self, id: str, index: int, *, seconds: float = BUSY_S, every: float = 0.2
     ) -> AsyncIterator[SceneStatus]:
-        """As `Client.watch`."""
+        """Yields the scene's status until a frame is finished, see `Client.watch`."""
         until = time.monotonic() + seconds
         while True:
             status = await self.scene(id)
@@ -339,7 +351,7 @@ class AsyncClient(_ClientBase):
             await asyncio.sleep(every)
 
     async def wait(self, id: str, index: int, *, seconds: float = BUSY_S, every: float = 0.2) -> FrameReportModel:
-        """As `Client.wait`."""
+        """Waits until a frame is finished, see `Client.wait`."""
         async for _ in self.watch(id, index, seconds=seconds, every=every):
             pass
         return await self.frame(id, index)

@@ -13,8 +13,8 @@
                     show(event.picture())
                     stream.update("live", camera=next_camera())
 
-A connection that breaks is made anew and everything is subscribed to again, so that a stream outlives a restart of the
-service; trajectories are then sent from their first frame. The iteration ends when the scene is deleted.
+After a lost connection, the client reconnects and renews all subscriptions, so that a stream survives a restart of the
+service. Trajectories are then sent again from their first frame. The iteration ends when the scene is deleted.
 """
 
 from __future__ import annotations
@@ -72,18 +72,20 @@ CONNECTION_ERRORS = (OSError, ConnectionClosed, InvalidHandshake, EOFError)
 
 
 class Stream:
-    """A scene's stream. Use it in a `with`; iterate over it for events.
+    """Stream of a scene as a context manager and an iterator over events.
 
-    `subscribe`, `update` and `unsubscribe` may be called from another thread than the one that iterates. After a
-    `ServiceError` the iteration can go on.
+    `subscribe`, `update` and `unsubscribe` may be called from a different thread than the iteration. The iteration can
+    be continued after a `ServiceError`.
 
     Args:
-        url: of the service, http or https. scene: its id. token: of a service that asks for one.
-        outage: seconds that a service that does not answer is waited for.
+        url: address of the service, http or https.
+        scene: id of the scene.
+        token: token, if the service requires one.
+        outage: seconds to wait for a service that does not answer.
 
     Raises:
-        ServiceError: the service refused; `NotFound` where there is no such scene.
-        ServiceUnreachable: nobody answered.
+        ServiceError: the service refused a request; `NotFound` if the scene does not exist.
+        ServiceUnreachable: the service did not answer.
 
     >>> with Stream(url, scene) as stream:
     ...     stream.subscribe("live", view("c0"), tag=1)
@@ -121,11 +123,11 @@ class Stream:
         self._open.close()
 
     def subscribe(self, id: str, wanted: SubscriptionRequest, *, tag: int | None = None) -> None:
-        """Begins a subscription under a name of yours; `tag` comes back with what is sent for it."""
+        """Starts a subscription with an id of your choice; `tag` is echoed in its events."""
         self._send(self._session.subscribe(id, wanted, tag))
 
     def update(self, id: str, *, tag: int | None = None, **request: Any) -> None:
-        """Changes members of a subscription's request, such as `camera` and `frame` of a view."""
+        """Changes fields of a subscription's request, such as `camera` and `frame` of a view."""
         self._send(self._session.update(id, tag, request))
 
     def unsubscribe(self, id: str) -> None:
@@ -133,10 +135,10 @@ class Stream:
         self._send(self._session.unsubscribe(id))
 
     def receive(self, timeout: float | None = None) -> Event | None:
-        """The next event; None when the scene was deleted.
+        """Returns the next event, or None if the scene was deleted.
 
         Raises:
-            TimeoutError: none within `timeout` seconds.
+            TimeoutError: no event arrived within `timeout` seconds.
         """
         until = None if timeout is None else time.monotonic() + timeout
         while True:
@@ -158,7 +160,7 @@ class Stream:
         session = self._session
         while True:
             try:
-                # As a context: what `connect` returns differs between versions, what it yields does not.
+                # Used as a context manager, because the return type of `connect` differs between versions.
                 connection: ClientConnection = self._open.enter_context(
                     connect_sync(session.address, **session.arguments)
                 )
@@ -176,15 +178,15 @@ class Stream:
             if self._connection is not None:
                 self._connection.send(message)
         except ConnectionClosed:
-            pass  # the receiver connects again, and then repeats its subscriptions
+            pass  # the receiver reconnects and renews its subscriptions
 
 
 class AsyncStream:
-    """A scene's stream for asyncio: use it in an `async with`, iterate with `async for`.
+    """Stream of a scene for asyncio, as an async context manager and an async iterator over events.
 
     >>> async def newest():
     ...     async with AsyncStream(url, scene) as stream:
-    ...         await stream.subscribe("what moves", parts(2))
+    ...         await stream.subscribe("labels", parts(2))
     ...         return await stream.receive()
     >>> asyncio.run(newest()).model().count
     2
@@ -216,19 +218,19 @@ class AsyncStream:
             await self._connection.close()
 
     async def subscribe(self, id: str, wanted: SubscriptionRequest, *, tag: int | None = None) -> None:
-        """As `Stream.subscribe`."""
+        """Starts a subscription, see `Stream.subscribe`."""
         await self._send(self._session.subscribe(id, wanted, tag))
 
     async def update(self, id: str, *, tag: int | None = None, **request: Any) -> None:
-        """As `Stream.update`."""
+        """Changes fields of a subscription's request, see `Stream.update`."""
         await self._send(self._session.update(id, tag, request))
 
     async def unsubscribe(self, id: str) -> None:
-        """As `Stream.unsubscribe`."""
+        """Ends a subscription, see `Stream.unsubscribe`."""
         await self._send(self._session.unsubscribe(id))
 
     async def receive(self) -> Event | None:
-        """The next event; None when the scene was deleted."""
+        """Returns the next event, or None if the scene was deleted."""
         while True:
             connection = self._connection or await self._connect()
             try:
@@ -263,4 +265,4 @@ class AsyncStream:
             if self._connection is not None:
                 await self._connection.send(message)
         except ConnectionClosed:
-            pass  # as in `Stream`
+            pass  # see `Stream._send`

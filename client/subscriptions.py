@@ -1,4 +1,4 @@
-"""Subscriptions of a scene's stream, the events that come for them, and the session that holds both."""
+"""Subscriptions and events of a scene's stream, and the session state shared by the stream clients."""
 
 from __future__ import annotations
 
@@ -42,17 +42,25 @@ OUTAGE_S = 20.0
 FIRST_WAIT_S = 0.2
 LONGEST_WAIT_S = 5.0
 UNREAD_MESSAGES = 2
-"""Read ahead of the caller. Few: what the service holds back is replaced by what is newer."""
+"""Maximum number of messages read ahead of the caller.
+
+It is small because the service replaces messages that it cannot send yet by newer ones.
+"""
 RETRIED_STATUSES = (429, 502, 503, 504)
 
 
 @dataclass(frozen=True)
 class BinaryEvent:
-    """A binary message of a subscription.
+    """Binary message of a subscription.
 
     Attributes:
-        id: the subscription's. tag: of the request that this answers. missed: what it took the place of, unsent.
-        frame: the newest that it knows. media_type: of `body`. headers: as the same request over HTTP has them.
+        id: id of the subscription.
+        tag: tag of the request that it answers.
+        missed: number of unsent messages that it replaces.
+        frame: index of the newest frame that it covers.
+        media_type: media type of `body`.
+        headers: response headers of the equivalent HTTP request.
+        body: encoded content.
     """
 
     id: str
@@ -64,38 +72,38 @@ class BinaryEvent:
     body: bytes
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """Reads the body as the arrays of an npz; nothing is unpickled."""
+        """Returns the arrays of an npz body by name; pickled data is refused."""
         with np.load(io.BytesIO(self.body), allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
 
 
 @dataclass(frozen=True)
 class ViewEvent(BinaryEvent):
-    """A rendered view."""
+    """Event with a rendered view."""
 
     def picture(self) -> NDArray[Any]:
-        """Decodes the picture: [H, W, 3] uint8 for colour, else [H, W]."""
+        """Returns the decoded image: [H, W, 3] uint8 for colour, else [H, W]."""
         with Image.open(io.BytesIO(self.body)) as picture:
             return np.array(picture)
 
 
 @dataclass(frozen=True)
 class TracksEvent(BinaryEvent):
-    """Trajectories over the frames `first` to `frame`, which go on where the message before ended."""
+    """Event with trajectories over the frames `first` to `frame`, which continue the previous event."""
 
     first: int
 
     def model(self) -> TracksModel:
-        """Of a request for JSON."""
+        """Returns the decoded trajectories; only for requests with format `json`."""
         return TracksModel.model_validate_json(self.body)
 
 
 @dataclass(frozen=True)
 class PartsEvent(BinaryEvent):
-    """Part labels of all Gaussians."""
+    """Event with the part labels of all Gaussians."""
 
     def model(self) -> PartsModel:
-        """Of a request for JSON."""
+        """Returns the decoded part labels."""
         return PartsModel.model_validate_json(self.body)
 
 
@@ -104,14 +112,14 @@ Event = SceneMessage | FrameMessage | ViewEvent | TracksEvent | PartsEvent
 
 @dataclass(frozen=True)
 class SubscriptionRequest:
-    """A topic and its request, to subscribe to; made by the functions below."""
+    """Topic and request of a subscription, created by the functions below."""
 
     topic: Topic
     request: Model
 
 
 def scene_changes() -> SubscriptionRequest:
-    """Subscribes to the scene's state, progress and queue at every change.
+    """Returns a subscription to the scene's state, progress and queue, sent on every change.
 
     >>> with Stream(url, scene) as stream:
     ...     stream.subscribe("scene", scene_changes())
@@ -123,7 +131,7 @@ def scene_changes() -> SubscriptionRequest:
 
 
 def finished_frames() -> SubscriptionRequest:
-    """Subscribes to the report of each finished frame, with its metrics.
+    """Returns a subscription to the report of each finished frame, including its metrics.
 
     >>> with Stream(url, scene) as stream:
     ...     stream.subscribe("done", finished_frames())
@@ -143,7 +151,7 @@ def view(
     background: tuple[float, float, float] | None = None,
     parts: int | None = None,
 ) -> SubscriptionRequest:
-    """Subscribes to a view of every new frame, or of a chosen one. Arguments as of `client.calls.render`.
+    """Returns a subscription to a view of every new frame or of a fixed one; arguments as for `client.calls.render`.
 
     >>> with Stream(url, scene) as stream:
     ...     stream.subscribe("live", view(rig.cameras[0], format="png"))
@@ -168,7 +176,9 @@ def tracks(
     project: Sequence[Camera | str] = (),
     format: str = "json",
 ) -> SubscriptionRequest:
-    """Subscribes to trajectories so far, then of each new frame. Arguments as of `client.calls.tracks`.
+    """Returns a subscription to trajectories, first over all frames, then over each new one.
+
+    The arguments are those of `client.calls.tracks`, except that `first` replaces `frames`.
 
     >>> with Stream(url, scene) as stream:
     ...     stream.subscribe("two", tracks(ids=[0, 1]))
@@ -190,7 +200,7 @@ def tracks(
 
 
 def parts(count: int | None = None, *, every: int = 1) -> SubscriptionRequest:
-    """Subscribes to part labels of all Gaussians, found anew after every `every` frames.
+    """Returns a subscription to the part labels of all Gaussians, recomputed every `every` frames.
 
     >>> with Stream(url, scene) as stream:
     ...     stream.subscribe("labels", parts(2))
@@ -202,7 +212,7 @@ def parts(count: int | None = None, *, every: int = 1) -> SubscriptionRequest:
 
 
 def event_of(head: BinaryHead, body: bytes) -> ViewEvent | TracksEvent | PartsEvent:
-    """The event of a binary message."""
+    """Returns the event for a binary message."""
     given = (head.id, head.tag, head.missed, head.frame, head.media_type, head.headers, body)
     if head.type == "tracks":
         return TracksEvent(*given, first=head.frame if head.first is None else head.first)
@@ -210,7 +220,7 @@ def event_of(head: BinaryHead, body: bytes) -> ViewEvent | TracksEvent | PartsEv
 
 
 class StreamSession:
-    """Subscriptions of a stream, the messages that ask for them, and the events read from the answers."""
+    """Session state of a stream: its subscriptions, the messages to send, and the decoding of received messages."""
 
     def __init__(self, url: str, scene: str, token: str | None, outage: float) -> None:
         self.scene = scene
@@ -220,8 +230,8 @@ class StreamSession:
         self.arguments: dict[str, Any] = {
             "subprotocols": [Subprotocol(STREAM_PROTOCOL)],
             "additional_headers": {} if token is None else {"Authorization": f"Bearer {token}"},
-            "compression": None,  # bulk is compressed already
-            "max_size": None,  # the service is the one that was asked for bulk
+            "compression": None,  # large messages are already compressed
+            "max_size": None,  # the client itself requested the large messages
             "max_queue": UNREAD_MESSAGES,
             "close_timeout": 2,
         }
@@ -230,13 +240,13 @@ class StreamSession:
         self._failures = 0
 
     def subscribe(self, id: str, wanted: SubscriptionRequest, tag: int | None) -> str:
-        """Keeps a subscription; the message that asks for it."""
+        """Stores a subscription and returns the message that requests it."""
         request = wanted.request.model_dump(mode="json", exclude_unset=True)
         self.subscriptions[id] = Subscribe(id=id, topic=wanted.topic, request=request, tag=tag)
         return self.subscriptions[id].model_dump_json()
 
     def update(self, id: str, tag: int | None, changes: Mapping[str, Any]) -> str:
-        """Changes a kept subscription; the message that asks for the change."""
+        """Changes a stored subscription and returns the message that requests the change."""
         request = dict(changes)
         if "camera" in request and not isinstance(request["camera"], str):
             request["camera"] = CameraModel.of(request["camera"]).model_dump(mode="json")
@@ -245,15 +255,15 @@ class StreamSession:
         return Update(id=id, request=request, tag=tag).model_dump_json()
 
     def unsubscribe(self, id: str) -> str:
-        """Forgets a subscription; the message that ends it."""
+        """Removes a subscription and returns the message that ends it."""
         self.subscriptions.pop(id)
         return Unsubscribe(id=id).model_dump_json()
 
     def read(self, data: str | bytes) -> Event | SceneGone | None:
-        """Reads a message; None for one that is of no interest to the caller.
+        """Returns the event of a received message, or None if it is irrelevant to the caller.
 
         Raises:
-            ServiceError: the service refused what was asked for.
+            ServiceError: the service refused a request.
         """
         if isinstance(data, bytes):
             return event_of(*unpack(data))
@@ -263,15 +273,15 @@ class StreamSession:
         return message if isinstance(message, SceneMessage | FrameMessage | SceneGone) else None
 
     def connected(self) -> None:
-        """Forgets earlier failures."""
+        """Resets the failure count after a successful connection."""
         self._failed_at, self._failures = None, 0
 
     def wait_after(self, error: Exception) -> float:
-        """Seconds until the next try.
+        """Returns the delay in seconds before the next connection attempt.
 
         Raises:
-            ServiceError: the service answered, and refused.
-            ServiceUnreachable: it was tried for long enough.
+            ServiceError: the service refused the connection.
+            ServiceUnreachable: the service could not be reached within the outage timeout.
         """
         if isinstance(error, InvalidStatus) and error.response.status_code not in RETRIED_STATUSES:
             raise error_of_problem(_problem(error)) from error

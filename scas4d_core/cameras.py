@@ -304,7 +304,7 @@ class Rig:
         with np.errstate(over="ignore", invalid="ignore"):
             far = not np.isfinite(self._spread)
         if far:
-            raise CameraError("camera centres are too far away for numbers", "give world_to_camera in other units")
+            raise CameraError("camera centres are too far from the origin", "give world_to_camera in other units")
         if metres_per_unit == "auto":
             if self.at_one_place:
                 raise CameraError(

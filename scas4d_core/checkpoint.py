@@ -153,7 +153,7 @@ class Checkpoints:
             names = {str(name) for name in arrays.pop("names")}
             missing = names ^ set(arrays)
             if missing:
-                raise ValueError(f"{file.name}: {', '.join(sorted(missing))} went missing")
+                raise ValueError(f"{file.name}: {', '.join(sorted(missing))} are missing")
             pictures = {name[5:]: array for name, array in arrays.items() if name.startswith("seen.")}
             seen = factory.views(Frame(index, 0.0, pictures, {}), {}, use_masks=False) if pictures else ()
             motion = _unpacked(arrays) if "motion.seconds" in arrays else None

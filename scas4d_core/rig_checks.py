@@ -159,7 +159,7 @@ def check_start(rig: Rig, has_points: bool) -> None:
     which = "one camera" if len(rig) == 1 else f"all {len(rig)} cameras are at one place"
     raise RigError(
         f"{which}, and no points: distances are unknown",
-        "give points of the first frame, or cameras that stand apart",
+        "give points of the first frame, or cameras at different places",
         "points",
         "nothing",
     )

@@ -95,7 +95,7 @@ class Hub:
         if len(channel.listeners) >= self.max_listeners:
             raise Problem(
                 429,
-                f"this scene has its maximum of subscribers: {len(channel.listeners)}",
+                f"this scene has the maximum number of subscribers: {len(channel.listeners)}",
                 field="SCAS4D_MAX_SUBSCRIBERS",
                 value=self.max_listeners,
                 remedy="close another subscriber of the scene, or raise the limit",
@@ -133,7 +133,7 @@ class Hub:
             try:
                 listener.on_event(event)
             except Exception:
-                log.exception("scene %s: a subscriber could not take the event %s", scene, type(event).__name__)
+                log.exception("scene %s: a subscriber could not handle the event %s", scene, type(event).__name__)
 
     def close(self, scene: str, reason: str) -> None:
         """Closes the channel of a deleted scene and notifies its listeners."""

@@ -62,7 +62,7 @@ def serve(settings: ServerSettings) -> None:
     try:
         lock_data(settings.data).release()  # early check; the application takes the lock at startup
     except OSError as error:
-        raise RuntimeError(f"data folder {settings.data}: {error.strerror}; name another with --data") from None
+        raise RuntimeError(f"data folder {settings.data}: {error.strerror}; choose another one with --data") from None
     placement = _placement(settings, prepare)
     sockets = listen(settings.host, settings.port)
     asyncio.run(placement.open())  # early check, too
@@ -97,7 +97,7 @@ def _placement(settings: ServerSettings, prepare: Callable[[], None]) -> Placeme
         from server.cluster.ray_placement import RayPlacement
     except ModuleNotFoundError:
         raise RuntimeError(
-            "placement is ray, and Ray is not installed; pip install 'scas4d[ray]', or take --placement local"
+            "placement is ray, and Ray is not installed; pip install 'scas4d[ray]', or use --placement local"
         ) from None
     return RayPlacement(prepare, settings.placement.partition("=")[2] or None, settings)
 
@@ -107,8 +107,8 @@ def _limit_to_open_files(settings: ServerSettings) -> ServerSettings:
     room = raise_open_file_limit(settings.max_connections)
     if room < settings.max_connections:
         log.warning(
-            "SCAS4D_MAX_CONNECTIONS is %d, but files may be open for %d connections only; raise the limit on open "
-            "files (ulimit -n)",
+            "SCAS4D_MAX_CONNECTIONS is %d, but the limit on open files allows only %d connections; raise that limit "
+            "(ulimit -n)",
             settings.max_connections,
             room,
         )
@@ -135,8 +135,8 @@ def listen(host: str, port: int) -> list[socket.socket]:
             opened.close()
         if error.errno == errno.EADDRINUSE:
             raise RuntimeError(
-                f"port {port} of {host} is in use, perhaps by another `scas4d serve`; stop that, or take another port: "
-                f"--port {port + 1 if port < 65535 else 8000}, or 0 for any that is free"
+                f"port {port} of {host} is in use, perhaps by another `scas4d serve`; stop it, or use another port: "
+                f"--port {port + 1 if port < 65535 else 8000}, or 0 for any free port"
             ) from None
         raise RuntimeError(
             f"cannot listen at {host}, port {port}: {error.strerror}; give an address of this machine (--host) and a "

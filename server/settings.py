@@ -227,7 +227,9 @@ class ServerSettings(BaseSettings):
             try:
                 ipaddress.ip_network(network)
             except ValueError as error:
-                raise ValueError(f"a proxy is an address or a network, as 10.0.0.2 or 10.1.0.0/24 ({error})") from None
+                raise ValueError(
+                    f"a proxy is an address or a network, such as 10.0.0.2 or 10.1.0.0/24 ({error})"
+                ) from None
         return value
 
     @model_validator(mode="after")
@@ -235,18 +237,18 @@ class ServerSettings(BaseSettings):
         if not re.fullmatch(r"local|ray(=\S+:\d+)?", self.placement):
             raise ValueError(f"placement is {self.placement!r}; give local, ray, or ray=HOST:PORT")
         if self.token is not None and self.token_file is not None:
-            raise ValueError("token and token_file are two tokens; give one of them")
+            raise ValueError("token and token_file are both set; give only one")
         if self.token_file is not None and not self.token_file.is_file():
             raise ValueError(f"token_file: there is no file {self.token_file}")
         secret = self.secret
         if secret is not None and not TOKEN.fullmatch(secret):
             raise ValueError(
-                "the token has to be 16 to 512 of the characters A-Z a-z 0-9 . _ ~ + / = -; make one with: "
+                "the token must consist of 16 to 512 of the characters A-Z a-z 0-9 . _ ~ + / = -; make one with: "
                 'python -c "import secrets; print(secrets.token_urlsafe(32))"'
             )
         if secret is None and not is_loopback(self.host):
             raise ValueError(
-                f"host {self.host} can be reached from other machines, and there is no token; set SCAS4D_TOKEN or "
+                f"host {self.host} is reachable from other machines, and there is no token; set SCAS4D_TOKEN or "
                 "SCAS4D_TOKEN_FILE, or listen at 127.0.0.1"
             )
         return self

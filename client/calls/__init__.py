@@ -1,8 +1,8 @@
-"""Requests as values, one file per resource; the sync and the async client send the same ones.
+"""API requests as values, one module per resource, shared by the sync and the async client.
 
-In the examples `client` is a `client.sdk.Client`, `scene` the id of a scene with frames 0 to 2 committed, `rig` its
-rig of two cameras, `open_scene` the id of a scene that takes further frames, `pictures` a PNG file by camera, and `np`
-is numpy; `time` is the module.
+In the examples, `client` is a `client.sdk.Client`, and `scene` is the id of a scene with frames 0 to 2 committed. `rig`
+is its rig of two cameras. `open_scene` is the id of a scene that accepts further frames, and `pictures` maps camera
+names to PNG files. `np` is numpy, and `time` is the module.
 """
 
 from client.calls.budgets import budget, end_replay, replay, set_budget, tradeoff

@@ -1,4 +1,4 @@
-"""Calls on budgets of updates, and on the measured accuracy against time."""
+"""Calls for update budgets and for the measured trade-off between accuracy and time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from client.wire.budgets import BudgetFields
 
 
 def budget(id: str) -> Call[SceneBudget]:
-    """Reads the budget of a scene's updates.
+    """Returns the budget of a scene's updates.
 
     >>> client.budget(scene).effective.iterations
     100
@@ -20,24 +20,24 @@ def budget(id: str) -> Call[SceneBudget]:
 
 
 def set_budget(id: str, **budget: Unpack[BudgetFields]) -> Call[SceneBudget]:
-    """Sets another budget, from the first frame on that is not begun.
+    """Sets the budget for all frames whose reconstruction has not started.
 
     Args:
-        id: of the scene.
-        budget: fields of `client.wire.Budget`: iterations, budget_ms, stop_gain, still. A field that is left out, or
-            None, is as the scene was made.
+        id: id of the scene.
+        budget: fields of `client.wire.Budget`: iterations, budget_ms, stop_gain, still. A field that is omitted or None
+            takes the value from the scene's settings.
 
     >>> found = client.set_budget(scene, iterations=50)
     >>> found.effective.iterations, found.since
     (50, 3)
-    >>> client.set_budget(scene).effective.iterations  # as the scene was made
+    >>> client.set_budget(scene).effective.iterations  # the scene's own settings
     100
     """
     return Call("PUT", path(id, "budget"), json_reader(SceneBudget), arguments=body(Budget(**budget)))
 
 
 def tradeoff(id: str) -> Call[TradeoffModel]:
-    """Reads the measured points of accuracy against time, for this scene on its machine.
+    """Returns the measured trade-off between accuracy and time for this scene on its machine.
 
     >>> "measured" in [point.kind for point in client.tradeoff(scene).points]
     True
@@ -46,14 +46,14 @@ def tradeoff(id: str) -> Call[TradeoffModel]:
 
 
 def replay(id: str, iterations: Sequence[int] = (25, 50, 200), frames: int = 4) -> Call[TradeoffModel]:
-    """Measures other numbers of iterations: the newest frames are updated again, in the background and in memory.
+    """Measures other iteration counts by replaying the updates of the newest frames in the background, in memory.
 
-    `tradeoff` reports its progress, and has the points when it is done.
+    `tradeoff` reports the progress, and the results when the replay has finished.
 
     Args:
-        id: of the scene.
-        iterations: a frame, each a replay; the scene's own number is always measured too.
-        frames: that are replayed; their pictures must still be held.
+        id: id of the scene.
+        iterations: iteration counts per frame to measure, one replay each; the scene's own count is always included.
+        frames: number of frames to replay; their images must still be stored.
 
     >>> client.replay(scene, [50], frames=1).replay.state
     <ReplayState.RUNNING: 'running'>
@@ -65,7 +65,7 @@ def replay(id: str, iterations: Sequence[int] = (25, 50, 200), frames: int = 4) 
 
 
 def end_replay(id: str) -> Call[TradeoffModel]:
-    """Ends the replay that is running, if one is; what it has measured stays.
+    """Stops a running replay, if any; its measurements are kept.
 
     >>> client.end_replay(scene).scene == scene
     True

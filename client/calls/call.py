@@ -1,4 +1,4 @@
-"""`Call`: a request as a value; paths, bodies and readers of answers that most calls share."""
+"""API request as a value (`Call`), with helpers for paths, request bodies and response parsing."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ NPZ = "application/vnd.numpy.npz"
 
 @dataclass(frozen=True)
 class Call(Generic[T]):
-    """One request.
+    """Single request to the service.
 
     Attributes:
-        method: of HTTP.
-        path: below the address of the service.
-        parse: the answer to what the caller gets.
-        repeatable: sending it twice does what sending it once does, so a client may try again.
-        arguments: further ones of `httpx.Client.request`.
+        method: HTTP method.
+        path: path relative to the address of the service.
+        parse: converts the response to the return value of the call.
+        repeatable: whether the request is idempotent, so that a client may retry it.
+        arguments: further arguments of `httpx.Client.request`.
     """
 
     method: str
@@ -43,36 +43,36 @@ class Call(Generic[T]):
 
 
 def path(*parts: str | int) -> str:
-    """A path below /v1/scenes; each part is quoted."""
+    """Returns a path below /v1/scenes; each part is URL-quoted."""
     return "/".join(["/v1/scenes", *(quote(str(part), safe="") for part in parts)])
 
 
 def json_reader(model: type[M]) -> Callable[[httpx.Response], M]:
-    """A reader of the answer's JSON as a model of the wire."""
+    """Returns a function that parses the JSON of a response as a wire model."""
     return lambda response: model.model_validate_json(response.content)
 
 
 def nothing(response: httpx.Response) -> None:
-    """Reads nothing: for answers without a body."""
+    """Ignores a response without a body."""
 
 
 def body(model: BaseModel) -> dict[str, Any]:
-    """A model of the wire as the request's JSON; what was not set is left out."""
+    """Returns the request arguments for a wire model as JSON; unset fields are omitted."""
     return {"json": model.model_dump(mode="json", exclude_unset=True)}
 
 
 def wire_camera(camera: Camera | str) -> CameraModel | str:
-    """A camera by name, or as it goes over the wire."""
+    """Returns a camera name unchanged, or the wire model of a camera."""
     return camera if isinstance(camera, str) else CameraModel.of(camera)
 
 
 def read_picture(response: httpx.Response) -> NDArray[Any]:
-    """Decodes PNG, JPEG or WebP to [H, W, 3] or [H, W], 8 bit, or 16 for a depth."""
+    """Returns the decoded PNG, JPEG or WebP as [H, W, 3] or [H, W], with 8 bits, or 16 bits for depth."""
     with Image.open(io.BytesIO(response.content)) as picture:
         return np.array(picture)
 
 
 def read_npz(response: httpx.Response) -> dict[str, NDArray[Any]]:
-    """Reads the arrays of an npz by name; nothing is unpickled."""
+    """Returns the arrays of an npz by name; pickled data is refused."""
     with np.load(io.BytesIO(response.content), allow_pickle=False) as file:
         return {name: file[name] for name in file.files}

@@ -1,4 +1,4 @@
-"""Calls on exports: files of many frames in the formats of other tools, which the service makes in the background."""
+"""Calls for exports: files with many frames in third-party formats, which the service writes in the background."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ def begin_export(
     last: int | None = None,
     ids: Sequence[int] | None = None,
 ) -> Call[ExportModel]:
-    """Has the service write committed frames to a file, in the background; `export` reports its progress.
+    """Starts a background export of committed frames to a file on the service; `export` reports its progress.
 
     Args:
-        id: of the scene.
-        format: a name of docs/exports.md.
-        first, last: frames, both counted in; None: the first and the last that are committed.
-        ids: Gaussians of format `tracks`; None: all that move.
+        id: id of the scene.
+        format: format name from docs/exports.md.
+        first, last: first and last frame, inclusive; None for the first and the last committed frame.
+        ids: ids of the Gaussians for the format `tracks`; None for all moving Gaussians.
 
     Raises:
-        Conflict: no frame is committed, or the scene has as many exports as it may.
-        Busy: as many exports wait as may.
+        Conflict: no frame is committed, or the scene has the maximum number of exports.
+        Busy: the queue of exports is full.
 
     >>> begun = client.begin_export(scene, "ply", first=1)
     >>> begun.frames, begun.format
@@ -49,7 +49,7 @@ def exports(id: str) -> Call[ExportList]:
 
 
 def export(id: str, export_id: str) -> Call[ExportModel]:
-    """Reads the state of an export.
+    """Returns the state of an export.
 
     >>> begun = client.begin_export(scene, "splat", first=0, last=1)
     >>> while (found := client.export(scene, begun.id)).state in ("waiting", "running"):
@@ -62,14 +62,17 @@ def export(id: str, export_id: str) -> Call[ExportModel]:
 
 
 def export_file(id: str, export_id: str, begin: int = 0, count: int | None = None) -> Call[bytes]:
-    """Reads the file of an export that is done, or so many bytes of it: a large one comes piece by piece.
+    """Returns the file of a finished export, or a byte range of it, so that large files can be read in pieces.
 
     Args:
-        id: of the scene. export_id: of the export.
-        begin, count: bytes; None: to the end.
+        id: id of the scene.
+        export_id: id of the export.
+        begin: offset of the first byte.
+        count: number of bytes; None for all bytes to the end.
 
     Raises:
-        Conflict: it is not done. NotFound: its file is removed.
+        Conflict: the export is not finished.
+        NotFound: the file has been removed.
 
     >>> begun = client.begin_export(scene, "ply")
     >>> while not client.export(scene, begun.id).file:
@@ -84,7 +87,7 @@ def export_file(id: str, export_id: str, begin: int = 0, count: int | None = Non
 
 
 def delete_export(id: str, export_id: str) -> Call[None]:
-    """Cancels an export that waits or runs; removes one that is over, with its file.
+    """Cancels a queued or running export, or removes a finished one with its file.
 
     >>> begun = client.begin_export(scene, "ply")
     >>> while not client.export(scene, begun.id).file:

@@ -1,4 +1,4 @@
-"""Calls on frames: send whole or camera by camera, close, declare missing, read reports and exports."""
+"""Calls for frames: upload whole or per camera, closing, declaring missing, reports and downloads."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ def put_frame(
     masks: Mapping[str, bytes] | None = None,
     time: float | None = None,
 ) -> Call[FrameReceipt]:
-    """Sends frame `index` whole. Waits while the queue is full.
+    """Sends frame `index` with the images of all cameras; waits while the queue is full.
 
     Args:
-        id: of the scene.
-        index: 0, 1, 2, …
-        images: JPEG, PNG or WebP files by camera name, all cameras of the rig.
-        masks: PNG files by camera name, of all cameras or none.
-        time: seconds, rising from frame to frame; index / frames_per_second where not given.
+        id: id of the scene.
+        index: frame index: 0, 1, 2, …
+        images: JPEG, PNG or WebP files by camera name, for all cameras of the rig.
+        masks: PNG files by camera name, for all cameras or none.
+        time: time in seconds, increasing from frame to frame; index / frames_per_second if None.
 
     Raises:
-        FrameGap: `expected` is the index that comes next.
-        Conflict: the index is known with other content.
+        FrameGap: another frame must be sent first; `expected` is its index.
+        Conflict: the frame was already sent with different content.
 
     >>> n = client.scene(open_scene).next_frame
     >>> client.put_frame(open_scene, n, pictures).index == n
@@ -51,18 +51,18 @@ def put_frame(
 def put_camera(
     id: str, index: int, camera: str, image: bytes, mask: bytes | None = None, time: float | None = None
 ) -> Call[CameraReceipt]:
-    """Sends one camera's picture of frame `index`, where each camera has its own sender.
+    """Sends one camera's image of frame `index`, for rigs in which each camera has its own sender.
 
-    The frame closes when all cameras are in, on `close_frame`, or after the scene's `ingest.open_frame_seconds`. A
-    camera may be some frames ahead of the others.
+    The frame closes when all cameras have arrived, on `close_frame`, or after the scene's `ingest.open_frame_seconds`.
+    A camera may be a few frames ahead of the others.
 
     Args:
-        id: of the scene.
-        index: of the frame.
-        camera: of the rig.
-        image: JPEG, PNG or WebP.
-        mask: PNG.
-        time: seconds of the frame, the same for all its cameras.
+        id: id of the scene.
+        index: index of the frame.
+        camera: name of a camera of the rig.
+        image: JPEG, PNG or WebP file.
+        mask: PNG file.
+        time: time of the frame in seconds, equal for all its cameras.
 
     >>> n = client.scene(open_scene).next_frame
     >>> client.put_camera(open_scene, n, "c0", pictures["c0"]).absent
@@ -75,7 +75,7 @@ def put_camera(
 
 
 def close_frame(id: str, index: int) -> Call[FrameReceipt]:
-    """Closes a frame whose cameras send one by one: it is reconstructed without those that are absent.
+    """Closes a frame that is sent camera by camera; it is reconstructed without the absent cameras.
 
     >>> n = client.scene(open_scene).next_frame
     >>> client.put_camera(open_scene, n, "c0", pictures["c0"]).absent
@@ -87,7 +87,7 @@ def close_frame(id: str, index: int) -> Call[FrameReceipt]:
 
 
 def declare_missing(id: str, index: int, reason: str = "") -> Call[FrameReportModel]:
-    """Declares that frame `index`, which is next, will never come; for ever. The one after it is next then.
+    """Declares the next frame permanently missing; `index` must be the next index, and the following frame comes next.
 
     >>> n = client.scene(open_scene).next_frame
     >>> client.declare_missing(open_scene, n, "cable").state
@@ -107,7 +107,7 @@ def _framed(
 
 
 def frame(id: str, index: int) -> Call[FrameReportModel]:
-    """Reads the report of a frame.
+    """Returns the report of a frame.
 
     >>> report = client.frame(scene, 1)
     >>> report.state, report.used_cameras
@@ -117,7 +117,7 @@ def frame(id: str, index: int) -> Call[FrameReportModel]:
 
 
 def frames(id: str, first: int = 0, limit: int = 500) -> Call[FrameList]:
-    """Reads the reports of many frames, from `first` on; `next` of the answer is the index to go on with.
+    """Returns the reports of up to `limit` frames starting at `first`; `next` is the `first` of the next page.
 
     >>> listed = client.frames(scene, limit=1)
     >>> [report.index for report in listed.frames], listed.next
@@ -128,7 +128,7 @@ def frames(id: str, first: int = 0, limit: int = 500) -> Call[FrameList]:
 
 
 def ply(id: str, index: int) -> Call[bytes]:
-    """Reads a committed frame as a 3DGS .ply.
+    """Returns a committed frame as a 3DGS .ply file.
 
     >>> client.ply(scene, 1)[:3]
     b'ply'
@@ -137,9 +137,9 @@ def ply(id: str, index: int) -> Call[bytes]:
 
 
 def states(id: str, first: int = 0, limit: int = 120, parts: bool = False) -> Call[tuple[bytes, int | None]]:
-    """Reads committed frames from `first` on as a compact 4D file, and the frame to go on with, or None.
+    """Returns committed frames starting at `first` as a compact 4D file, and the next frame to request, or None.
 
-    The file may start before the requested range, at the key frame that it depends on.
+    The file may start before the requested range, at the key frame on which it depends.
 
     >>> data, following = client.states(scene)
     >>> data[:4], following
@@ -155,7 +155,7 @@ def states(id: str, first: int = 0, limit: int = 120, parts: bool = False) -> Ca
 
 
 def picture(id: str, index: int, camera: str, kind: FileKind = FileKind.IMAGE) -> Call[bytes]:
-    """Reads one camera's picture of a frame, or its mask, byte for byte as it was sent.
+    """Returns one camera's image or mask of a frame, byte for byte as it was sent.
 
     >>> client.picture(scene, 1, "c0")[1:4]
     b'PNG'

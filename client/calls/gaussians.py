@@ -1,4 +1,4 @@
-"""Calls on Gaussians: the frames in which they came and went."""
+"""Calls for the lifetimes of Gaussians."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from client.wire import GaussiansModel
 
 
 def gaussians(id: str, ids: Sequence[int]) -> Call[GaussiansModel]:
-    """Reads the lives of Gaussians by id: the frames in which each was born, retired and revived.
+    """Returns the lifetimes of Gaussians by id: the frames in which each was created, retired and revived.
 
     >>> found = client.gaussians(scene, [1, 0])
     >>> [(one.id, one.born, one.retired) for one in found.gaussians]

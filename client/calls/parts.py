@@ -1,4 +1,4 @@
-"""Calls on parts: groups of Gaussians that move together."""
+"""Calls for parts, which are groups of Gaussians that move together."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from client.wire import PartsModel
 
 
 def parts(id: str, count: int | None = None) -> Call[PartsModel]:
-    """Reads a part label for every Gaussian; `count` parts, or as many as a stated rule finds.
+    """Returns a part label for every Gaussian; if `count` is None, the number of parts is chosen automatically.
 
     >>> found = client.parts(scene, 2)
     >>> found.count, len(found.labels) == len(found.ids)

@@ -1,4 +1,4 @@
-"""Calls on scenes: create, read, edit, pause, resume, put to sleep, begin again, delete; points of frame 0."""
+"""Calls that create, read, edit, pause, resume, put to sleep, restart and delete scenes, and upload initial points."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ def create_scene(
     ingest: IngestSettings | None = None,
     nodes: Mapping[str, str] | None = None,
 ) -> Call[SceneStatus]:
-    """Creates a scene. The request is never sent twice: that would make two.
+    """Creates a scene; the request is never retried, since that could create two scenes.
 
     Args:
-        rig: its cameras, at the size of the pictures that will be sent.
-        name: for people; the service makes the id.
-        preset: named settings.
-        settings: what differs from the preset, nested.
-        frames_per_second: frame n without a time of its own is taken at n / frames_per_second.
-        ingest: how the scene takes frames, and what it keeps of them.
-        nodes: labels that a node of the cluster must have to run its processes.
+        rig: cameras at the resolution of the images that will be sent.
+        name: display name; the service assigns the id.
+        preset: name of a settings preset.
+        settings: nested settings that differ from the preset.
+        frames_per_second: frame rate; frame n without a timestamp gets the time n / frames_per_second.
+        ingest: how the scene accepts frames and which data it keeps.
+        nodes: labels that a cluster node must have to run the scene's processes.
 
     >>> new = client.create_scene(rig, name="studio", settings={"update": {"iterations": 50}})
     >>> new.state, new.settings["update"]["iterations"]
@@ -65,7 +65,7 @@ def create_scene(
 
 
 def estimate(rig: Rig, *, preset: str = "scas4d", settings: Mapping[str, Any] | None = None) -> Call[SceneEstimate]:
-    """Estimates the memory and disk that a scene would take; arguments as `create_scene`, and nothing is created.
+    """Returns the estimated memory and disk usage of a scene without creating it; arguments as for `create_scene`.
 
     >>> found = client.estimate(rig)
     >>> found.memory_mb < found.limit_mb
@@ -76,7 +76,7 @@ def estimate(rig: Rig, *, preset: str = "scas4d", settings: Mapping[str, Any] | 
 
 
 def scenes() -> Call[list[SceneStatus]]:
-    """Reads the status of all scenes, oldest first.
+    """Returns the status of all scenes, oldest first.
 
     >>> scene in [status.id for status in client.scenes()]
     True
@@ -85,7 +85,7 @@ def scenes() -> Call[list[SceneStatus]]:
 
 
 def scene(id: str) -> Call[SceneStatus]:
-    """Reads a scene's state, progress and queue.
+    """Returns a scene's state, progress and queue.
 
     >>> client.scene(scene).committed
     3
@@ -94,7 +94,7 @@ def scene(id: str) -> Call[SceneStatus]:
 
 
 def rig(id: str) -> Call[Rig]:
-    """Reads a scene's cameras.
+    """Returns a scene's camera rig.
 
     >>> client.rig(scene).names
     ('c0', 'c1')
@@ -103,7 +103,7 @@ def rig(id: str) -> Call[Rig]:
 
 
 def pause(id: str) -> Call[SceneStatus]:
-    """Pauses a scene after the frame at work: it takes frames, and reconstructs none.
+    """Pauses a scene after the current frame; it accepts frames but does not reconstruct them.
 
     >>> client.pause(scene).paused
     True
@@ -131,13 +131,15 @@ def edit_scene(
     keep_states: Retention | None = None,
     exact_states: int | None = None,
 ) -> Call[SceneStatus]:
-    """Renames a scene, archives it or takes that back, or changes what it keeps; what is None stays.
+    """Renames, archives or unarchives a scene, or changes its retention rules; None leaves a value unchanged.
 
     Args:
-        id: of the scene. name: for people.
-        archived: True: it takes no further frames, and sleeps unless it is looked at.
-        keep_frames, keep_states: rules for pictures and committed states, as in `IngestSettings`; they hold at once.
-        exact_states: so many newest states stay exact, older ones go to compact files.
+        id: id of the scene.
+        name: display name.
+        archived: whether the scene refuses further frames, and sleeps unless it is viewed.
+        keep_frames, keep_states: retention rules for images and committed states, as in `IngestSettings`; they take
+            effect immediately.
+        exact_states: number of newest states that stay exact; older ones are moved to compact files.
 
     >>> from client.wire import Retention
     >>> new = client.create_scene(rig)
@@ -152,7 +154,7 @@ def edit_scene(
 
 
 def put_to_sleep(id: str) -> Call[SceneStatus]:
-    """Ends the processes of an idle scene; it wakes by itself when it is asked or sent something.
+    """Stops the processes of an idle scene, which wakes automatically on the next request or frame.
 
     >>> new = client.create_scene(rig)
     >>> client.put_to_sleep(new.id).asleep
@@ -163,7 +165,7 @@ def put_to_sleep(id: str) -> Call[SceneStatus]:
 
 
 def delete_scene(id: str) -> Call[None]:
-    """Ends a scene and removes all it has on disk.
+    """Stops a scene and deletes all its data on disk.
 
     >>> new = client.create_scene(rig)
     >>> client.delete_scene(new.id)
@@ -182,18 +184,19 @@ def begin_again(
     points: bool = True,
     discard: bool = False,
 ) -> Call[SceneStatus]:
-    """Begins the reconstruction of a scene anew, after a first frame that failed or came out poor.
+    """Restarts the reconstruction of a scene, e.g. after a first frame that failed or has poor quality.
 
-    Frames from the first one on are updated again, as far as their pictures are held; ids begin anew.
+    All frames whose images are still stored are reconstructed again, starting with the first. Ids of Gaussians are
+    assigned anew.
 
     Args:
-        id: of the scene.
-        n: number of the new reconstruction, `scene(id).reconstruction + 1`: so it is begun once, however often this is
-            sent.
-        settings: what changes of the scene's settings, nested.
-        frame: to begin with, here or still to come; None: as before. Earlier frames fail.
-        points: begin from the scene's points (`put_points`), False: from the pictures alone.
-        discard: drop committed states; must be True where a frame after the first is committed.
+        id: id of the scene.
+        n: number of the new reconstruction, `scene(id).reconstruction + 1`; it makes the call idempotent.
+        settings: nested changes to the scene's settings.
+        frame: index of the first frame, already received or still to come; None for the same as before. Earlier frames
+            are marked as failed.
+        points: whether to initialize from the scene's points (`put_points`) instead of the images alone.
+        discard: whether to delete committed states; must be True if a frame after the first is committed.
 
     >>> new = client.create_scene(rig)
     >>> receipt = client.put_frame(new.id, 0, pictures)
@@ -210,11 +213,12 @@ def begin_again(
 
 
 def put_points(id: str, points: InitialPoints, *, reconstruction: int | None = None) -> Call[PointsReceipt]:
-    """Sends the initial points of frame 0; to be sent before it.
+    """Uploads the initial point cloud of frame 0; it must be sent before that frame.
 
     Args:
-        id: of the scene. points: in the rig's world and units.
-        reconstruction: number of the one that is to begin from them (`begin_again`); None: the scene's own.
+        id: id of the scene.
+        points: points in the rig's world frame and units.
+        reconstruction: number of the reconstruction that starts from the points (`begin_again`); None for the current.
 
     >>> from scas4d_core.captures import InitialPoints
     >>> new = client.create_scene(rig)

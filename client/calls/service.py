@@ -1,4 +1,4 @@
-"""Calls on the service itself: health, metrics, tickets."""
+"""Calls for the service itself: health, cluster, metrics, tickets and share links."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from client.wire import Cluster, Health, Share, ShareRequest, Ticket
 
 
 def live() -> Call[Health]:
-    """Reads whether the process answers.
+    """Returns the health of the service process; succeeds whenever the process responds.
 
     >>> client.live().status
     'live'
@@ -16,7 +16,7 @@ def live() -> Call[Health]:
 
 
 def ready() -> Call[Health]:
-    """Reads whether the service takes scenes; an error while it does not.
+    """Returns the health of the service once it is ready for scenes; raises an error before.
 
     >>> client.ready().status
     'ready'
@@ -25,7 +25,7 @@ def ready() -> Call[Health]:
 
 
 def ingest_ready() -> Call[Health]:
-    """Reads whether frames can be taken; an error while scenes are recovered or the disk has no room.
+    """Returns the health of the service while it accepts frames; raises an error during recovery or on a full disk.
 
     >>> client.ingest_ready().ingest_ready
     True
@@ -34,7 +34,7 @@ def ingest_ready() -> Call[Health]:
 
 
 def cluster() -> Call[Cluster]:
-    """Reads on which machines scenes run, and what waits for room.
+    """Returns the machines on which scenes run, and the scenes that wait for resources.
 
     >>> [node.alive for node in client.cluster().nodes]
     [True]
@@ -43,7 +43,7 @@ def cluster() -> Call[Cluster]:
 
 
 def metrics() -> Call[str]:
-    """Reads counters and gauges in the text format of Prometheus.
+    """Returns counters, histograms and gauges in the Prometheus text format.
 
     >>> client.metrics().startswith("# HELP")
     True
@@ -52,7 +52,7 @@ def metrics() -> Call[str]:
 
 
 def ticket() -> Call[Ticket]:
-    """Makes a ticket that opens one WebSocket from a browser, which cannot send the token.
+    """Returns a ticket that opens one WebSocket from a browser, where the token cannot be sent as a header.
 
     >>> client.ticket().ticket != client.ticket().ticket
     True
@@ -61,9 +61,9 @@ def ticket() -> Call[Ticket]:
 
 
 def share(scene: str | None = None, seconds: int = 7 * 86_400) -> Call[Share]:
-    """Makes a token that may only read one scene, or all, and the page's address that has it.
+    """Returns a read-only token for one scene or for all scenes, and a viewer address that contains it.
 
-    The service has to have a token itself, else everybody may do everything.
+    The service must be protected by a token itself; without one, access is unrestricted anyway.
 
     >>> client.share(scene)  # doctest: +IGNORE_EXCEPTION_DETAIL
     Traceback (most recent call last):

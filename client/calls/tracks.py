@@ -1,4 +1,4 @@
-"""Calls on trajectories of ids, of pixels, of points."""
+"""Calls for trajectories of Gaussians, pixels and 3D points."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ def tracks(
     frames: tuple[int, int] | None = None,
     project: Sequence[Camera | str] = (),
 ) -> Call[TracksModel]:
-    """Reads the trajectories of exactly one of `ids`, `pixels` and `points`.
+    """Returns trajectories for exactly one of `ids`, `pixels` and `points`.
 
     Args:
-        id: of the scene.
-        ids: of Gaussians.
-        pixels: [Q, 2] u v in the picture of `camera` at frame `at`; (0.5, 0.5) is the centre of the first pixel.
-        camera: where the pixels are.
-        points: [Q, 3] in the rig's world and units, at frame `at`.
-        at: the first committed frame where None.
-        frames: first and last, both included; all committed where None.
-        project: cameras to project into, with visibility.
+        id: id of the scene.
+        ids: ids of Gaussians.
+        pixels: [Q, 2] u v in the image of `camera` at frame `at`; (0.5, 0.5) is the centre of the first pixel.
+        camera: camera of the pixels.
+        points: [Q, 3] in the rig's world frame and units, at frame `at`.
+        at: frame of the pixels or points; None for the first committed frame.
+        frames: first and last frame, inclusive; None for all committed frames.
+        project: cameras into which the trajectories are projected, with visibility.
 
     >>> found = client.tracks(scene, ids=[0, 1], frames=(0, 1))
     >>> np.array(found.positions).shape
@@ -57,7 +57,7 @@ def tracks_arrays(
     frames: tuple[int, int] | None = None,
     project: Sequence[Camera | str] = (),
 ) -> Call[dict[str, NDArray[Any]]]:
-    """Reads trajectories as the arrays of an npz: for many. Arguments as of `tracks`.
+    """Returns trajectories as arrays, which is more efficient for many of them; arguments as for `tracks`.
 
     >>> client.tracks_arrays(scene, ids=[0, 1], project=["c0"])["tracks_world"].shape
     (3, 2, 3)

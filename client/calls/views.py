@@ -1,4 +1,4 @@
-"""Calls on novel views from committed frames."""
+"""Calls that render novel views of committed frames."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ def render(
     width: int | None = None,
     parts: int | None = None,
 ) -> Call[NDArray[Any]]:
-    """Renders one kind of view as a picture: [H, W, 3] uint8 for colour, else [H, W].
+    """Renders one kind of view and returns the image: [H, W, 3] uint8 for colour, else [H, W].
 
     Args:
-        id: of the scene.
-        camera: any camera in the rig's world, or the name of one of the rig.
-        frame: a committed one; the last where None.
+        id: id of the scene.
+        camera: any camera in the rig's world frame, or the name of a camera of the rig.
+        frame: index of a committed frame; None for the last.
         kind: colour, depth, alpha or parts.
-        format: how it crosses the wire: png, jpeg or webp.
-        background: RGB in 0…1; the scene's where None.
-        width: pixels that the camera is scaled to.
-        parts: number of parts; None: chosen by the rule of the method.
+        format: transfer format: png, jpeg or webp.
+        background: RGB in 0…1; None for the scene's background.
+        width: image width in pixels to which the camera is scaled.
+        parts: number of parts; None for the automatic choice.
 
     >>> client.render(scene, "c0").shape
     (16, 24, 3)
@@ -57,7 +57,7 @@ def render_file(
     width: int | None = None,
     parts: int | None = None,
 ) -> Call[bytes]:
-    """Renders a view; returns the bytes that the service sends. Arguments as of `render`, any of its formats.
+    """Renders a view and returns the encoded file; arguments as for `render`, with any format of the service.
 
     >>> client.render_file(scene, "c0", format="jpeg")[:2].hex()
     'ffd8'
@@ -76,7 +76,9 @@ def render_arrays(
     width: int | None = None,
     parts: int | None = None,
 ) -> Call[dict[str, NDArray[Any]]]:
-    """Renders several kinds of view as arrays by kind: colour 0…1, depth along z in the rig's units, alpha, parts.
+    """Renders several kinds of view and returns the arrays by kind.
+
+    Colour is in 0…1, and depth is measured along z in the rig's units. The other kinds are alpha and parts.
 
     >>> views = client.render_arrays(scene, "c0", kinds=["colour", "depth"])
     >>> views["colour"].shape, views["depth"].shape

@@ -43,7 +43,7 @@ def parse_labels(labels: Sequence[str] | None) -> dict[str, str]:
     for label in labels or ():
         name, sign, value = (part.strip() for part in label.partition("="))
         if not (name and sign and value):
-            raise ValueError(f"label {label!r} cannot be read; write it as rig=stage-a")
+            raise ValueError(f"label {label!r} is not valid; write it as rig=stage-a")
         if result.setdefault(name, value) != value:
             raise ValueError(f"label {name!r} has two values, {result[name]!r} and {value!r}; give one of them")
     return check_labels(result)
@@ -63,12 +63,12 @@ def parse_changes(changes: Sequence[str] | None) -> dict[str, Any]:
         path, sign, text = change.partition("=")
         *groups, last = path.strip().split(".")
         if not sign or not last:
-            raise ValueError(f"setting {change!r} cannot be read; write it as update.iterations=200")
+            raise ValueError(f"setting {change!r} is not valid; write it as update.iterations=200")
         inner = result
         for group in groups:
             inner = inner.setdefault(group, {})
             if not isinstance(inner, dict):
-                raise ValueError(f"setting {change!r}: {group!r} has a value already; give one of the two")
+                raise ValueError(f"setting {change!r}: {group!r} already has a value; give one of the two")
         try:
             inner[last] = json.loads(text)
         except json.JSONDecodeError:

@@ -1,4 +1,4 @@
-"""Commands that talk to a service, or prepare a capture for it: `scas4d push`, `scenes`, `watch`, `begin-again` …"""
+"""Commands that use a service or prepare a capture for it: `scas4d push`, `scenes`, `watch`, `begin-again`, etc."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def push(
     """Sends a capture to a running service as its rig would, and waits for the last frame."""
     settings, labels = parse_changes(changes), parse_labels(nodes)
     if labels and scene is not None:
-        raise ValueError("--node is for a new scene, and --scene continues one that has its nodes; leave one out")
+        raise ValueError("--node is only for new scenes, not together with --scene; leave one out")
     source = open_capture(capture, options, encoding=encoding.value)
     with Client(url, token=token, outage=0) as client:
         client.live()  # a wrong address fails immediately; only later outages are retried
@@ -259,9 +259,7 @@ def import_(
     frames: Annotated[int | None, typer.Option(min=1, help="Maximum number of frames to import.")] = None,
     encoding: Encode = Encoding.JPEG,
 ) -> None:
-    """Undistorts a capture once, so that reading it needs neither OpenCV nor PyAV and keeps up with the rig's frame
-    rate.
-    """
+    """Undistorts a capture once, so that reading it needs neither OpenCV nor PyAV and keeps up with the rig."""
     from client.importers.write import write_dynamic3dgs
 
     source = open_capture(capture, options, encoding=encoding.value)

@@ -107,9 +107,8 @@ def _last_log_line(log: Path) -> str:
 def run(capture: Capture, url: str, out: Path, *, frames: int | None, preset: str, settings: Mapping[str, Any]) -> str:
     """Streams the capture through the service at `url`, saves its renders and returns the scene's id.
 
-    `out` receives ground truth | render | difference for each frame and test camera (one training camera if there are
-    no
-    test cameras), and the depth and parts of the last frame.
+    `out` receives ground truth | render | difference for each frame and test camera, and the depth and parts of the
+    last frame. Without test cameras, one training camera is used.
     """
     name = f"demo of {capture.name}"
     with Client(url, token=_token()) as client:

@@ -271,7 +271,7 @@ def measure(
 
 
 def summary(lines: Sequence[Row]) -> Row:
-    """Averages the per-frame lines over all updates (every frame but the first), for the table."""
+    """Summarizes the per-frame lines over all updates (every frame but the first), for the table."""
     updates = lines[1:]
     if not updates:
         return {"updates": 0}
@@ -290,7 +290,7 @@ def summary(lines: Sequence[Row]) -> Row:
 
 
 def _seconds(updates: Sequence[Row]) -> Row:
-    """Returns median times; the median ignores the first update, which compiles or loads kernels."""
+    """Returns median times, because the first update also compiles or loads kernels."""
     stages = dict.fromkeys(name for line in updates for name in line["stages"])
     return {
         "seconds_update": float(np.median([line["seconds"] for line in updates])),
@@ -327,9 +327,7 @@ def save_parts(reconstruction: Committed, capture: Capture, index: int, labels: 
 
 
 def peak_megabytes() -> float | None:
-    """Returns the peak resident memory of this process in 10⁶ bytes, or None if the system does not report it
-    (Windows).
-    """
+    """Returns the peak resident memory of this process in 10⁶ bytes; None if unknown (on Windows)."""
     status = Path("/proc/self/status")
     if status.exists():  # on Linux, `getrusage` in a child process also counts its parent's peak
         peak = next(line for line in status.read_text().splitlines() if line.startswith("VmHWM:"))

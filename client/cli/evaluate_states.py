@@ -137,9 +137,7 @@ def _measure(found: Source, truth: Capture, store: Store, frames: int | None, re
 
 
 def _with_ids(state: Gaussians, history: History) -> Gaussians:
-    """Returns the state with ids assigned by the history. Rows keep their order, and the file's own ids are not
-    needed.
-    """
+    """Returns the state with ids assigned by the history. Rows keep their order; the file's ids are not needed."""
     if not len(history):
         return state
     known = history.ids

@@ -176,8 +176,7 @@ def export(
     url: commands.Url = DEFAULT_URL,
     token: commands.Token = None,
 ) -> None:
-    """Exports reconstructed frames to other tools' formats (splats, glTF, USD, tables), or to a page that plays
-    offline.
+    """Exports reconstructed frames to other formats (splats, glTF, USD, tables), or to a page that plays offline.
 
     Example: scas4d reconstruct samples/robot --out out/robot; scas4d export out/robot --player robot.html
     """

@@ -34,7 +34,7 @@ FRAME_ALARMS = (AlarmKind.FRAME_REJECTED, AlarmKind.FRAME_IN_PART)
 
 @dataclass(frozen=True)
 class ReconstructedFrame:
-    """One frame that was committed, or held because of an alarm.
+    """One committed frame, which may be degraded.
 
     Attributes:
         index: frame index in the capture.
@@ -178,7 +178,7 @@ def reconstruct(
 
 
 def remarks_on(report: FrameReport | None) -> str:
-    """Returns the printed lines that accompany a frame's PSNR: why the frame was held, and its alarms.
+    """Returns the printed lines that accompany a frame's PSNR: why the frame is degraded, and its alarms.
 
     >>> remarks_on(None)
     ''

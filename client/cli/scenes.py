@@ -44,7 +44,7 @@ def listed(
     token: Token = None,
     all: Annotated[bool, typer.Option("--all", help="Include archived scenes.")] = False,
 ) -> None:
-    """Lists the scenes of the service, oldest first. Other commands take the id as SCENE."""
+    """Lists the scenes of the service, oldest first. SCENE in other commands is the id shown here."""
     if context.invoked_subcommand is not None:
         return
     with Client(url, token=token, outage=0) as client:
@@ -87,9 +87,7 @@ def resume(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
 
 @app.command()
 def archive(scenes: Scenes, url: Url = DEFAULT_URL, token: Token = None) -> None:
-    """Archives scenes: they accept no further frames, sleep unless someone views them, and are listed only with
-    --all.
-    """
+    """Archives scenes: they accept no frames, sleep unless someone views them, and are listed only with --all."""
     with Client(url, token=token) as client:
         for scene in scenes:
             _told(client.edit_scene(scene, archived=True))

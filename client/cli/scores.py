@@ -40,8 +40,9 @@ def write_row(path: Path, row: Mapping[str, Any]) -> None:
 
 
 class Store:
-    """The rows of one study: ``rows/<key>.json`` when finished, ``frames/<key>.jsonl`` with one line per frame
-    meanwhile.
+    """The rows of one study.
+
+    Finished rows are in ``rows/<key>.json``; ``frames/<key>.jsonl`` receives one line per frame during measurement.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -1,1 +1,1 @@
-"""Writes the states of a scene, a folder or a file: formats of other tools, pages, recordings."""
+"""Export of states from a scene, folder or file to third-party formats, HTML players, recordings and videos."""

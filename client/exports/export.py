@@ -1,4 +1,4 @@
-"""`scas4d export`: states of a compact file, an export, or a scene of the service, in the formats of other tools."""
+"""Implementation of `scas4d export`, which converts states of a file, an export or a scene to third-party formats."""
 
 from __future__ import annotations
 
@@ -20,18 +20,21 @@ def export(
     url: str,
     token: str | None,
 ) -> None:
-    """Exports frames; one state is in memory at a time.
+    """Exports frames to a file or folder, with one state in memory at a time.
 
     Args:
-        source: as `opened` takes it.
-        format: a name of docs/exports.md. out: a folder or `.zip` for numbered files, else a file; None: beside the
-            file, or in this folder for a scene, named after it and the format.
-        frames: `A:B`, the frames from A to B, both counted in; either may be left out. None: all. ids: of tracks.
-        rate: frames a second of a source of numbered files.
-        url, token: of the service.
+        source: source of the states, see `opened`.
+        format: format name from docs/exports.md.
+        out: folder or `.zip` for numbered files, else a file. None derives the name from source and format and writes
+            next to the source file, or to the current folder for a scene.
+        frames: range `A:B`, inclusive; either end may be omitted. None for all.
+        ids: ids of the Gaussians for the format `tracks`.
+        rate: frames per second of a source with numbered files.
+        url: address of the service.
+        token: token of the service.
 
     Raises:
-        InputError: a source, a format, a range or an output that cannot be.
+        InputError: the source, format, range or output is invalid.
     """
     from scas4d_core.exports.formats import WITH_PARTS, check_suffix, format_of
     from scas4d_core.exports.sequence import export_sequence, other_frames
@@ -60,12 +63,12 @@ def export(
         if others := other_frames(target, wanted, chosen):
             raise InputError(
                 f"out {str(target)!r} holds {len(others)} files of frames that are not in this export, as "
-                f"{others[0].name}; readers would take them for one with it",
+                f"{others[0].name}; readers would treat them as one sequence",
                 "remove them, or give another folder: --out",
             )
         parts = given.parts() if with_parts else None
         if wanted.needs_parts and parts is None:
-            raise InputError(f"{source} has no parts, and {format} is made of them", "take a source with parts")
+            raise InputError(f"{source} has no parts, and {format} is made of them", "use a source with parts")
         paths = export_sequence(
             given.states(low, high),
             format,

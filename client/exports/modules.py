@@ -1,7 +1,7 @@
-"""JavaScript modules as one classic script: what a page can run that was opened as a file.
+"""Bundling of JavaScript modules into one classic script, for pages opened from ``file://``.
 
-Browsers load no modules from ``file://``. Each module becomes a function that returns what it exports; the modules keep
-to the forms of import and export that are known here, and others are refused.
+Browsers do not load modules from ``file://``. Each module becomes a function that returns its exports. Only the forms
+of import and export matched below are supported; all others are refused.
 """
 
 from __future__ import annotations
@@ -16,16 +16,17 @@ _OTHER = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
 
 
 def script(entry: Path, root: Path) -> str:
-    """Links a module and all that it imports.
+    """Returns a script that contains a module and all its imports.
 
     Args:
-        entry: the module that runs. root: of the names that modules have in errors.
+        entry: main module.
+        root: folder relative to which modules are named.
 
     Returns:
-        A script that needs no other file, without ``</script``.
+        Self-contained script without ``</script``.
 
     Raises:
-        ValueError: a module has an import or export of another form, or modules import one another in a circle.
+        ValueError: a module uses an unsupported form of import or export, or there is an import cycle.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""`scas4d export --player`: one HTML file that plays a sequence, without a network and without other files."""
+"""Implementation of `scas4d export --player`, which writes a self-contained HTML file that plays a sequence offline."""
 
 from __future__ import annotations
 
@@ -22,22 +22,25 @@ from scas4d_core.compact import CompactReader, CompactWriter
 from scas4d_core.errors import InputError
 
 VIEWER = Path(__file__).parents[2] / "server" / "viewer"
-"""The page's own modules: the player has the same."""
+"""Folder of the viewer's modules, which the player shares."""
 PIECE = 3 << 18
-"""Bytes in a piece; a multiple of 3, so that each piece of base64 stands for itself."""
+"""Chunk size in bytes; a multiple of 3, so that each base64 chunk can be decoded separately."""
 LARGE, LARGEST = 100 << 20, 1 << 30
-"""Bytes of compact files from which a player is slow to open, and beyond which browsers refuse it."""
+"""Total size of compact files in bytes above which a player opens slowly, and above which browsers refuse it."""
 
 
 def export_player(source: str, out: Path, frames: str | None = None, *, url: str, token: str | None) -> None:
-    """Writes the player; its compact files are the source's own, or a new one where only some frames are asked for.
+    """Writes the player with the compact files of the source, or with a new one if only some frames are requested.
 
     Args:
-        source: a compact file, the folder in which `scas4d reconstruct` left one, or the id of a scene of the service.
-        out: of the HTML. frames: `A:B`, both counted in; None: all. url, token: of the service.
+        source: compact file, output folder of `scas4d reconstruct`, or id of a scene of the service.
+        out: path of the HTML file.
+        frames: range `A:B`, inclusive; None for all.
+        url: address of the service.
+        token: token of the service.
 
     Raises:
-        InputError: a range or an output that cannot be, or more than browsers open.
+        InputError: the range or output is invalid, or the data is larger than browsers can open.
     """
     if out.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"player={str(out)!r} is not the name of a page", "give one that ends in .html")
@@ -53,7 +56,7 @@ def export_player(source: str, out: Path, frames: str | None = None, *, url: str
                     f"{size / 1e6:.0f} MB of frames are more than browsers open in one page",
                     "export fewer with --frames A:B",
                 )
-            folder = given.beside.resolve().name  # `scas4d reconstruct` calls all its files alike
+            folder = given.beside.resolve().name  # `scas4d reconstruct` always uses the same file name
             write_player(out, folder if f"{given.name}.s4d" == STATES and folder else given.name, files)
     console.print(f"{count} frames in {out}, {out.stat().st_size / 1e6:.1f} MB; open it in a browser", soft_wrap=True)
     if size > LARGE:
@@ -61,12 +64,14 @@ def export_player(source: str, out: Path, frames: str | None = None, *, url: str
 
 
 def write_player(out: Path, title: str, files: Sequence[Path]) -> None:
-    """Writes a page with compact files in it; one piece of them is in memory at a time.
+    """Writes an HTML page with embedded compact files, holding one chunk in memory at a time.
 
     Args:
-        title: of the page. files: in the order of their frames.
+        out: path of the HTML file.
+        title: title of the page.
+        files: compact files in frame order.
     """
-    from scas4d_core.exports.atomic_files import atomic_path  # with it comes what exports need
+    from scas4d_core.exports.atomic_files import atomic_path  # imported lazily: it loads the dependencies of exports
 
     parts = {
         "title": html.escape(title),
@@ -98,7 +103,7 @@ def _pieces(file: Path) -> Iterator[str]:
 
 @contextmanager
 def _files(given: Source, low: int, high: int, count: int) -> Iterator[Sequence[Path]]:
-    """The source's files, or one that is written anew where these hold other frames, too, or are none."""
+    """Yields the source's compact files, or a new one if they contain other frames or the source has none."""
     if isinstance(given.of, CompactStates) and count == _held(given.of.files):
         yield given.of.files
         return
@@ -120,7 +125,7 @@ def _files(given: Source, low: int, high: int, count: int) -> Iterator[Sequence[
 
 
 def _facing(points: NDArray[np.float64]) -> Camera:
-    """A camera that sees points [N, 3] of the user's world from the front, along its z: where a source has none.
+    """Returns a camera that views points [N, 3] (user's world) along +z, for sources without cameras.
 
     >>> camera = _facing(np.array([[0.0, 0, 5], [1, 0, 5], [0, 1, 5], [1, 1, 5]]))
     >>> pixels, depth = camera.project(np.array([[0.5, 0.5, 5]]))
@@ -135,7 +140,7 @@ def _facing(points: NDArray[np.float64]) -> Camera:
 
 
 def _held(files: Sequence[Path]) -> int:
-    """Number of frames in compact files, with those that others depend on."""
+    """Returns the number of frames in compact files, including those on which others depend."""
     indices: set[int] = set()
     for file in files:
         with CompactReader(file) as reader:

@@ -1,4 +1,4 @@
-"""`scas4d rerun`: frames as a recording for the Rerun viewer: points in their colours, tracks, the rig, parts."""
+"""Implementation of `scas4d rerun`, which records points, tracks, the rig and parts for the Rerun viewer."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from scas4d_core.gaussians import Gaussians
 
 SUFFIX = ".rrd"
 FAINT = 0.1
-"""Opacity below which a Gaussian is left out: points are drawn solid, and haze would hide what it lies before."""
+"""Opacity below which Gaussians are omitted; points are drawn opaque, so haze would hide the surfaces behind it."""
 THIN = -0.7
-"""Radius of a track; the viewer takes what is negative for points of the screen."""
+"""Radius of a track; the viewer interprets negative values as screen-space points."""
 PLANE = 0.15
-"""Distance at which the viewer draws a camera's picture, as a share of the rig's distance."""
+"""Distance of a camera's image plane in the viewer, as a fraction of the rig's radius."""
 
 
 def make_recording(
@@ -40,20 +40,21 @@ def make_recording(
     url: str,
     token: str | None,
 ) -> Path:
-    """Writes a recording; one state is in memory at a time.
+    """Writes a Rerun recording, with one state in memory at a time, and returns its path.
 
     Args:
-        source: as `opened` takes it. out: ends in `.rrd`; None: beside the source, named after it.
-        frames: `A:B`, the frames from A to B, both counted in; None: all.
-        tracks: how many of the Gaussians that move draw their way. trail: its length, seconds of the scene.
-        parts: whether points have the colours of their parts; their own else. The part of each is recorded anyway.
-        url, token: of the service.
-
-    Returns:
-        The file.
+        source: source of the states, see `opened`.
+        out: path that ends in `.rrd`; None for a file next to the source, named after it.
+        frames: range `A:B`, inclusive; None for all.
+        tracks: number of moving Gaussians whose trajectories are drawn.
+        trail: length of the trajectories in seconds of scene time.
+        parts: whether to colour points by part instead of by their own colour. Part labels are recorded in any case.
+        url: address of the service.
+        token: token of the service.
 
     Raises:
-        InputError: a range or an output that cannot be. ModuleNotFoundError: rerun-sdk is not installed.
+        InputError: the range or output is invalid.
+        ModuleNotFoundError: rerun-sdk is not installed.
     """
     low, high = frame_range(frames)
     if out is not None and out.suffix.lower() != SUFFIX:
@@ -65,7 +66,9 @@ def make_recording(
         target = out or given.beside / f"{given.name}{SUFFIX}"
         labels = given.parts()
         if parts and labels is None:
-            raise InputError(f"parts: {given.name} holds none", "leave --parts out; there are none without motion")
+            raise InputError(
+                f"parts: {given.name} holds none", "leave --parts out; a scene without motion has no parts"
+            )
         rows = moving_rows(given.some(list(times)), tracks)
         with _stream(target) as stream:
             _log_what_stays(stream, given, labels)
@@ -85,7 +88,7 @@ def make_recording(
 
 @contextmanager
 def _stream(target: Path) -> Iterator[Any]:
-    """A stream of the Rerun SDK into a file that has its name when it is whole."""
+    """Yields a Rerun recording stream into a temporary file, which gets its final name once it is complete."""
     import rerun
     from rerun import blueprint
 
@@ -95,7 +98,7 @@ def _stream(target: Path) -> Iterator[Any]:
     look = blueprint.Blueprint(blueprint.Spatial3DView(origin="/world", name="scene"))
     with atomic_path(target) as beside:
         stream = rerun.RecordingStream("scas4d")
-        stream.set_log_time_enabled(False)  # when it was written says nothing
+        stream.set_log_time_enabled(False)  # the time of writing is irrelevant
         stream.save(beside, default_blueprint=look)
         try:
             yield stream
@@ -104,7 +107,10 @@ def _stream(target: Path) -> Iterator[Any]:
 
 
 def _log_what_stays(stream: Any, given: Source, labels: NDArray[np.int64] | None) -> None:
-    """Logs axes, names and colours of parts, and the rig. A part's class is its label and 1; 0 is none."""
+    """Logs the static data: axes, part names and colours, and the rig.
+
+    The class id of a part is its label + 1; 0 means no part.
+    """
     import rerun
 
     rig = given.head.rig
@@ -129,7 +135,7 @@ def _log_what_stays(stream: Any, given: Source, labels: NDArray[np.int64] | None
 
 
 def _axes(rig: Rig | None) -> Any:
-    """The axis of the user's world that is most upwards, by the rig; y down without one."""
+    """Returns the view coordinates whose axis is closest to the rig's up direction; y down if there is no rig."""
     import rerun
 
     up = np.array([0.0, -1.0, 0.0]) if rig is None else RigView.of(rig).up
@@ -167,7 +173,11 @@ def _longer(
     seconds: float,
     trail: float,
 ) -> NDArray[np.float64]:
-    """[S, K, 3] the places of the last seconds, with those of a state; NaN where a Gaussian is not there."""
+    """Appends the positions of a state to the trails and returns the last `trail` seconds.
+
+    Returns:
+        Positions [S, K, 3]; NaN if a Gaussian is not present.
+    """
     places = given.head.world.to_user(state.means[rows])
     places[~state.present[rows]] = np.nan
     ways.append((seconds, places))

@@ -1,4 +1,4 @@
-"""The states that an export begins from: a compact file, the folder that holds one, an export, or a scene."""
+"""Sources of states for exports: a compact file, its folder, an export, or a scene of the service."""
 
 from __future__ import annotations
 
@@ -18,51 +18,60 @@ from scas4d_core.errors import InputError
 from scas4d_core.gaussians import Gaussians
 
 STATES = "states.s4d"
-"""The compact file that `scas4d reconstruct` leaves in its folder."""
+"""Name of the compact file that `scas4d reconstruct` writes to its output folder."""
 MOST = 120
-"""Frames that are asked of the service at once."""
+"""Maximum number of frames per request to the service."""
 LAST = 1_000_000_000
-"""No frame has a higher index."""
+"""Largest possible frame index."""
 
 
 class States(Protocol):
-    """The states of a sequence, one in memory at a time.
+    """States of a sequence, read one at a time.
 
     Attributes:
-        head: world, rig, rate and background. frames: indices, rising. times: their seconds.
-        damage: why only a part can be read, or None. remarks: what the source lacks, a sentence each.
+        head: world frame, rig, frame rate and background.
+        frames: frame indices in ascending order.
+        times: times of the frames in seconds.
+        damage: reason why only a part of the source can be read, or None.
+        remarks: sentences that describe data missing from the source.
     """
 
     @property
     def head(self) -> FileHeader:
-        """World, rig, rate and background."""
+        """World frame, rig, frame rate and background."""
 
     @property
     def frames(self) -> Sequence[int]:
-        """Indices, rising."""
+        """Frame indices in ascending order."""
 
     @property
     def times(self) -> Sequence[float]:
-        """Seconds, of all frames."""
+        """Times of all frames in seconds."""
 
     @property
     def damage(self) -> str | None:
-        """Why only a part can be read, or None."""
+        """Reason why only a part of the source can be read, or None."""
 
     @property
     def remarks(self) -> Sequence[str]:
-        """Sentences on what the source lacks."""
+        """Sentences that describe data missing from the source."""
 
     def parts(self) -> NDArray[np.int64] | None:
-        """[N] part of each Gaussian, or None."""
+        """Returns the part label of each Gaussian [N], or None."""
 
     def states(self, low: int = 0, high: int = LAST) -> Iterator[tuple[int, float, Gaussians]]:
-        """Index, seconds and state of the frames from ``low`` to ``high``."""
+        """Yields index, time in seconds and state of the frames from ``low`` to ``high``."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """States with the ``name`` of their outputs and the folder ``beside`` them."""
+    """States with the default name and folder of exported files.
+
+    Attributes:
+        name: base name of exported files.
+        beside: folder next to the source, for exported files.
+        of: states of the source.
+    """
 
     name: str
     beside: Path
@@ -70,22 +79,22 @@ class Source:
 
     @property
     def head(self) -> FileHeader:
-        """World, rig, rate and background."""
+        """World frame, rig, frame rate and background."""
         return self.of.head
 
     def parts(self) -> NDArray[np.int64] | None:
-        """[N] part of each Gaussian, or None."""
+        """Returns the part label of each Gaussian [N], or None."""
         return self.of.parts()
 
     def states(self, low: int = 0, high: int = LAST) -> Iterator[tuple[int, float, Gaussians]]:
-        """Index, seconds and state of the frames from ``low`` to ``high``."""
+        """Yields index, time in seconds and state of the frames from ``low`` to ``high``."""
         return self.of.states(low, high)
 
     def within(self, low: int, high: int) -> dict[int, float]:
-        """Index and time in seconds of the frames from ``low`` to ``high``, in order.
+        """Returns the times in seconds of the frames from ``low`` to ``high`` by frame index, in order.
 
         Raises:
-            InputError: there is none.
+            InputError: there are no such frames.
         """
         times = {index: time for index, time in zip(self.of.frames, self.of.times, strict=True) if low <= index <= high}
         if not times:
@@ -95,13 +104,13 @@ class Source:
         return times
 
     def some(self, indices: Sequence[int]) -> list[Gaussians]:
-        """The states of the first, the middle and the last of some frames, each once."""
+        """Returns the states of the first, middle and last of the given frames, without duplicates."""
         chosen = dict.fromkeys((indices[0], indices[len(indices) // 2], indices[-1]))
         return [state for index in chosen for _, _, state in self.states(index, index)]
 
     @property
     def rate(self) -> float:
-        """Frames a second: the nominal rate, else the mean one, else 30."""
+        """Frame rate in frames per second: the nominal rate if known, else the mean rate, else 30."""
         if self.of.head.frames_per_second is not None:
             return self.of.head.frames_per_second
         length = self.of.times[-1] - self.of.times[0] if self.of.times else 0.0
@@ -112,16 +121,20 @@ class Source:
 def opened(
     source: str, low: int, high: int, parts: bool, url: str, token: str | None, rate: float | None = None
 ) -> Iterator[Source]:
-    """The states of a source; those of a scene are fetched from the service.
+    """Yields an opened source of states; the states of a scene are downloaded from the service.
 
     Args:
-        source: a compact file, the folder in which `scas4d reconstruct` left one, an export that records which Gaussian
-            is which (docs/exports.md), or the id of a scene of the service.
-        low, high: first and last frame. parts: with the part of each Gaussian. url, token: of the service.
-        rate: frames a second of numbered files.
+        source: compact file, output folder of `scas4d reconstruct`, export with Gaussian ids (docs/exports.md), or id
+            of a scene of the service.
+        low: first frame.
+        high: last frame.
+        parts: whether to download the part labels of a scene.
+        url: address of the service.
+        token: token of the service.
+        rate: frames per second of numbered files.
 
     Raises:
-        InputError: the source is not there, or is an export that lost the ids.
+        InputError: the source does not exist, or it is an export without ids.
     """
     path = Path(source)
     if path.exists():
@@ -136,7 +149,7 @@ def opened(
 
 
 def is_scene_id(source: str) -> bool:
-    """True where a source is the id of a scene: it is no file, and its name could not be one.
+    """Returns True if a source is a scene id: no such file exists, and it has neither a suffix nor a folder.
 
     >>> is_scene_id("0f6a21"), is_scene_id("client"), is_scene_id("out/robot"), is_scene_id("robot.s4d")
     (True, False, False, False)
@@ -147,11 +160,14 @@ def is_scene_id(source: str) -> bool:
 
 @dataclass(frozen=True)
 class CompactStates:
-    """States of one compact file or of several, one after the other; one file is open at a time.
+    """States of one or several consecutive compact files; one file is open at a time.
 
     Attributes:
-        files: in the order of their frames. head: of the first. frames, times: of all.
-        damage: of the first file that has any.
+        files: compact files in frame order.
+        head: header of the first file.
+        frames, times: frame indices and times in seconds of all files.
+        damage: damage of the first damaged file, or None.
+        remarks: always empty.
     """
 
     files: Sequence[Path]
@@ -163,7 +179,7 @@ class CompactStates:
 
     @classmethod
     def of(cls, files: Sequence[Path], first: int = 0) -> CompactStates:
-        """Looks at each file; frames before ``first`` are left out: later frames only depend on them."""
+        """Returns the states of the files from frame ``first`` on; earlier frames only serve as dependencies."""
         heads: list[FileHeader] = []
         times: dict[int, float] = {}
         damages: list[str] = []
@@ -176,12 +192,12 @@ class CompactStates:
         return cls(files, heads[0], list(times), list(times.values()), damages[0] if damages else None)
 
     def parts(self) -> NDArray[np.int64] | None:
-        """[N] part of each Gaussian, by the last file."""
+        """Returns the part label of each Gaussian [N] from the last file, or None."""
         with CompactReader(self.files[-1]) as reader:
             return reader.parts()
 
     def states(self, low: int = 0, high: int = LAST) -> Iterator[tuple[int, float, Gaussians]]:
-        """Index, time in seconds and state of the frames from ``low`` to ``high``, each once."""
+        """Yields index, time in seconds and state of the frames from ``low`` to ``high``, without duplicates."""
         last = low - 1
         for file in self.files:
             with CompactReader(file) as reader:
@@ -192,19 +208,20 @@ class CompactStates:
 
 
 def of_path(path: Path, rate: float | None = None) -> Source:
-    """The states of a compact file, of the folder that holds one, or of an export.
+    """Returns the source for a compact file, the folder that contains one, or an export.
 
     Args:
-        path: is there. rate: frames a second of numbered files; None: 30.
+        path: existing file or folder.
+        rate: frames per second of numbered files; None for the default of 30.
 
     Raises:
-        InputError: it is none of them.
+        InputError: the path is none of these.
     """
     if path.is_dir() and (path / STATES).exists():
         path = path / STATES
     if path.suffix.lower() == ".s4d":
         return Source(path.stem, path.parent, CompactStates.of([path]))
-    from scas4d_core.exports.reading import open_export  # it brings readers that a compact file does not need
+    from scas4d_core.exports.reading import open_export  # lazy: compact files need none of its readers
     from scas4d_core.exports.reading.sources import DEFAULT_FPS
 
     return Source(path.stem, path.parent, open_export(path, DEFAULT_FPS if rate is None else rate))
@@ -212,10 +229,15 @@ def of_path(path: Path, rate: float | None = None) -> Source:
 
 @contextmanager
 def of_scene(id: str, low: int, high: int, parts: bool, url: str, token: str | None) -> Iterator[CompactStates]:
-    """The states of a scene, fetched from the service to temporary files.
+    """Yields the states of a scene, downloaded from the service to temporary files.
 
     Args:
-        low, high: first and last frame. parts: with the part of each Gaussian.
+        id: id of the scene.
+        low: first frame.
+        high: last frame.
+        parts: whether to include part labels.
+        url: address of the service.
+        token: token of the service.
     """
     with Client(url, token=token, outage=0) as client, TemporaryDirectory() as folder:
         files: list[Path] = []
@@ -228,7 +250,7 @@ def of_scene(id: str, low: int, high: int, parts: bool, url: str, token: str | N
 
 
 def frame_range(text: str | None) -> tuple[int, int]:
-    """First and last frame of a range.
+    """Returns the first and last frame of a range.
 
     >>> frame_range("2:4"), frame_range(":1"), frame_range("7")
     ((2, 4), (0, 1), (7, 7))

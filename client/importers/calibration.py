@@ -14,9 +14,7 @@ from scas4d_core.cameras import CAMERA_NAME
 from scas4d_core.captures import CaptureError, InitialPoints
 
 STATIC_TOLERANCE = 1e-6
-"""Largest change of an entry of a static camera's pose, intrinsics or distortion, relative to the largest entry or
-1.
-"""
+"""Largest relative change of an entry of a static camera's pose, intrinsics or distortion between images."""
 
 
 NAMES = "a camera's name has letters, digits, dots, dashes and underscores, at most 64, and is not `time`"

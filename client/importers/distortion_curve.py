@@ -1,6 +1,4 @@
-"""`DistortionCurve`: applies and inverts a lens's distortion as far as its polynomial is monotonic. Needs only
-numpy.
-"""
+"""`DistortionCurve`: applies and inverts a lens's distortion where its polynomial is monotonic. Needs only numpy."""
 
 from __future__ import annotations
 
@@ -24,22 +22,19 @@ a tenth of a pixel in the lens's image would be stretched over more than a pixel
 """
 NEWTON = 8
 ROUNDS = 60
-"""Fixed-point iterations for the tangential part. It is small, so each iteration shrinks the error by about its
-size.
-"""
+"""Fixed-point iterations for the tangential part; since it is small, the iteration converges quickly."""
 CLOSE = 1e-7
 """Largest residual, on the plane at distance 1, of a ray that counts as a solution."""
 
 
 @dataclass(frozen=True, eq=False)
 class DistortionCurve:
-    """Radial distortion profile of a lens, over the ray's radius at distance 1 or, for a fisheye, its angle from the
-    axis.
+    """Radial distortion profile of a lens: a function of the ray's radius at distance 1 or, for a fisheye, its angle.
 
     Attributes:
         lens: the lens.
-        reach: largest radius (fisheye: angle) at which the profile is trusted.
-        turns: True if the image extends beyond `reach`, that is, the polynomial turns back before the farthest corner.
+        reach: largest radius (fisheye: angle from the axis) at which the profile is trusted.
+        turns: True if the image extends beyond `reach` because the polynomial turns back before the farthest corner.
         samples: [S] radii (angles) from 0 to `reach`.
         bends: [S] distorted radii at `samples`, increasing.
     """
@@ -72,7 +67,7 @@ class DistortionCurve:
 
     @property
     def max_radius(self) -> float:
-        """Largest trusted radius of a ray at distance 1; infinite beyond 89° of a fisheye."""
+        """Largest trusted radius of a ray at distance 1; infinite for a fisheye that is trusted beyond 89°."""
         if not self.lens.fisheye:
             return self.reach
         return float(np.tan(self.reach)) if self.reach < FLAT else np.inf
@@ -116,9 +111,7 @@ class DistortionCurve:
 
 
 def _profile(lens: LensCamera, of: Float) -> tuple[Float, Float]:
-    """Returns distorted radii and the profile's slopes at the given radii (fisheye: angles), both of the input's
-    shape.
-    """
+    """Returns distorted radii and slopes of the profile at the given radii (fisheye: angles)."""
     s = of * of
     if lens.fisheye:
         k1, k2, k3, k4 = lens.distortion

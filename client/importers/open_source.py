@@ -40,15 +40,14 @@ class CaptureOptions:
     encoding: Encoding = "jpeg"
 
     def open(self, folder: Path | str, **more: Any) -> Capture:
-        """Opens a capture with these options; keyword arguments in `more` are passed to `open_source` and take
-        precedence.
-        """
+        """Opens a capture with these options; `more` is passed to `open_source` too and takes precedence."""
         return open_source(folder, **(asdict(self) | more))
 
     @property
     def changed(self) -> dict[str, Any]:
-        """Options that differ from the default, as JSON values. Excludes the encoding, which does not affect decoded
-        pixels.
+        """Options that differ from the default, as JSON values.
+
+        The encoding is excluded, because it does not affect decoded pixels.
         """
         usual, own = asdict(CaptureOptions()), asdict(self)
         changes = {name: value for name, value in own.items() if value != usual[name] and name != "encoding"}

@@ -1,5 +1,4 @@
-"""Removes perspective and fisheye distortion with OpenCV: maps a lens to a pinhole camera of the same pose and image
-size.
+"""Undistorts images of perspective and fisheye lenses with OpenCV, to pinhole images of the same pose and size.
 
 The pinhole camera covers the largest region with the image's aspect ratio in which every pixel was seen, so there are
 no black corners. It keeps the lens's pixel aspect ratio; the principal point follows from the region. If the lens's
@@ -27,16 +26,12 @@ Float = NDArray[np.float64]
 Picture = NDArray[np.uint8]
 
 WIDEST_DEGREES = 120.0
-"""Largest field of view of a pinhole camera; beyond it, a fisheye image is stretched over pixels without
-information.
-"""
+"""Largest field of view of a pinhole camera; a wider one would stretch a fisheye image too much."""
 BORDER_POINTS = 64
 TOLERANCE_PIXELS = 0.01
 """Largest distance that the pinhole's border may lie outside the image; interpolation hides smaller distances."""
 NARROWING = 1.005
-"""Factor per step by which the focal length grows while a lens that turns back is cropped: 0.5 % of the image's
-side.
-"""
+"""Factor per step by which the focal length grows while a lens that turns back is cropped."""
 MOST_NARROWED = 50.0
 """Multiple of the lens's focal length at which the search for a pinhole camera stops."""
 LEAST_KEPT = 0.25

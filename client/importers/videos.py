@@ -133,8 +133,7 @@ class Video:
 
 
 class Videos:
-    """One video per camera, with a common frame rate and start time. The shortest video determines the number of
-    frames.
+    """One video per camera, with a common frame rate and start time. The shortest determines the number of frames.
 
     Raises:
         CaptureError: the frame rates differ, or frames of two videos are more than half a frame apart.

@@ -109,9 +109,7 @@ def _write_meta(
 
 
 def _one_or_all(sizes: list[int]) -> int | list[int]:
-    """Returns one size if all cameras share it, as the layout defines, else a list per camera, an extension of this
-    project.
-    """
+    """Returns one size if all cameras share it, else a list per camera, which extends the layout."""
     return sizes[0] if len(set(sizes)) == 1 else sizes
 
 

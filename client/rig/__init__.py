@@ -1,4 +1,4 @@
-"""The rig simulator: sends a capture on disk as a rig would."""
+"""Rig simulator, which sends a capture on disk to the service like a live camera rig."""
 
 from client.rig.delivery import Delivery, Lateness
 from client.rig.pace import Pace

@@ -1,4 +1,4 @@
-"""Result of a push: the scene, the lost frames, and how late the frames were."""
+"""Result of a push: the scene, the lost frames and the delays."""
 
 from __future__ import annotations
 
@@ -10,14 +10,17 @@ from client.wire import SceneStatus
 
 @dataclass
 class Lateness:
-    """Seconds by which the sending fell behind the pace, and seconds waited, by reason.
+    """Delays of sending relative to the pace, and waiting times per reason, all in seconds.
 
     Attributes:
-        late: by how much each frame was acknowledged after its moment, plus one period: 0 means before the next one.
-        busy: waited for a full queue, and how often.
-        outage: waited for a service that did not answer, and how often.
-        began: when the clock of the rig started: with the first frame, or once frame 0 was finished.
-        before: how many of `late` were acknowledged before the clock started.
+        late: delay of each frame's acknowledgement relative to the due time of the next frame; negative if earlier.
+        busy: time spent waiting for a full queue.
+        busy_count: number of waits for a full queue.
+        outage: time spent waiting for a service that did not answer.
+        outage_count: number of retries during outages.
+        began: `time.monotonic()` at the start of the rig's clock: at the first frame, or when frame 0 was finished.
+        before: number of entries of `late` acknowledged before the clock started.
+        ended: `time.monotonic()` after the last frame; None while sending.
     """
 
     late: list[float] = field(default_factory=list)
@@ -30,7 +33,7 @@ class Lateness:
     ended: float | None = None
 
     def summary(self, fps: float | None) -> str:
-        """One line for a person."""
+        """Returns a one-line summary for users."""
         count = len(self.late)
         timed = count - self.before
         seconds = (self.ended or time.monotonic()) - self.began
@@ -55,10 +58,10 @@ class Delivery:
     """Result of a push.
 
     Attributes:
-        scene: id.
-        lateness: how far the sending fell behind.
-        lost: indices that the rig lost, declared missing.
-        status: of the scene after the last frame; None while it goes on.
+        scene: id of the scene.
+        lateness: delays of sending.
+        lost: indices of frames that the rig lost and declared missing.
+        status: status of the scene after the last frame; None while the push is running.
     """
 
     scene: str

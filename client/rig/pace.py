@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Pace:
-    """Frame rate, jitter and losses of a simulated rig; the same seed gives the same.
+    """Frame rate, jitter and losses of a simulated rig; deterministic for a given seed.
 
     Attributes:
-        fps: frames a second; None sends as fast as the service takes them.
-        jitter: seconds that a frame is late at most, evenly distributed: cables, encoders, switches.
-        drop: share of frames that the rig loses, 0…1. Frame 0 is never lost.
-        seed: of what is random here.
+        fps: frames per second; None sends as fast as the service accepts frames.
+        jitter: maximum delay of a frame in seconds, uniformly distributed; it models cables, encoders and switches.
+        drop: fraction of frames that the rig loses, 0…1. Frame 0 is never lost.
+        seed: random seed of the jitter and the losses.
 
     >>> pace = Pace(fps=30, drop=0.5)
     >>> [pace.drops(index) for index in range(4)] == [pace.drops(index) for index in range(4)]
@@ -37,9 +37,9 @@ class Pace:
             raise ValueError(f"drop {self.drop!r} must be a share from 0 to below 1")
 
     def drops(self, index: int, camera: str = "") -> bool:
-        """True where this frame (or this camera's picture of it) is lost; the same answer every time."""
+        """Returns True if this frame, or this camera's image of it, is lost; deterministic."""
         return index > 0 and random.Random(f"{self.seed} {index} {camera} lost").random() < self.drop
 
     def delay(self, index: int, camera: str = "") -> float:
-        """Seconds that this frame leaves late."""
+        """Returns the delay of this frame, or of this camera's image of it, in seconds; deterministic."""
         return random.Random(f"{self.seed} {index} {camera} late").uniform(0, self.jitter)

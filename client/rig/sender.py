@@ -1,4 +1,4 @@
-"""Sends the rig simulator's frames in time: as requests or over WebSockets, whole or camera by camera."""
+"""Timed sending of the rig simulator's frames over HTTP or WebSockets, whole or per camera."""
 
 from __future__ import annotations
 
@@ -10,46 +10,46 @@ from client.errors import FrameGap
 from client.ingest import IngestSocket
 from client.rig.delivery import Delivery
 from client.rig.pace import Pace
-from client.rig.sequence import FrameFiles, Sequence
+from client.rig.sequence import EncodedFrame, Sequence
 from client.sdk import Client
 
 OnMessage = Callable[[str], None]
 
 
 class Requests:
-    """Frames as requests."""
+    """Transport of frames by HTTP requests."""
 
     def __init__(self, client: Client, scene: str) -> None:
         self._client = client
         self._scene = scene
 
-    def frame(self, index: int, files: FrameFiles) -> None:
+    def frame(self, index: int, files: EncodedFrame) -> None:
         """Sends a whole frame."""
         self._client.put_frame(self._scene, index, files.images, files.masks, time=files.time)
 
-    def camera(self, index: int, name: str, files: FrameFiles) -> None:
-        """Sends one camera's pictures."""
+    def camera(self, index: int, name: str, files: EncodedFrame) -> None:
+        """Sends one camera's image and mask."""
         mask = files.masks.get(name)
         self._client.put_camera(self._scene, index, name, files.images[name], mask, time=files.time)
 
     def close(self) -> None:
-        """Does nothing: no connection is kept."""
+        """Does nothing, since no connection is owned."""
 
 
 class Sockets:
-    """Frames over WebSockets, one a sender."""
+    """Transport of frames over WebSockets, one per sender."""
 
     def __init__(self, client: Client, scene: str) -> None:
         self._client = client
         self._scene = scene
         self._sockets: dict[str, IngestSocket] = {}
 
-    def frame(self, index: int, files: FrameFiles) -> None:
+    def frame(self, index: int, files: EncodedFrame) -> None:
         """Sends a whole frame."""
         self._of("").put_frame(index, files.images, files.masks, time=files.time)
 
-    def camera(self, index: int, name: str, files: FrameFiles) -> None:
-        """Sends one camera's pictures over its own socket."""
+    def camera(self, index: int, name: str, files: EncodedFrame) -> None:
+        """Sends one camera's image and mask over the camera's own socket."""
         self._of(name).put_camera(index, name, files.images[name], files.masks.get(name), time=files.time)
 
     def close(self) -> None:
@@ -58,14 +58,14 @@ class Sockets:
             socket.close()
 
     def _of(self, sender: str) -> IngestSocket:
-        # Of one camera there is one picture at a time on its way: no two threads come here with one name.
+        # Each camera has at most one image in flight, so no two threads call this with the same name.
         if sender not in self._sockets:
             self._sockets[sender] = IngestSocket(self._client, self._scene)
         return self._sockets[sender]
 
 
 class Sender:
-    """Sends the frames in their time."""
+    """Sender of all frames at the configured pace."""
 
     def __init__(
         self,
@@ -88,14 +88,17 @@ class Sender:
         self.start_clock()
 
     def start_clock(self) -> None:
-        """Starts the clock: the next frame is due now."""
+        """Starts or restarts the clock, so that the next frame is due now."""
         self._began = time.monotonic()
         self._sent = 0
         self._delivery.lateness.began = self._began
         self._delivery.lateness.before = len(self._delivery.lateness.late)
 
     def send_all(self, first: int, count: int) -> Iterator[int]:
-        """Every index in order, once it is acknowledged or given up; goes where the service says it goes on."""
+        """Sends frames in order and yields each index once it is acknowledged or lost.
+
+        If the service expects another index, sending continues there.
+        """
         index = first
         while index < count:
             due = self._await(index)
@@ -139,7 +142,7 @@ class Sender:
             lost = ", ".join(name for name in files.images if name not in sending)
             self._on_message(f"frame {index}: the rig lost the pictures of {lost}; closed without them")
 
-    def _send_camera(self, index: int, name: str, files: FrameFiles) -> None:
+    def _send_camera(self, index: int, name: str, files: EncodedFrame) -> None:
         time.sleep(self._pace.delay(index, name))
         self._way.camera(index, name, files)
 
@@ -149,6 +152,6 @@ class Sender:
         self._on_message(f"frame {index}: lost by the rig, declared missing")
 
     def close(self) -> None:
-        """Ends its threads."""
+        """Stops the threads."""
         if self._cameras is not None:
             self._cameras.shutdown(wait=True, cancel_futures=True)

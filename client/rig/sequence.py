@@ -1,4 +1,4 @@
-"""The frames of a capture as those of a scene, made ready ahead of their time."""
+"""Frames of a capture as frames of a scene, encoded ahead of time."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ FOREVER = 10**9
 
 
 @dataclass(frozen=True)
-class FrameFiles:
-    """One frame as it is sent."""
+class EncodedFrame:
+    """Encoded images and masks of a frame by camera name, with the frame's time in seconds."""
 
     time: float
     images: dict[str, bytes]
@@ -21,7 +21,7 @@ class FrameFiles:
 
 
 def ping_pong(index: int, count: int) -> int:
-    """The place among so many of an index that goes to their end, back to their start, and so on.
+    """Returns the position in 0…count − 1 of an index that runs back and forth.
 
     >>> [ping_pong(index, 3) for index in range(6)]
     [0, 1, 2, 1, 0, 1]
@@ -33,9 +33,9 @@ def ping_pong(index: int, count: int) -> int:
 
 
 class Sequence:
-    """The frames of a capture as frames of a scene: from a start, and where it loops back and forth for ever.
+    """Frames of a capture as frames of a scene, beginning at `start`; with `loop`, they run back and forth endlessly.
 
-    Back and forth, because a jump from the last frame to the first is a motion that no scene makes.
+    Playback reverses at the ends, because a jump from the last frame to the first would not be a plausible motion.
     """
 
     def __init__(self, source: Capture, *, start: int = 0, loop: bool = False) -> None:
@@ -46,41 +46,41 @@ class Sequence:
         self.loop = loop
         self._last = source.frame_count - 1 - start
         self._pool = ThreadPoolExecutor(max_workers=min(8, os.cpu_count() or 1), thread_name_prefix="frames")
-        self._ahead: tuple[int, Future[FrameFiles]] | None = None
+        self._ahead: tuple[int, Future[EncodedFrame]] | None = None
         self._reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="ahead")
 
     def __len__(self) -> int:
         return FOREVER if self.loop else self._last + 1
 
     def capture_index(self, index: int) -> int:
-        """The frame of the capture that is frame `index` of the scene."""
+        """Returns the index in the capture of the scene's frame `index`."""
         return self.start + ping_pong(index, self._last + 1)
 
     def time(self, index: int) -> float:
-        """Seconds: those of the capture; beyond its end by its rate."""
+        """Returns the time of a frame in seconds, extrapolated at the frame rate beyond the end of the capture."""
         if index <= self._last:
             return self.source.time(self.start + index) - self.source.time(self.start)
         return self.time(self._last) + (index - self._last) / self.source.fps
 
-    def files(self, index: int) -> FrameFiles:
-        """Returns the files of a frame; those of the next are made meanwhile."""
+    def files(self, index: int) -> EncodedFrame:
+        """Returns the files of a frame and prefetches those of the next one."""
         future = self._ahead[1] if self._ahead and self._ahead[0] == index else self._reader.submit(self._files, index)
         files = future.result()
         if index + 1 < len(self):
             self._ahead = index + 1, self._reader.submit(self._files, index + 1)
         return files
 
-    def _files(self, index: int) -> FrameFiles:
+    def _files(self, index: int) -> EncodedFrame:
         place, names = self.capture_index(index), self.source.full_rig.names
         images = dict(
             zip(names, self._pool.map(lambda name: self.source.encoded_image(place, name), names), strict=True)
         )
         files = dict(zip(names, self._pool.map(lambda name: self.source.encoded_mask(place, name), names), strict=True))
         masks = {name: mask for name, mask in files.items() if mask is not None}
-        # The service takes masks of all cameras or of none.
-        return FrameFiles(self.time(index), images, masks if len(masks) == len(images) else {})
+        # The service accepts masks for all cameras or for none.
+        return EncodedFrame(self.time(index), images, masks if len(masks) == len(images) else {})
 
     def close(self) -> None:
-        """Ends its threads."""
+        """Stops the threads."""
         self._reader.shutdown(wait=True, cancel_futures=True)
         self._pool.shutdown(wait=True)

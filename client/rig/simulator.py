@@ -1,4 +1,4 @@
-"""The rig simulator: a capture on disk, sent as a rig would send it."""
+"""Simulation of a live camera rig, which sends a capture on disk to the service."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from client.wire import IngestSettings, SceneStatus
 from scas4d_core.captures import Capture
 
 OnProgress = Callable[[str, int, int], None]
-"""(stage, done, total)."""
+"""Progress callback, called with (stage, done, total)."""
 
 
 def push(
@@ -40,33 +40,37 @@ def push(
     on_progress: OnProgress | None = None,
     on_message: OnMessage | None = None,
 ) -> Delivery:
-    """Creates a scene, sends its cloud and every frame in order and in time, and waits until the last is finished.
+    """Creates a scene, sends its point cloud and all frames at the given pace, and waits until the last is finished.
 
-    The clock of a rig starts when frame 0 is finished. A restart of the service is waited out for as long as the
-    client waits for an outage, and what it says comes next is sent next.
+    The clock of the rig starts when frame 0 is finished. Restarts of the service are tolerated within the outage
+    timeout of the client. Sending then continues with the frame that the service expects.
 
     Args:
-        source: its training cameras are sent, at the size of the files. The service scales, if `settings` say so.
-        client: of the service.
-        scene: id of a scene to go on with, from its next frame; a new one where None.
-        name: of a new scene; that of the source where None.
-        pace: of the rig; as fast as the service takes them where None. The times of the frames are those of the capture
-            either way.
-        frames: how many the scene shall have; all where None, or without end with `loop`.
-        start: the frame of the capture that is frame 0 of the scene.
-        loop: go back and forth through the capture until `frames`, or until it is interrupted.
-        per_camera: every camera sends its own pictures, over a connection of its own.
-        websocket: send over a WebSocket (one for each camera with `per_camera`) instead of requests.
-        preset: named settings.
-        settings: what differs from the preset, nested.
-        ingest: how the scene takes frames.
-        nodes: labels that a node of the cluster must have for a new scene.
-        on_progress: hears of progress: the stages of frame 0, then "frames" with the number finished.
-        on_message: hears sentences: outages, frames that were lost, where it goes on.
+        source: capture whose training cameras are sent, at the resolution of the files. The service scales the images
+            if `settings` requests it.
+        client: client of the service.
+        scene: id of an existing scene to continue from its next frame; None creates a new scene.
+        name: name of a new scene; None for the name of the source.
+        pace: pace of the rig; None sends as fast as the service accepts frames. Timestamps are those of the capture
+            in either case.
+        frames: total number of frames of the scene; None for all, or for no limit with `loop`.
+        start: index in the capture of the scene's frame 0.
+        loop: run back and forth through the capture until `frames` is reached or the push is interrupted.
+        per_camera: each camera sends its own images over its own connection.
+        websocket: send over a WebSocket (one per camera with `per_camera`) instead of HTTP requests.
+        preset: name of a settings preset.
+        settings: nested settings that differ from the preset.
+        ingest: how the scene accepts frames.
+        nodes: labels that a cluster node must have to run a new scene.
+        on_progress: called with the stages of frame 0, then with "frames" and the number of finished frames.
+        on_message: called with messages about outages, lost frames and the frame at which sending continues.
+
+    Returns:
+        The scene, the delays and the lost frames.
 
     Raises:
-        ServiceError, ServiceUnreachable: as by the client.
-        RuntimeError: the scene failed, or has other cameras than the capture.
+        ServiceError, ServiceUnreachable: raised by the client.
+        RuntimeError: the scene failed, or its cameras differ from those of the capture.
 
     >>> from client.importers.open_source import open_source
     >>> delivery = push(open_source(folder), client, frames=2)
@@ -110,10 +114,10 @@ def push(
                 else:
                     on_progress("frames", _finished(client.scene(status.id)), count)
             delivery.lateness.ended = time.monotonic()
-            # A frame that was lost is finished at once, those before it are not.
+            # Lost frames count as finished immediately, so wait for the last frame that was sent.
             last = next((index for index in reversed(range(count)) if index not in delivery.lost), 0)
             _follow(client, status.id, last, count, on_progress)
-        except KeyboardInterrupt:  # how a loop without end is ended
+        except KeyboardInterrupt:  # the way to stop an endless loop
             on_message("interrupted")
             delivery.lateness.ended = delivery.lateness.ended or time.monotonic()
         delivery.status = client.scene(status.id)
@@ -122,7 +126,7 @@ def push(
 
 
 class _record_retries:
-    """Counts what the client waits for, and says when an outage begins."""
+    """Context manager that records the client's waiting times and reports the start of an outage."""
 
     def __init__(self, client: Client, lateness: Lateness, on_message: OnMessage) -> None:
         self._client = client
@@ -139,7 +143,7 @@ class _record_retries:
         self._client.on_retry = self._before
 
     def _hear(self, retry: Retry) -> None:
-        with self._lock:  # cameras of their own wait at the same time
+        with self._lock:  # the threads of several cameras may wait at the same time
             if retry.reason == "busy":
                 self._lateness.busy += retry.seconds
                 self._lateness.busy_count += 1
@@ -176,5 +180,5 @@ def _follow(client: Client, id: str, index: int, count: int, on_progress: OnProg
 
 
 def _finished(status: SceneStatus) -> int:
-    """Frames of which nothing more will happen."""
+    """Returns the number of frames that need no further processing."""
     return status.next_frame - status.queued

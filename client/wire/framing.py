@@ -147,7 +147,7 @@ def parse_frame(data: bytes | bytearray | memoryview) -> tuple[FrameHead, list[m
     head = parse_head(view[PREFIX.size : at])
     expected = at + sum(file.size for file in head.files)
     if len(view) != expected:
-        raise FramingError(f"has {len(view)} bytes where its head says {expected}", "send what the head says")
+        raise FramingError(f"has {len(view)} bytes where its head says {expected}", "send what the head describes")
     pieces = []
     for file in head.files:
         pieces.append(view[at : at + file.size])

@@ -1,4 +1,4 @@
-"""Reads captures from disk: cameras, pictures, masks, ground truth. Needs only numpy and Pillow."""
+"""Reads captures from disk: cameras, images, masks and ground truth. Needs only numpy and Pillow."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ __all__ = [
 
 
 def open_capture(folder: Path | str, **options: Any) -> Capture:
-    """Opens a capture of any known layout; the files in the folder determine the layout.
+    """Opens a capture in a known layout, which is recognized by the files in the folder.
 
     Args:
-        folder: of the capture.
-        options: of the reader, `read_dynamic3dgs`: image_scale, fps, use_masks, use_points, size_mismatch.
+        folder: folder of the capture.
+        options: options of `read_dynamic3dgs`: image_scale, fps, use_masks, use_points, size_mismatch.
 
     Raises:
-        CaptureError: no such folder, no known layout, or a fault in one of the files.
+        CaptureError: the folder does not exist, its layout is unknown, or one of its files is invalid.
 
     >>> capture = open_capture("samples/robot", image_scale=0.25)
     >>> capture.rig.names[:3], capture.frame_count

@@ -1,4 +1,4 @@
-"""A capture: pictures of a rig over time. Pictures are decoded when they are read."""
+"""`Capture`: images of a rig over time, decoded lazily on access."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from scas4d_core.captures.reader import PictureReader
 
 
 class LazyPictures(Mapping[str, NDArray[np.uint8]]):
-    """Pictures by camera name, decoded anew at every access and not kept: a long capture stays out of memory."""
+    """Images by camera name, decoded on every access and not cached, to limit memory use."""
 
     def __init__(self, cameras: Collection[str], decode: Callable[[str], NDArray[np.uint8]]) -> None:
         self._cameras = cameras
@@ -37,26 +37,26 @@ class LazyPictures(Mapping[str, NDArray[np.uint8]]):
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """A sequence of frames of one rig, with points and ground truth where there are any.
+    """A sequence of frames from one rig, optionally with points and ground truth.
 
     Attributes:
-        name: of the capture's folder.
-        full_rig: the training cameras at the size of the pictures.
-        full_test_rig: the test cameras at the size of the pictures; None where there are none.
-        pictures: reads pictures and masks of all these cameras.
-        image_scale: pictures, masks, labels and the cameras of ``rig`` are resized by this.
-        fps: frames per second; the time of frame i is i / fps where the pictures have no times of their own.
-        points: a cloud of frame 0, or None.
-        ground_truth: tracks and parts, or None.
-        extent: longest side of the box of the foreground over the sequence, user's units, or None.
-        remarks: sentences for a person, on how the files were read.
+        name: name of the capture's folder.
+        full_rig: training cameras at the full image size.
+        full_test_rig: test cameras at the full image size, or None.
+        pictures: reader for the images and masks of all cameras.
+        image_scale: factor by which images, masks, labels and the cameras of ``rig`` are resized.
+        fps: frames per second; the time of frame i is i / fps if the images have no times of their own.
+        points: point cloud of frame 0, or None.
+        ground_truth: ground-truth tracks and parts, or None.
+        extent: longest side of the foreground's bounding box over the sequence, in the user's units, or None.
+        remarks: messages about how the files were read, for the user.
 
     >>> from scas4d_core.captures import open_capture
     >>> capture = open_capture("samples/robot")
     >>> frame = capture.frame(2)
     >>> round(frame.time, 4), sorted(frame.masks) == sorted(capture.rig.names)
     (0.0667, True)
-    >>> capture.encoded_image(2, "0")[:4]  # the file as it is
+    >>> capture.encoded_image(2, "0")[:4]  # the unchanged file
     b'\x89PNG'
     >>> capture.test_rig.names
     ('4', '11')
@@ -77,45 +77,45 @@ class Capture:
 
     @property
     def rig(self) -> Rig:
-        """The training cameras, as large as the pictures that `frame` gives."""
+        """Training cameras at the size of the images that `frame` returns."""
         return self.full_rig.scaled(self.image_scale)
 
     @property
     def test_rig(self) -> Rig | None:
-        """The test cameras, as large as the pictures that `test_frame` gives; None where there are none."""
+        """Test cameras at the size of the images that `test_frame` returns, or None."""
         return None if self.full_test_rig is None else self.full_test_rig.scaled(self.image_scale)
 
     @property
     def frame_count(self) -> int:
-        """T, the number of frames."""
+        """Number of frames T."""
         return self.pictures.frame_count
 
     def time(self, index: int) -> float:
-        """Seconds of a frame: those of its pictures, else by the frame rate."""
+        """Returns the time of a frame in seconds: from the images if they have times, else from the frame rate."""
         given = self.pictures.time(index)
         return index / self.fps if given is None else given
 
     def frame(self, index: int) -> Frame:
-        """The training pictures and masks of one moment.
+        """Returns the training images and masks of one frame.
 
         Raises:
-            IndexError: no such frame. Reading a picture may raise ImageError.
+            IndexError: no such frame. Accessing an image may also raise ImageError.
         """
         return self._frame(index, self.full_rig)
 
     def test_frame(self, index: int) -> Frame:
-        """The test pictures of one moment, and masks where there are any: to measure with, never to train on.
+        """Returns the test images of one frame, and their masks if any, for evaluation only.
 
         Raises:
             IndexError: no such frame.
-            CaptureError: the capture has no test cameras. Reading a picture may raise ImageError.
+            CaptureError: the capture has no test cameras. Accessing an image may also raise ImageError.
         """
         if self.full_test_rig is None:
             raise CaptureError(f"capture {self.name}: has no test cameras; hold some out (--test)")
         return self._frame(index, self.full_test_rig)
 
     def encoded_image(self, index: int, camera: str) -> bytes:
-        """Bytes of a picture's file, at full size whatever ``image_scale``, of a training or test camera.
+        """Returns the bytes of an image file of a training or test camera, at full size independent of ``image_scale``.
 
         Raises:
             IndexError: no such frame.
@@ -126,7 +126,7 @@ class Capture:
         return self.pictures.encoded_image(index, camera)
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
-        """Bytes of a mask's file, at full size whatever ``image_scale``; None where there is none.
+        """Returns the bytes of a mask file at full size independent of ``image_scale``, or None if there is no mask.
 
         Raises:
             IndexError: no such frame.
@@ -136,7 +136,7 @@ class Capture:
         return self.pictures.encoded_mask(index, camera)
 
     def scaled(self, image_scale: float) -> Capture:
-        """The same capture at another ``image_scale``; pictures come from the same reader."""
+        """Returns the capture at another ``image_scale``; it shares the image reader."""
         truth = self.ground_truth
         if truth is not None:
             sizes = {name: (full, scaled_size(full, image_scale)) for name, (full, _) in truth.image_size.items()}
@@ -144,10 +144,10 @@ class Capture:
         return replace(self, image_scale=image_scale, ground_truth=truth)
 
     def with_held_out(self, names: Collection[str]) -> Capture:
-        """The same capture with these cameras among the test cameras: measured on, never trained on.
+        """Returns the capture with the named cameras moved from the training to the test cameras.
 
         Raises:
-            CaptureError: no such camera, or none is left to train on.
+            CaptureError: a camera does not exist, or no training camera would be left.
         """
         if not names:
             return self
@@ -163,10 +163,10 @@ class Capture:
         return replace(self, full_rig=Rig(train), full_test_rig=Rig(held + others))
 
     def with_training_as_test(self, rig: Rig | None = None) -> Capture:
-        """The same capture with its training cameras for test cameras: measures how well training pictures are met.
+        """Returns the capture with its training cameras as test cameras, to measure the fit to the training images.
 
         Args:
-            rig: these cameras as a scene has refined them; None: as they are.
+            rig: training cameras as refined by a scene; None uses them unchanged.
         """
         return replace(self, full_test_rig=self.full_rig if rig is None else rig)
 

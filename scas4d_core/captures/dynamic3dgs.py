@@ -1,10 +1,10 @@
-"""Reads the layout of the Dynamic3DGaussians data. Numpy and Pillow only.
+"""Reads the Dynamic3DGaussians data layout. Needs only numpy and Pillow.
 
-``train_meta.json`` and ``test_meta.json`` hold ``w``, ``h``, ``k[t][c]`` (3×3, pixels), ``w2c[t][c]`` (4×4, OpenCV
-axes), ``fn[t][c]`` (path under ``ims/``) and ``cam_id[t][c]``. Masks lie under ``seg/`` with the same path, ending in
-``.png``. ``init_pt_cld.npz`` holds ``data`` [P, 7]: x y z, r g b (0…1), foreground (0…1). Beyond that layout,
-``train_meta.json`` may hold ``fps``; ``w`` and ``h`` may be lists of one number a camera, where sizes differ; and a
-cloud without known foreground has six columns.
+``train_meta.json`` and ``test_meta.json`` contain ``w``, ``h``, ``k[t][c]`` (3×3, pixels), ``w2c[t][c]`` (4×4, OpenCV
+axes), ``fn[t][c]`` (path under ``ims/``) and ``cam_id[t][c]``. Masks are under ``seg/`` with the same path, ending in
+``.png``. ``init_pt_cld.npz`` contains ``data`` [P, 7]: x y z, r g b (0…1), foreground (0…1). This reader also accepts
+``fps`` in ``train_meta.json``, lists with one number per camera for ``w`` and ``h``, and point clouds with six columns,
+without foreground.
 (JonathonLuiten/Dynamic3DGaussians, ``train.py``.)
 """
 
@@ -29,7 +29,7 @@ from scas4d_core.captures.size_mismatch import SizeMismatch, adapt_intrinsics
 
 TRAIN_META = "train_meta.json"
 STATIC_TOLERANCE = 1e-6
-"""Largest change of an entry of k or w2c over time that still counts as a camera standing still."""
+"""Largest relative change over time of an entry of k or w2c for a camera that counts as static."""
 
 
 def read_dynamic3dgs(
@@ -43,18 +43,20 @@ def read_dynamic3dgs(
 ) -> Capture:
     """Opens a capture. Cameras are named ``str(cam_id)``; test cameras are those of ``test_meta.json``.
 
-    Masks, cloud, test cameras and ground truth are optional, but masks must be there for all training cameras or none.
+    Masks, point cloud, test cameras and ground truth are optional, but masks must exist for all training cameras or
+    none.
 
     Args:
-        folder: holds ``train_meta.json``.
-        image_scale: resizes pictures, masks, labels and cameras alike.
-        fps: frames per second; where None, those of ``train_meta.json`` (``scas4d import`` writes them), else 30.
-        use_masks: False to leave ``seg/`` alone.
-        use_points: False to leave ``init_pt_cld.npz`` alone.
-        size_mismatch: how pictures of another shape than ``w``, ``h`` were made (`adapt_intrinsics`); None refuses.
+        folder: folder that contains ``train_meta.json``.
+        image_scale: factor by which images, masks, labels and cameras are resized.
+        fps: frames per second; None uses ``fps`` of ``train_meta.json`` (written by ``scas4d import``), or else 30.
+        use_masks: False ignores ``seg/``.
+        use_points: False ignores ``init_pt_cld.npz``.
+        size_mismatch: how images with another aspect ratio than ``w``, ``h`` were made (`adapt_intrinsics`); None
+            rejects them.
 
     Raises:
-        CaptureError: a file is missing, broken, or does not fit the others; or a camera moves.
+        CaptureError: a file is missing, damaged or inconsistent with the others, or a camera moves.
     """
     folder = Path(folder)
     train = _read_cameras(folder, TRAIN_META, size_mismatch)
@@ -91,7 +93,7 @@ def read_dynamic3dgs(
 
 
 def _merge_files(of: list[tuple[Files, ...]]) -> list[Files]:
-    """The files of training and test cameras, frame by frame."""
+    """Merges the files of training and test cameras, frame by frame."""
     return [{name: file for files in frame for name, file in files.items()} for frame in zip(*of, strict=True)]
 
 
@@ -150,7 +152,7 @@ def _adapt_camera(camera: Camera, picture: Path, size_mismatch: SizeMismatch | N
 
 
 def _sizes(path: Path, key: str, value: Any, cameras: int) -> list[int]:
-    """Widths or heights by camera; one number stands for all."""
+    """Returns widths or heights by camera; a single number applies to all cameras."""
     if not isinstance(value, list):
         return [_parse_pixels(path, key, value)] * cameras
     if len(value) != cameras:
@@ -193,7 +195,7 @@ def _require_static(path: Path, key: str, value: Any, shape: tuple[int, ...]) ->
     if moved.any():
         frame, camera = np.argwhere(moved)[0]
         raise CaptureError(
-            f"{path}: {key} of camera number {camera} changes at frame {frame}; a rig's cameras must stand still: "
+            f"{path}: {key} of camera number {camera} changes at frame {frame}; a rig's cameras must not move: "
             "cut the capture where they move"
         )
     still: NDArray[np.float64] = array[0]
@@ -211,7 +213,7 @@ def _relative_paths(path: Path, fn: Any, frames: int, names: list[str]) -> tuple
         for name, entry in zip(names, row, strict=True):
             file = PurePosixPath(entry)
             if file.is_absolute() or ".." in file.parts or "\\" in entry or not file.name:
-                raise CaptureError(f"{path}: fn[{number}] {entry!r} leads out of ims/; give a path below it")
+                raise CaptureError(f"{path}: fn[{number}] {entry!r} points outside ims/; give a path below it")
             files[name] = file
         result.append(files)
     return tuple(result)

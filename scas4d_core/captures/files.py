@@ -1,4 +1,4 @@
-"""Reads the JSON and npz files of a capture, with errors that name the fault. Numpy only."""
+"""Reads the JSON and npz files of a capture, with specific error messages. Needs only numpy."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from numpy.typing import NDArray
 
 
 class CaptureError(ValueError):
-    """A capture that cannot be read; the message names the file, the fault and the remedy."""
+    """Raised if a capture cannot be read; the message names the file, the problem and the remedy."""
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Reads a JSON file that holds an object.
+    """Reads a JSON file that contains an object.
 
     Raises:
-        CaptureError: missing, not JSON, or not an object.
+        CaptureError: the file is missing, not JSON, or not an object.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -32,16 +32,16 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_npz(path: Path, keys: tuple[str, ...]) -> dict[str, NDArray[Any]]:
-    """Reads named arrays of an npz file, without pickle.
+    """Reads the named arrays of an npz file, without pickle.
 
     Raises:
-        CaptureError: missing, broken, or without one of the keys.
+        CaptureError: the file is missing or damaged, or lacks one of the keys.
     """
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             arrays = {key: file[key] for key in keys}
     except KeyError as fault:
         raise CaptureError(f"{path}: has no array {fault}; needed: {', '.join(keys)}") from fault
-    except Exception as fault:  # zipfile, zlib and numpy each raise their own on a damaged file
+    except Exception as fault:  # zipfile, zlib and numpy raise different exceptions
         raise CaptureError(f"{path}: is not an npz file without pickle ({type(fault).__name__}: {fault})") from fault
     return arrays

@@ -1,4 +1,4 @@
-"""A frame, pictures and masks of one moment by camera, and the initial points of a scene. Numpy only."""
+"""`Frame`, the images and masks of one time step by camera, and `InitialPoints` of a scene. Needs only numpy."""
 
 from __future__ import annotations
 
@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """The pictures of one moment.
+    """The images of all cameras at one time step.
 
     Attributes:
-        index: 0, 1, 2, … in order of time.
+        index: 0, 1, 2, … in temporal order.
         time: seconds since the first frame.
-        images: by camera name, [H, W, 3] uint8, the sRGB values of the file. An entry may be decoded when it is read.
-        masks: by camera name, [H, W] uint8, 1 on the foreground; empty where the capture has no masks.
+        images: images by camera name, [H, W, 3] uint8, sRGB values as in the file. Entries may be decoded lazily on
+            access.
+        masks: masks by camera name, [H, W] uint8, 1 on the foreground; empty if the capture has no masks.
 
     >>> picture = np.zeros((48, 64, 3), np.uint8)
     >>> frame = Frame(index=3, time=0.1, images={"front": picture, "left": picture}, masks={})
@@ -33,12 +34,12 @@ class Frame:
 
 @dataclass(eq=False)
 class InitialPoints:
-    """A cloud on the surfaces of frame 0, from which frame 0 is fitted.
+    """A point cloud on the surfaces of frame 0, from which the fit of frame 0 starts.
 
     Attributes:
-        positions: [P, 3] float64, user's units and axes.
-        colours: [P, 3] float32 in 0…1, sRGB values as in the pictures.
-        foreground: [P] float32 in 0…1, or None where unknown.
+        positions: [P, 3] float64, in the user's units and axes.
+        colours: [P, 3] float32 in 0…1, sRGB values as in the images.
+        foreground: [P] float32 in 0…1, or None if unknown.
 
     >>> cloud = InitialPoints(np.zeros((5, 3)), np.full((5, 3), 0.5, np.float32))
     >>> len(cloud), cloud.foreground is None

@@ -1,4 +1,4 @@
-"""Ground truth of a synthetic capture: point tracks, visibility, parts and their labels. Numpy only."""
+"""Ground truth of a synthetic capture: point tracks, visibility, parts and part labels. Needs only numpy."""
 
 from __future__ import annotations
 
@@ -18,12 +18,13 @@ class TruePart:
     """One part of the scene.
 
     Attributes:
-        id: the part's value in part labels.
-        name: for people.
-        rigid: true where all of the part moves as one.
-        static: true where it stands still throughout.
-        foreground: true where masks cover it.
-        pose: [T, 4, 4] part to world, where rigid; a point moves from frame s to t by ``pose[t] @ inv(pose[s])``.
+        id: value of the part in label images.
+        name: human-readable name.
+        rigid: whether the part moves as a rigid body.
+        static: whether the part never moves.
+        foreground: whether masks cover the part.
+        pose: [T, 4, 4] part to world for rigid parts, else None; ``pose[t] @ inv(pose[s])`` moves a point from frame s
+            to t.
     """
 
     id: int
@@ -36,16 +37,16 @@ class TruePart:
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """Tracks of P material points over T frames, seen by C cameras, and part labels per pixel.
+    """Tracks of P material points over T frames, their visibility in C cameras, and part labels per pixel.
 
     Attributes:
-        points: [T, P, 3] float64 world positions, user's units.
+        points: [T, P, 3] float64 world positions, in the user's units.
         part_id: [P] int64, the part of each point.
-        visible: [T, C, P] bool: inside the picture and not hidden.
-        cameras: names for the axis C, training and test cameras alike.
-        parts: the table of parts; empty where the capture has none.
-        label_files: by camera name, the label picture of every frame; empty where the capture has none.
-        image_size: by camera name, (width, height) to which labels are resized.
+        visible: [T, C, P] bool, whether the point is inside the image and not occluded.
+        cameras: names along the axis C, for both training and test cameras.
+        parts: the parts; empty if the capture has none.
+        label_files: label images of all frames, by camera name; empty if the capture has none.
+        image_size: full and scaled (width, height), by camera name; labels are resized from the former to the latter.
 
     >>> from scas4d_core.captures import open_capture
     >>> truth = open_capture("samples/robot").ground_truth
@@ -65,17 +66,17 @@ class GroundTruth:
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """[P] bool: points that leave their place of frame 0 by more than a millionth of the box of all points."""
+        """[P] bool: points that leave their position in frame 0 by more than 10⁻⁶ of the bounding box of all points."""
         moved: NDArray[np.float64] = np.linalg.norm(self.points - self.points[:1], axis=-1).max(axis=0)
         box = float(np.ptp(self.points.reshape(-1, 3), axis=0).max())
         moving: NDArray[np.bool_] = moved > 1e-6 * box
         return moving
 
     def visible_in(self, camera: str) -> NDArray[np.bool_]:
-        """[T, P] visibility in one camera.
+        """Returns the visibility [T, P] in one camera.
 
         Raises:
-            KeyError: the ground truth does not know the camera.
+            KeyError: the ground truth does not include the camera.
         """
         if camera not in self.cameras:
             raise KeyError(camera)
@@ -83,33 +84,33 @@ class GroundTruth:
 
     @property
     def label_cameras(self) -> tuple[str, ...]:
-        """The cameras that have part labels."""
+        """Cameras that have part labels."""
         return tuple(self.label_files)
 
     def labels(self, camera: str, index: int) -> NDArray[np.uint8]:
-        """[H, W] uint8 part id per pixel of a frame, 0 where there is no part; sampled, not averaged, when scaled.
+        """Returns part ids per pixel of a frame, [H, W] uint8, 0 for no part. Labels are sampled, not averaged.
 
         Raises:
             KeyError: the camera has no labels.
-            ImageError: the file cannot be used.
+            ImageError: the label image cannot be used.
         """
         full, scaled = self.image_size[camera]
         return decode_labels(self.label_files[camera][index], size=full, target=scaled)
 
 
 def read_ground_truth(folder: Path, frame_count: int, sizes: Mapping[str, tuple[Size, Size]]) -> GroundTruth | None:
-    """The ground truth beside a capture: ``gt_tracks.npz``, and if there ``scene.json`` and ``gt_parts/``.
+    """Reads a capture's ground truth: ``gt_tracks.npz`` and, if present, ``scene.json`` and ``gt_parts/``.
 
     Args:
-        folder: of the capture.
-        frame_count: T of the capture.
-        sizes: by camera name, full and scaled (width, height).
+        folder: folder of the capture.
+        frame_count: number of frames T of the capture.
+        sizes: full and scaled (width, height), by camera name.
 
     Returns:
-        None where there is no ``gt_tracks.npz``.
+        The ground truth, or None if ``gt_tracks.npz`` does not exist.
 
     Raises:
-        CaptureError: a file is broken, or does not fit the capture.
+        CaptureError: a file is damaged, or does not match the capture.
     """
     path = folder / "gt_tracks.npz"
     if not path.exists():
@@ -135,7 +136,7 @@ def read_ground_truth(folder: Path, frame_count: int, sizes: Mapping[str, tuple[
         points=points.astype(np.float64),
         part_id=part_id.astype(np.int64),
         visible=visible.astype(np.bool_),
-        # The axis C is indexed by cam_id, which is also the cameras' name.
+        # The axis C is indexed by cam_id, which is also the camera's name.
         cameras=tuple(str(index) for index in range(visible.shape[1])),
         parts=_read_parts(folder / "scene.json", frame_count),
         label_files=label_files,
@@ -144,7 +145,10 @@ def read_ground_truth(folder: Path, frame_count: int, sizes: Mapping[str, tuple[
 
 
 def read_extent(folder: Path) -> float | None:
-    """Longest side of the box of the foreground over the sequence, user's units, where ``scene.json`` has it."""
+    """Returns the longest side of the foreground's bounding box over the sequence, in the user's units.
+
+    The value is read from ``scene.json``; returns None if it has none.
+    """
     path = folder / "scene.json"
     value = read_json(path).get("extent") if path.exists() else None
     if value is None:

@@ -1,21 +1,21 @@
-"""Decodes pictures and masks from files, and resizes them. Numpy and Pillow only.
+"""Decodes and resizes images and masks. Needs only numpy and Pillow.
 
-Content of a picture file, and its treatment:
+Content of an image file, and how it is handled:
 
 ======================  ====================================================================================
-EXIF orientation ≠ 1    refused: the intrinsics of a calibrated camera belong to one orientation of the pixels,
+EXIF orientation ≠ 1    rejected: the intrinsics of a calibrated camera hold for one orientation of the pixels,
                         and the file does not say which one the calibration used
-alpha (also palette)    composited over black, in the values of the file: the empty background of a capture
+alpha (also palette)    composited over black, the empty background of a capture, using the file's values
 grey                    replicated to three channels
-16 bit                  to 8 bit by value / 257: grey exactly, colour by its high byte (within one level of that)
-ICC profile             converted to sRGB, relative to white; a profile that calls itself sRGB leaves values as is
-ICC profile of grey     not applied: the values are taken as they are
-no ICC profile          taken for sRGB; gAMA and cHRM chunks are not read
-CMYK, float, Lab        refused
-more than one picture   refused (animations, multi-page and multi-picture files)
+16 bit                  value / 257, rounded to 8 bit for grey; colour takes the high byte (at most one level off)
+ICC profile             converted to sRGB (relative colorimetric); values are kept if the profile names itself sRGB
+ICC profile of grey     not applied: the values are kept
+no ICC profile          assumed to be sRGB; gAMA and cHRM chunks are not read
+CMYK, float, Lab        rejected
+more than one image     rejected (animations, multi-page and multi-image files)
 ======================  ====================================================================================
 
-A mask is 1 where the stored value of any channel is not zero; alpha in a mask and lossy formats are refused.
+A mask is 1 where the stored value of any channel is nonzero. Masks with alpha or in lossy formats are rejected.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ Size = tuple[int, int]
 
 
 class ImageError(ValueError):
-    """A picture or mask that cannot be used; the message names the file and the fault."""
+    """Raised if an image or mask cannot be used; the message names the file and the problem."""
 
 
 def scaled_size(size: Size, image_scale: float) -> Size:
-    """Width and height under ``image_scale``, rounded as `Camera.scaled` rounds them."""
+    """Returns width and height multiplied by ``image_scale``, rounded as in `Camera.scaled`."""
     if not (np.isfinite(image_scale) and image_scale > 0):
         raise ImageError(f"image_scale {image_scale!r} must be a positive number")
     return max(1, round(size[0] * image_scale)), max(1, round(size[1] * image_scale))
@@ -52,19 +52,19 @@ def scaled_size(size: Size, image_scale: float) -> Size:
 def decode_image(
     source: bytes | Path, *, size: Size | None = None, image_scale: float = 1.0, name: str | None = None
 ) -> NDArray[np.uint8]:
-    """Decodes a picture to sRGB values.
+    """Decodes an image to sRGB values.
 
     Args:
-        source: the bytes of a picture file, or its path.
-        size: (width, height) in pixels that the file must have: those of the camera before ``image_scale``.
-        image_scale: resizes by area averaging to the size that `Camera.scaled` gives, edges on edges.
-        name: of the picture in messages; None: the path.
+        source: bytes of an image file, or its path.
+        size: (width, height) in pixels that the file must have, before ``image_scale``.
+        image_scale: factor for resizing by area averaging to the size of `Camera.scaled`, with edges aligned.
+        name: name of the image in messages; None uses the path.
 
     Returns:
         [H, W, 3] uint8.
 
     Raises:
-        ImageError: no such file, not a picture, or content that the head of this module refuses.
+        ImageError: the file is missing, is not an image, or has content that the module docstring lists as rejected.
 
     >>> file = io.BytesIO()
     >>> Image.new("RGB", (4, 2), (255, 128, 0)).save(file, "PNG")
@@ -83,9 +83,9 @@ def decode_image(
 def decode_mask(
     source: bytes | Path, *, size: Size | None = None, image_scale: float = 1.0, name: str | None = None
 ) -> NDArray[np.uint8]:
-    """Decodes a foreground mask, 1 where any stored value is not zero; arguments and errors as for `decode_image`.
+    """Decodes a foreground mask: 1 where any stored value is nonzero. Arguments and errors are those of `decode_image`.
 
-    Under ``image_scale`` a pixel is foreground when at least half of its area is.
+    After resizing by ``image_scale``, a pixel is foreground if at least half of its area is.
 
     Returns:
         [H, W] uint8, values 0 and 1.
@@ -98,8 +98,8 @@ def decode_mask(
     name = name or _name(source)
     picture = _open(source, name, MASK_FORMATS, size)
     if picture.mode in ("LA", "PA", "RGBA", "La", "RGBa"):
-        raise ImageError(f"{name}: a mask with an alpha channel can be read two ways; give one channel, 0 and not 0")
-    values = np.asarray(picture)  # palette pictures: the index, not the colour
+        raise ImageError(f"{name}: a mask with an alpha channel is ambiguous; give one channel, 0 and not 0")
+    values = np.asarray(picture)  # for palette images, the index instead of the colour
     foreground = values != 0
     if foreground.ndim == 3:
         foreground = foreground.any(axis=-1)
@@ -107,19 +107,19 @@ def decode_mask(
 
 
 def decode_labels(source: bytes | Path, *, size: Size, target: Size, name: str | None = None) -> NDArray[np.uint8]:
-    """Decodes a picture of labels, one channel of 8 bit; labels are picked, never averaged.
+    """Decodes an 8-bit single-channel image of labels. Resizing samples labels and never averages them.
 
     Args:
-        source: the bytes of the file, or its path.
-        size: (width, height) the file must have.
+        source: bytes of the file, or its path.
+        size: (width, height) that the file must have.
         target: (width, height) of the result; a pixel takes the label under its centre.
-        name: of the picture in messages; None: the path.
+        name: name of the image in messages; None uses the path.
 
     Returns:
         [H, W] uint8.
 
     Raises:
-        ImageError: as for `decode_mask`, or more than one channel.
+        ImageError: as for `decode_mask`, or the image has more than one channel.
 
     >>> file = io.BytesIO()
     >>> Image.fromarray(np.array([[3, 3, 7, 7]], np.uint8)).save(file, "PNG")
@@ -139,7 +139,7 @@ def decode_labels(source: bytes | Path, *, size: Size, target: Size, name: str |
 
 
 def picture_size(source: bytes | Path, name: str | None = None) -> Size:
-    """Width and height in pixels from the head of the file, without decoding it.
+    """Returns width and height in pixels from the file header, without decoding the image.
 
     >>> file = io.BytesIO()
     >>> Image.new("RGB", (4, 2)).save(file, "JPEG")
@@ -155,10 +155,10 @@ def picture_size(source: bytes | Path, name: str | None = None) -> Size:
 
 
 def resize_area(picture: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
-    """Resizes a picture [H, W, C] to (width, height); each new pixel is the mean over its area of the old picture.
+    """Resizes an image [H, W, C] to (width, height) by area averaging.
 
-    Edges map to edges, so a pixel position (centres at +0.5) is multiplied by the ratio of the sizes, as in
-    `Camera.scaled`. (Pillow's BOX filter takes whole source pixels only: half a pixel off at fractional ratios.)
+    Edges map to edges, so pixel positions (centres at +0.5) are multiplied by the ratio of the sizes, as in
+    `Camera.scaled`. Pillow's BOX filter uses whole source pixels only, which is half a pixel off at fractional ratios.
 
     >>> resize_area(np.array([[[0], [10], [20]]], np.uint8), size=(2, 1))[..., 0]
     array([[ 3, 17]], dtype=uint8)
@@ -169,7 +169,7 @@ def resize_area(picture: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
 
 
 def resize_mask(mask: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
-    """Resizes a mask [H, W] of 0 and 1 to (width, height): 1 where at least half of the new pixel's area is.
+    """Resizes a mask [H, W] of 0 and 1 to (width, height); a pixel is 1 if at least half of its area was 1.
 
     >>> resize_mask(np.array([[1, 1, 1, 0]], np.uint8), size=(2, 1))
     array([[1, 1]], dtype=uint8)
@@ -181,10 +181,10 @@ def resize_mask(mask: NDArray[np.uint8], size: Size) -> NDArray[np.uint8]:
 
 
 def eight_bit_file(data: bytes, name: str = "picture") -> bytes:
-    """The bytes of a JPEG, PNG or WebP as they are; any other picture becomes a PNG, of 16 bits one of 8.
+    """Returns an 8-bit JPEG, PNG or WebP file unchanged; any other image is re-encoded as an 8-bit PNG.
 
     Raises:
-        ImageError: such a picture cannot be decoded.
+        ImageError: the image must be re-encoded but cannot be decoded.
 
     >>> file = io.BytesIO()
     >>> Image.fromarray(np.full((2, 4), 25700, np.uint16)).save(file, "PNG")
@@ -200,18 +200,18 @@ def eight_bit_file(data: bytes, name: str = "picture") -> bytes:
 
 
 def is_sixteen_bit(head: bytes) -> bool:
-    """True where the first 25 bytes of a file are those of a PNG of 16 bits a channel."""
+    """Returns whether the first 25 bytes of a file are those of a PNG with 16 bits per channel."""
     return head.startswith(b"\x89PNG") and head[24:25] == b"\x10"
 
 
 def describe_pictures(files: Mapping[str, Path]) -> list[str]:
-    """Remarks on the first pictures of the cameras, by their heads: 16 bits, and grey cameras beside colour ones.
+    """Returns remarks on the cameras' first images, from their headers: 16 bits, and grey cameras among colour ones.
 
     Args:
-        files: one picture by camera name.
+        files: one image file by camera name.
 
     Raises:
-        ImageError: one cannot be read.
+        ImageError: an image cannot be read.
     """
     remarks, grey = [], {}
     for camera, path in files.items():
@@ -228,17 +228,17 @@ def describe_pictures(files: Mapping[str, Path]) -> list[str]:
 
 
 def mixed_colours(grey: Mapping[str, bool]) -> list[str]:
-    """The remark on a rig of grey and colour cameras, by camera name; none where all are alike."""
+    """Returns a remark if some cameras are grey and others are not, else an empty list."""
     if len(set(grey.values())) < 2:
         return []
     return grey_warnings([name for name, is_grey in grey.items() if is_grey])
 
 
 def grey_among(images: Mapping[str, NDArray[np.uint8]]) -> list[str]:
-    """Names of the grey pictures, where others have colours; a picture without contrast counts for nothing.
+    """Returns the names of grey images among colour images; images without contrast are ignored.
 
     Args:
-        images: [H, W, 3] by camera. Sensors of colour cameras have noise: no picture of theirs is grey in every pixel.
+        images: [H, W, 3] by camera. Colour sensors are noisy, so their images are never grey in every pixel.
 
     >>> grey = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)[..., :1].repeat(3, axis=2)
     >>> red = grey + np.uint8([1, 0, 0])
@@ -252,11 +252,11 @@ def grey_among(images: Mapping[str, NDArray[np.uint8]]) -> list[str]:
 
 
 def area_average(picture: NDArray[np.float64], size: Size) -> NDArray[np.float64]:
-    """``resize_area`` of float64 pictures [H, W] or [H, W, C], without rounding."""
+    """Resizes float64 images [H, W] or [H, W, C] like ``resize_area``, without rounding."""
     for axis, target in ((0, size[1]), (1, size[0])):
         picture = np.moveaxis(picture, axis, 0)
         length = picture.shape[0]
-        # The running integral of the picture is linear inside a pixel: read it at the edges of the new pixels.
+        # The image's cumulative integral is linear within a pixel, so it is interpolated at the new pixels' edges.
         integral = np.concatenate([np.zeros_like(picture[:1]), np.cumsum(picture, axis=0)])
         edges = np.arange(target + 1) * (length / target)
         left = np.minimum(edges.astype(np.intp), length - 1)
@@ -283,10 +283,10 @@ def _unreadable(name: str, fault: Exception) -> ImageError:
 
 
 def _open(source: bytes | Path, name: str, formats: tuple[str, ...], size: Size | None) -> Image.Image:
-    # Pillow's decoders fail on damaged files with many kinds of exceptions (OSError, SyntaxError, struct.error, …).
+    # On damaged files, Pillow's decoders raise many kinds of exceptions (OSError, SyntaxError, struct.error, …).
     try:
         picture = Image.open(_stream(source), formats=formats)
-        # Before decoding: a small file can unfold into gigabytes.
+        # Check before decoding, because a small file can decompress to gigabytes.
         if size is not None and picture.size != size:
             raise ImageError(
                 f"{name}: is {picture.width}x{picture.height} pixels, the camera {size[0]}x{size[1]}; "
@@ -299,7 +299,7 @@ def _open(source: bytes | Path, name: str, formats: tuple[str, ...], size: Size 
         if orientation != 1:
             raise ImageError(
                 f"{name}: EXIF orientation is {orientation}; the intrinsics refer to stored pixels and a turned "
-                "picture would not fit them; store the pixels the way the camera was calibrated and drop the tag"
+                "picture would not fit them; store the pixels as calibrated and remove the tag"
             )
         picture.load()
     except Exception as fault:
@@ -333,7 +333,7 @@ def _to_srgb(picture: Image.Image, profile: bytes, name: str) -> Image.Image:
         source: Any = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         described = source.profile.profile_description or ""
         if source.profile.xcolor_space.strip() != "RGB" or "sRGB" in described:
-            # A grey profile says only how grey is toned, and an sRGB one would turn values by a rounding.
+            # A grey profile is only a tone curve, and converting from sRGB would merely add rounding errors.
             return picture
         converted = ImageCms.profileToProfile(
             picture, source, ImageCms.createProfile("sRGB"), ImageCms.Intent.RELATIVE_COLORIMETRIC

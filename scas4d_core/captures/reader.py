@@ -1,4 +1,4 @@
-"""`PictureReader`: how a capture gets its pictures. `FileReader` reads files. Numpy and Pillow only."""
+"""`PictureReader`, the interface for reading a capture's images, and `FileReader`. Needs only numpy and Pillow."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ Files = Mapping[str, Path]
 
 
 class PictureReader(Protocol):
-    """Pictures and masks of pinhole cameras by frame and camera, training and test cameras alike.
+    """Reads the images and masks of pinhole cameras by frame and camera, for training and test cameras.
 
-    A picture has the size of its camera in the full rig, whatever the capture's `image_scale`. A reader keeps at most
-    a few pictures a camera in memory, and reading frame after frame costs each once.
+    Images have the size of their camera in the full rig, independent of the capture's `image_scale`. A reader keeps at
+    most
+    a few images per camera in memory, and decodes each image once if frames are read in order.
     """
 
     @property
@@ -27,23 +28,23 @@ class PictureReader(Protocol):
         """Number of frames T."""
 
     def time(self, index: int) -> float | None:
-        """Seconds, rising with the frame; None where the pictures do not say, and the frame rate counts."""
+        """Returns the frame's time in seconds, strictly increasing, or None if only the frame rate is known."""
 
     def image(self, index: int, camera: str) -> NDArray[np.uint8]:
-        """Decodes a picture, [H, W, 3] sRGB values.
+        """Decodes an image, [H, W, 3] sRGB values.
 
         Raises:
-            ImageError: it cannot be decoded, or has another size than its camera.
+            ImageError: the image cannot be decoded, or has another size than its camera.
         """
 
     def has_mask(self, index: int, camera: str) -> bool:
-        """True where there is a mask."""
+        """Returns whether the image has a mask."""
 
     def mask(self, index: int, camera: str) -> NDArray[np.uint8]:
         """Decodes a mask, [H, W], 1 on the foreground."""
 
     def encoded_image(self, index: int, camera: str) -> bytes:
-        """A picture as a file of 8 bits that the service takes: JPEG, PNG or WebP.
+        """Returns an image as an 8-bit file that the service accepts: JPEG, PNG or WebP.
 
         Raises:
             KeyError: no such camera.
@@ -51,16 +52,16 @@ class PictureReader(Protocol):
         """
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
-        """A mask as PNG or BMP; None where there is none."""
+        """Returns a mask as PNG or BMP, or None if there is none."""
 
 
 class FileReader:
-    """Reads one file a picture, as the Dynamic3DGaussians layout has them.
+    """Reads one file per image, as in the Dynamic3DGaussians layout.
 
     Args:
-        images: [T] files by camera name.
-        masks: [T] files by camera name; a camera without one has no mask then.
-        sizes: (width, height) that the files of a camera must have.
+        images: [T] image files by camera name.
+        masks: [T] mask files by camera name; a camera may have no mask in a frame.
+        sizes: (width, height) that the files of each camera must have.
     """
 
     def __init__(self, images: Sequence[Files], masks: Sequence[Files], sizes: Mapping[str, Size]) -> None:
@@ -68,15 +69,15 @@ class FileReader:
         self.frame_count = len(self.images)
 
     def time(self, index: int) -> float | None:
-        """None: this layout has a frame rate alone."""
+        """Returns None, because the layout stores only a frame rate."""
         return None
 
     def image(self, index: int, camera: str) -> NDArray[np.uint8]:
-        """Decodes a picture, [H, W, 3]."""
+        """Decodes an image, [H, W, 3]."""
         return decode_image(self.images[index][camera], size=self._sizes[camera])
 
     def has_mask(self, index: int, camera: str) -> bool:
-        """True where there is a file."""
+        """Returns whether the image has a mask file."""
         return camera in self.masks[index]
 
     def mask(self, index: int, camera: str) -> NDArray[np.uint8]:
@@ -84,19 +85,19 @@ class FileReader:
         return decode_mask(self.masks[index][camera], size=self._sizes[camera])
 
     def encoded_image(self, index: int, camera: str) -> bytes:
-        """The file as it is; one of 16 bits is rounded to 8."""
+        """Returns the unchanged file; 16-bit images are rounded to 8 bits."""
         return eight_bit_file(read_bytes(self.images[index][camera]), str(self.images[index][camera]))
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
-        """The file as it is; None where there is none."""
+        """Returns the unchanged mask file, or None if there is none."""
         return read_bytes(self.masks[index][camera]) if self.has_mask(index, camera) else None
 
 
 def read_bytes(path: Path) -> bytes:
-    """The bytes of a file.
+    """Reads the bytes of a file.
 
     Raises:
-        CaptureError: it cannot be read.
+        CaptureError: the file cannot be read.
     """
     try:
         return path.read_bytes()

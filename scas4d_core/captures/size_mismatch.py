@@ -1,4 +1,4 @@
-"""Cameras whose pictures are of another size than they were calibrated for. Numpy only."""
+"""Adapts cameras whose images have another size than calibrated. Needs only numpy."""
 
 from __future__ import annotations
 
@@ -11,15 +11,18 @@ from scas4d_core.captures.files import CaptureError
 from scas4d_core.captures.images import Size
 
 SizeMismatch = Literal["corner", "centre", "stretch"]
-"""How a picture of another shape than calibrated came about: cut (or padded) at the right and the bottom, cut evenly
-on opposite sides, or resized by different factors along x and y."""
+"""How images with another aspect ratio than calibrated were produced.
+
+``corner``: cropped (or padded) at the right and bottom. ``centre``: cropped evenly on opposite sides. ``stretch``:
+resized by different factors along x and y.
+"""
 
 ROUNDING_PIXELS = 0.5
-"""A resized picture has the calibrated shape up to the rounding of its sides to whole pixels."""
+"""Tolerance per side when comparing aspect ratios, because resized sides are rounded to whole pixels."""
 MIN_RESIZE = 0.05
-"""Nobody resizes pictures by less than this share: a few pixels less are cut off, and cutting is another camera."""
+"""Smallest relative size change that counts as resizing; a smaller change is cropping, which shifts the camera."""
 CODEC_BLOCK = 16
-"""Video codecs pad both sides to a multiple of this; some calibrations were made with the padding, as 1088 for 1080."""
+"""Video codecs pad both sides to a multiple of this. Some calibrations include the padding, such as 1088 for 1080."""
 
 
 def adapt_intrinsics(
@@ -31,23 +34,24 @@ def adapt_intrinsics(
     where: str,
     size_mismatch: SizeMismatch | None = None,
 ) -> tuple[NDArray[np.float64], str | None]:
-    """Intrinsics [3, 3] for pictures of another size than a camera was calibrated for, and a remark that says so.
+    """Adapts intrinsics [3, 3] to images of another size than calibrated, and returns a remark about it.
 
-    A picture of the calibrated shape was resized: intrinsics scale with it. One of another shape may have been cut in
-    more than one way, and the file does not say in which: it is refused unless `size_mismatch` says.
+    Images with the calibrated aspect ratio were resized, so the intrinsics are scaled. Images with another aspect ratio
+    may have been cropped in several ways, so they are rejected unless `size_mismatch` is given.
 
     Args:
-        intrinsics: [3, 3] in pixels, principal point from the upper left corner.
-        calibrated: (width, height) for which they hold.
-        found: (width, height) of the pictures.
-        camera: its name, for messages. where: the picture, for messages.
-        size_mismatch: how pictures of another shape came about; None refuses them.
+        intrinsics: [3, 3] in pixels, with the principal point relative to the upper left corner.
+        calibrated: (width, height) that the intrinsics were calibrated for.
+        found: (width, height) of the images.
+        camera: name of the camera, for messages.
+        where: path of the image, for messages.
+        size_mismatch: how images with another aspect ratio were produced; None rejects them.
 
     Returns:
-        The intrinsics, and the remark; None where the sizes are the same.
+        The intrinsics and the remark, which is None if the sizes are equal.
 
     Raises:
-        CaptureError: another shape, and `size_mismatch` does not say how.
+        CaptureError: the aspect ratios differ and `size_mismatch` is None.
 
     >>> k = np.array([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]])
     >>> half, remark = adapt_intrinsics(k, (64, 48), (32, 24), camera="c", where="c.png")
@@ -82,7 +86,7 @@ def adapt_intrinsics(
 
 
 def _same_shape(calibrated: Size, found: Size) -> bool:
-    """True where one factor gives both sides, rounded."""
+    """Returns whether one scale factor maps both sides, up to rounding."""
     lowest = max((side - ROUNDING_PIXELS) / of for side, of in zip(found, calibrated, strict=True))
     highest = min((side + ROUNDING_PIXELS) / of for side, of in zip(found, calibrated, strict=True))
     return lowest <= highest

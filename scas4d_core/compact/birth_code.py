@@ -1,6 +1,6 @@
-"""Gaussians as bytes without a reference: those of the first frame, and those that are born later.
+"""Encodes Gaussians without a reference: those of the first frame, and those that are born later.
 
-Other frames refer to them, so thin axes keep their direction: each axis is coded in parts of its own length.
+Other frames refer to them, so thin axes must keep their direction: each axis is quantized relative to its own length.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ from scas4d_core.compact.sections import (
 Float = NDArray[np.float64]
 
 OCTAVE = 8
-"""Steps of an axis' length in a factor of two."""
+"""Quantization steps of an axis length per factor of two."""
 FINER = 4
-"""Bounds of centres, axes and colours are divided by this: they are coded once, and what stands keeps their errors."""
+"""Divisor of the bounds of centres, axes and colours. They are coded once, and static Gaussians keep these errors."""
 COARSEST = 0.02
-"""Error of an axis in parts of its own length, at most."""
+"""Maximum error of an axis, relative to its own length."""
 SHORTEST = 1e-30
-"""Metres; an axis is not shorter."""
+"""Minimum length of an axis, in metres."""
 TINIEST, LARGEST_SIZE = 1e-18, 1e18
-"""Metres; a size outside is coded exactly."""
+"""Range of sizes in metres; Gaussians outside it are coded exactly."""
 OPAQUE = 1e-4
-"""Opacities keep this far from 0 and 1."""
+"""Minimum distance of opacities from 0 and 1."""
 COMPONENTS = {"lengths": 3, "axes": 9, "means": 3, "rotations": 3, "colours": 3, "labels": 1, "opacities": 1}
 
 
 def encode_born(state: Columns, clusters: Clusters, bounds: Bounds) -> tuple[bytes, Columns]:
-    """Codes Gaussians, with their ids and clusters; returns the bytes, and the Gaussians as a reader will have them.
+    """Encodes Gaussians with their ids and clusters; returns the bytes and the Gaussians as decoded by a reader.
 
     >>> from scas4d_core.gaussians import Gaussians
     >>> state = Columns.of(Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1))
@@ -86,10 +86,10 @@ def encode_born(state: Columns, clusters: Clusters, bounds: Bounds) -> tuple[byt
 
 
 def decode_born(body: bytes, count: int, bounds: Bounds) -> tuple[Columns, Clusters]:
-    """The Gaussians that were coded, and their clusters.
+    """Decodes Gaussians and their clusters.
 
     Raises:
-        PlaneError: the bytes are not ``count`` Gaussians.
+        PlaneError: the bytes do not encode ``count`` Gaussians.
     """
     steps, offset = unpack(body, count)
     labels, offset = unpack(body, count, offset)
@@ -119,7 +119,7 @@ def _axis_step(bounds: Bounds) -> float:
 
 
 def _planes(state: Columns, bounds: Bounds) -> dict[str, Float]:
-    """[P, N] of each attribute, in whole steps; what is no finite number or too large is found later."""
+    """Returns each attribute [P, N] in quantization steps; values may still be non-finite or too large."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         factors = state.factors.astype(np.float64).reshape(3, 3, -1)
         lengths = np.rint(OCTAVE * np.log2(np.maximum(np.sqrt(np.square(factors).sum(axis=0)), SHORTEST)))

@@ -1,4 +1,4 @@
-"""Error bounds of a compact file, by attribute."""
+"""Error bounds of a compact file, per attribute."""
 
 from __future__ import annotations
 
@@ -10,18 +10,21 @@ from scas4d_core.errors import InputError
 
 @dataclass(frozen=True)
 class Bounds:
-    """The largest error that a decoded state has in one component of an attribute.
+    """Maximum error per component of each attribute of a decoded state.
 
-    A Gaussian's size is the root mean square of the lengths of its three axes. Defaults: the coarsest at which the five
-    objects lose less than 0.05 dB (docs/format.md has the figures).
+    A Gaussian's size is the root mean square of the lengths of its three axes. The defaults are the coarsest bounds at
+    which the five test objects lose less than 0.05 dB (figures in docs/format.md).
 
     Attributes:
-        position: of a centre, in parts of the Gaussian's size. axes: of an axis, in the same parts.
-        rotation: of the material rotation, the angle in radians.
-        colour: of a channel, where colours are 0…1. gloss: of a component. opacity: in 0…1.
+        position: error of a centre, as a fraction of the Gaussian's size.
+        axes: error of an axis, as a fraction of the Gaussian's size.
+        rotation: angle error of the material rotation in radians.
+        colour: error of a colour channel in 0…1.
+        gloss: error of a gloss component.
+        opacity: error of an opacity in 0…1.
 
     Raises:
-        InputError: a bound that is not between 1e-6 (rotation: 0.002) and 1.
+        InputError: a bound is not between 1e-6 (rotation: 0.002) and 1.
 
     >>> Bounds(position=0.1).position
     0.1
@@ -45,20 +48,20 @@ class Bounds:
 
     @property
     def rotation_step(self) -> float:
-        """The step of each component of ``rotation_vectors``; the bound is of the angle that three of them make."""
+        """Quantization step per component of ``rotation_vectors``, derived from the bound on the total angle."""
         return 2 * self.rotation / 3**0.5
 
     def record(self) -> dict[str, float]:
-        """The bounds by name, for the head of a file."""
+        """Returns the bounds by name, for the header of a file."""
         return asdict(self)
 
     @classmethod
     def of_record(cls, given: Mapping[str, float]) -> Bounds:
-        """The bounds that a head holds; names of later versions are left out."""
+        """Returns the bounds stored in a header; names from later versions are ignored."""
         return cls(**{item.name: float(given[item.name]) for item in fields(cls) if item.name in given})
 
 
 LEAST = 1e-6
-"""Below it float32 has no digits left."""
+"""Smallest bound; float32 has no precision left below it."""
 MIN_ROTATION = 0.002
-"""Below it the steps of a half turn are more than a plane holds."""
+"""Smallest rotation bound; with smaller steps, the values of a half turn would exceed the range of a plane."""

@@ -1,7 +1,7 @@
-"""One affine map for each cluster of Gaussians carries a state to the next.
+"""One affine map per cluster of Gaussians predicts a state from the previous one.
 
-As in the cascade, a map carries centres (x → x + A (x − c) + t), axes (F → (I + A) F) and, by the polar rotation of
-I + A, the material rotation. What remains is each Gaussian's own, and small. Numpy only.
+As in the cascade, a map transforms centres (x → x + A (x − c) + t) and axes (F → (I + A) F). The polar rotation of I +
+A is applied to the material rotation. The remaining residual of each Gaussian is small. Needs only numpy.
 """
 
 from __future__ import annotations
@@ -22,25 +22,28 @@ Float = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 PER_CLUSTER, MAX_CLUSTERS = 100, 400
-"""Gaussians in a cluster on average, and most clusters: more cost more than they save (docs/format.md)."""
+"""Average number of Gaussians per cluster, and maximum number of clusters.
+
+More clusters would cost more bytes than they save (docs/format.md).
+"""
 ROUNDS, SAMPLE = 5, 20_000
-"""Of k-means: rounds, and Gaussians whose centres are averaged."""
+"""Iterations of k-means, and number of Gaussians sampled to compute the centres."""
 NO_CLUSTER = 0
-"""Label of what does not move with a cluster; clusters count from 1."""
+"""Label of Gaussians without a cluster; clusters are numbered from 1."""
 SMALLEST = 1e-9
-"""Metres; smaller Gaussians weigh no more."""
+"""Minimum size in metres when weighting Gaussians, which limits the weight of tiny ones."""
 IDENTITY = (1.0, 0.0, 0.0, 0.0)
-"""No turn."""
+"""The identity quaternion."""
 RIDGE = 1e-3
-"""Pull of A to zero, in units of the Gaussians' size: a flat or thin cluster does not determine A across its plane."""
+"""Ridge regularization of A, in units of the Gaussians' size, since a flat or thin cluster leaves A underdetermined."""
 
 
 @dataclass(frozen=True, eq=False)
 class Clusters:
-    """Clusters of Gaussians that move together in a file.
+    """Clusters of Gaussians that share an affine motion.
 
     Attributes:
-        labels: [N] int64, 0 for those that stand, else 1 + the cluster.
+        labels: [N] int64, 0 for static Gaussians, else 1 + the cluster index.
 
     >>> clusters = Clusters(np.array([2, 0, 1, 2]))
     >>> clusters.count, clusters.means(np.array([[1.0, 5.0, 7.0, 3.0]]))
@@ -51,40 +54,40 @@ class Clusters:
 
     @cached_property
     def count(self) -> int:
-        """Of clusters."""
+        """Number of clusters."""
         return int(self.labels.max(initial=0))
 
     def sums(self, columns: Iterable[NDArray[Any]]) -> Float:
-        """[P, count] sums over each cluster of P columns [N]."""
+        """Returns the sum of each column [N] over each cluster, [P, count]."""
         totals = [np.bincount(self.labels, column, minlength=self.count + 1)[1:] for column in columns]
         return np.array(totals, np.float64)
 
     @cached_property
     def sizes(self) -> Float:
-        """[count] Gaussians of each cluster, 1 at least."""
+        """[count] number of Gaussians per cluster, at least 1."""
         return np.maximum(np.bincount(self.labels, minlength=self.count + 1)[1:], 1).astype(np.float64)
 
     def means(self, columns: NDArray[Any]) -> Float:
-        """[P, count] means over each cluster of columns [P, N]."""
+        """Returns the means of columns [P, N] over each cluster, [P, count]."""
         return self.sums(columns) / self.sizes
 
     def spread(self, values: NDArray[Any], stands: float) -> Array:
-        """[N] float32, a value [count] of each Gaussian's cluster; ``stands`` for those that stand."""
+        """Returns the value [count] of each Gaussian's cluster as float32 [N]; static Gaussians get ``stands``."""
         table = np.empty(self.count + 1, np.float32)
         table[NO_CLUSTER], table[1:] = stands, values
         return table[self.labels]
 
     def rows(self, rows: NDArray[np.intp]) -> Clusters:
-        """Those of some Gaussians: of all that move at least, so that each cluster is the same."""
+        """Returns the labels of some rows. These must include all moving Gaussians, so that clusters do not change."""
         return Clusters(self.labels[rows])
 
     def concatenate(self, labels: Ints) -> Clusters:
-        """With those of more Gaussians after them."""
+        """Appends the labels of further Gaussians."""
         return Clusters(np.concatenate([self.labels, labels]))
 
     @classmethod
     def of(cls, state: Gaussians) -> Clusters:
-        """Clusters of the Gaussians that move, by their places."""
+        """Clusters the moving Gaussians by position."""
         moving = np.flatnonzero(state.moving)
         labels = np.zeros(len(state), np.int64)
         count = min(MAX_CLUSTERS, -(-len(moving) // PER_CLUSTER))
@@ -93,10 +96,11 @@ class Clusters:
         return cls(labels)
 
     def nearest(self, state: Columns, born: Columns) -> Ints:
-        """[B] labels of Gaussians that are born: that of the nearest cluster, for those that move.
+        """Returns labels [B] of newborn Gaussians: the nearest cluster for moving ones, else 0.
 
         Args:
-            state: of those that ``labels`` are about.
+            state: the Gaussians that ``labels`` belong to.
+            born: the newborn Gaussians.
         """
         labels = np.zeros(len(born), np.int64)
         moving = np.flatnonzero(born.moving)
@@ -108,10 +112,11 @@ class Clusters:
 
 @dataclass(frozen=True, eq=False)
 class ClusterMotion:
-    """One affine map for each cluster.
+    """One affine map per cluster.
 
     Attributes:
-        matrices: [K, 3, 3] A. shifts: [K, 3] t, metres.
+        matrices: [K, 3, 3] A.
+        shifts: [K, 3] t in metres.
     """
 
     matrices: Float
@@ -119,7 +124,7 @@ class ClusterMotion:
 
     @classmethod
     def fit(cls, clusters: Clusters, reference: Columns, state: Columns) -> ClusterMotion:
-        """The maps of least squares, each Gaussian by its own size."""
+        """Fits the maps by least squares, weighting each Gaussian by its inverse squared size."""
         means = reference.means
         centres = clusters.means(means)
         weights = 1 / np.square(np.maximum(reference.sizes(), SMALLEST).astype(np.float64))
@@ -132,18 +137,18 @@ class ClusterMotion:
         for (i, j), second_moments in zip(pairs, clusters.sums(weighted[i] * arms[j] for i, j in pairs), strict=True):
             moments[:, i, j] = moments[:, j, i] = second_moments
         right = clusters.sums(one * step for one in weighted for step in steps).reshape(4, 3, -1)
-        # In units of 1/size², the pull of one Gaussian's own extent: its weight times its size squared is 1.
+        # A Gaussian's weight times its squared size is 1, so its own extent adds one unit of regularization.
         moments[:, range(3), range(3)] += RIDGE * clusters.sizes[:, None]
         moments[:, 3, 3] += 1e-12 + (moments[:, 3, 3] == 0)
         try:
             maps = np.asarray(np.linalg.solve(moments, right.transpose(2, 0, 1)), np.float64)
-        except np.linalg.LinAlgError:  # numbers near the ends of float64: every Gaussian is coded by itself
+        except np.linalg.LinAlgError:  # near float64 overflow; fall back to residuals alone
             maps = np.zeros((clusters.count, 4, 3))
         maps[~np.isfinite(maps).all(axis=(1, 2))] = 0
         return cls(np.ascontiguousarray(maps[:, :3].transpose(0, 2, 1)), maps[:, 3])
 
     def predict(self, clusters: Clusters, reference: Columns) -> Columns:
-        """The state that the maps predict; what stands has the reference's bits."""
+        """Returns the state predicted by the maps; static Gaussians are bit-identical to the reference."""
         if not clusters.count:
             return reference
         centres = clusters.means(reference.means)
@@ -167,7 +172,7 @@ class ClusterMotion:
 
 
 def polar_rotations(matrices: Float) -> Float:
-    """[K, 3, 3] the rotation nearest to each matrix.
+    """Returns the rotation nearest to each matrix, [K, 3, 3].
 
     >>> polar_rotations(np.diag([2.0, 1.0, 1.0])[None])[0].round(6)
     array([[1., 0., 0.],
@@ -180,7 +185,7 @@ def polar_rotations(matrices: Float) -> Float:
 
 
 def quaternions_of(turns: Float) -> Float:
-    """[K, 4] unit quaternions (w, x, y, z), w ≥ 0, of rotation matrices [K, 3, 3] (Bar-Itzhack 2000).
+    """Converts rotation matrices [K, 3, 3] to unit quaternions (w, x, y, z), w ≥ 0, [K, 4] (Bar-Itzhack 2000).
 
     >>> quaternions_of(np.diag([-1.0, -1.0, 1.0])[None])  # a half turn about z
     array([[0., 0., 0., 1.]])
@@ -199,7 +204,7 @@ def quaternions_of(turns: Float) -> Float:
 
 
 def _k_means(points: Float, count: int) -> Ints:
-    """[N] cluster of each point, from 0; the same points give the same clusters."""
+    """Returns the cluster of each point [N], from 0; the result is deterministic."""
     draw = np.random.default_rng(0)
     sample = points if len(points) <= SAMPLE else points[draw.choice(len(points), SAMPLE, replace=False)]
     centres = sample[draw.choice(len(sample), count, replace=False)]
@@ -209,11 +214,11 @@ def _k_means(points: Float, count: int) -> Ints:
         sums = np.stack([np.bincount(nearest, sample[:, axis], minlength=count) for axis in range(3)], axis=1)
         centres = np.where(members[:, None] > 0, sums / np.maximum(members, 1)[:, None], centres)
     labels = _nearest(points, centres)
-    return np.unique(labels, return_inverse=True)[1].astype(np.int64)  # none empty
+    return np.unique(labels, return_inverse=True)[1].astype(np.int64)  # drop empty clusters
 
 
 def _nearest(points: Float, centres: Float, piece: int = 512) -> Ints:
-    """[N] index of the nearest centre; in pieces that stay in the cache, which takes a tenth of the time."""
+    """Returns the index of the nearest centre for each point, [N]; blocks that fit the cache are ten times faster."""
     squares = np.square(centres).sum(axis=1)
     nearest = [
         np.argmin(squares - 2 * points[begin : begin + piece] @ centres.T, axis=1)

@@ -1,4 +1,4 @@
-"""A state by component: [components, N] arrays, which small kernels of numpy go through fast."""
+"""A state stored by component as [components, N] arrays, a layout on which numpy is fast."""
 
 from __future__ import annotations
 
@@ -15,17 +15,24 @@ Array = NDArray[np.float32]
 Float = NDArray[np.float64]
 
 LABELS = 64
-"""Levels of the learnt label; the threshold of moving Gaussians, 0.5, lies between two."""
+"""Number of levels of the learnt label; the threshold of moving Gaussians, 0.5, is between two levels."""
 
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """N Gaussians, component by component; arrays are shared between states and must not be written to.
+    """N Gaussians stored component by component. Arrays are shared between states and must not be modified.
 
     Attributes:
-        means: [3, N] metres. factors: [9, N], row by row of F. rotations: [4, N] (w, x, y, z). colours: [3, N].
-        foreground: [N]. ids: [N]. opacities: [N], those of the retired too. retired: [N] bool.
-        gloss: [3, M] or None. environment: what is mirrored, or None.
+        means: [3, N] in metres.
+        factors: [9, N], entries of F in row-major order.
+        rotations: [4, N] quaternions (w, x, y, z).
+        colours: [3, N].
+        foreground: [N] learnt labels.
+        ids: [N].
+        opacities: [N], including those of retired Gaussians.
+        retired: [N] bool.
+        gloss: [3, M] for the first M Gaussians, or None.
+        environment: environment map for reflections, or None.
 
     >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1)
     >>> Columns.of(state).means
@@ -49,7 +56,7 @@ class Columns:
 
     @classmethod
     def of(cls, state: Gaussians) -> Columns:
-        """The columns of a state."""
+        """Converts a state to columns."""
         return cls(
             means=_planes(state.means),
             factors=_planes(state.factors.reshape(len(state), 9)),
@@ -67,7 +74,7 @@ class Columns:
         return int(self.means.shape[1])
 
     def gaussians(self) -> Gaussians:
-        """The state."""
+        """Converts the columns to a state."""
         return Gaussians(
             means=np.ascontiguousarray(self.means.T),
             factors=np.ascontiguousarray(self.factors.T).reshape(-1, 3, 3),
@@ -82,39 +89,39 @@ class Columns:
         )
 
     def replace(self, **changes: Any) -> Columns:
-        """The same with some arrays exchanged."""
+        """Returns a copy with some arrays replaced."""
         return replace(self, **changes)
 
     def concatenate(self, born: Columns) -> Columns:
-        """With Gaussians after its own, which keep their ids and are dull."""
+        """Appends newborn Gaussians, which keep their ids and have no gloss."""
         return self.replace(
             **{name: np.concatenate([getattr(self, name), getattr(born, name)], axis=-1) for name in BY_ROW}
         )
 
     def from_row(self, count: int) -> Columns:
-        """The Gaussians from row ``count`` on, dull."""
+        """Returns the Gaussians from row ``count`` on, without gloss."""
         rows = {name: getattr(self, name)[..., count:] for name in BY_ROW}
         return self.replace(**rows, gloss=None, environment=None)
 
     def rows(self, rows: NDArray[np.intp]) -> Columns:
-        """Some of the Gaussians, dull."""
+        """Returns the Gaussians at the given rows, without gloss."""
         taken = {name: np.take(getattr(self, name), rows, axis=-1) for name in BY_ROW}
         return self.replace(**taken, gloss=None, environment=None)
 
     def replace_rows(self, rows: NDArray[np.intp], part: Columns) -> Columns:
-        """The same with place and shape of some rows exchanged."""
+        """Returns a copy with the positions and shapes of the given rows replaced."""
         changed = {name: getattr(self, name).copy() for name in SHAPED}
         for name, array in changed.items():
-            array[..., rows] = getattr(part, name) + np.float32(0)  # −0 to 0: whichever rows go through arithmetic
+            array[..., rows] = getattr(part, name) + np.float32(0)  # −0 becomes 0, as in computed rows
         return self.replace(**changed)
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """[N] bool: the Gaussians that move, by their label; none that is retired."""
+        """[N] bool: Gaussians that move according to their label and are not retired."""
         return np.asarray((self.foreground > 0.5) & ~self.retired)
 
     def sizes(self) -> Array:
-        """[N] sizes, metres: the root mean square of the lengths of the axes.
+        """Returns the sizes [N] in metres: the root mean square of the lengths of the axes.
 
         >>> Columns.of(Gaussians.of_points([[0, 0, 2]], radius=0.1)).sizes()
         array([0.1], dtype=float32)
@@ -122,19 +129,19 @@ class Columns:
         return sizes_of(self.factors)
 
     def volumes(self) -> Float:
-        """[N] determinants of F."""
+        """Returns the determinants of F, [N]."""
         a, b, c, d, e, f, g, h, i = self.factors.astype(np.float64)
         return np.asarray(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g))
 
 
 BY_ROW = ("means", "factors", "rotations", "colours", "foreground", "ids", "opacities", "retired")
-"""Arrays with a column for each Gaussian."""
+"""Names of the arrays with one column per Gaussian."""
 SHAPED = BY_ROW[:3]
-"""Those of them that say where a Gaussian is and of which shape."""
+"""Those arrays of `BY_ROW` that define position and shape."""
 
 
 def sizes_of(factors: Array) -> Array:
-    """[N] sizes of factors [9, N], metres."""
+    """Returns the sizes [N] in metres of factors [9, N]."""
     squares = np.zeros(factors.shape[1], np.float32)
     for plane in factors:
         squares += plane * plane
@@ -142,7 +149,7 @@ def sizes_of(factors: Array) -> Array:
 
 
 def levels_of(labels: NDArray[Any]) -> NDArray[np.int32]:
-    """Level of each learnt label, 0…63; those above 0.5 have 32 or more.
+    """Returns the level 0…63 of each learnt label; labels above 0.5 have levels of 32 or more.
 
     >>> levels_of(np.array([0.0, 0.5, 0.501, 1.0]))
     array([ 0, 31, 32, 63], dtype=int32)
@@ -152,20 +159,21 @@ def levels_of(labels: NDArray[Any]) -> NDArray[np.int32]:
 
 
 def label_of(levels: NDArray[Any]) -> Array:
-    """Label in the middle of a level."""
+    """Returns the label at the centre of each level."""
     return ((levels + 0.5) / LABELS).astype(np.float32)
 
 
 def products(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
-    """[4, N] a∘b of quaternions by component: first b, then a."""
+    """Returns the products a∘b of quaternions [4, N] by component; b is applied first."""
     return np.stack(product_components(a, b))
 
 
 def multiply_rows(rows: Sequence[Sequence[NDArray[Any]]], planes: NDArray[Any]) -> list[NDArray[Any]]:
-    """The components, [N] each, of a matrix times vectors or matrices, one of each a Gaussian.
+    """Multiplies one matrix per Gaussian with vectors or matrices; returns the components, each [N].
 
     Args:
-        rows: of the matrices, three of three [N]. planes: [3, N] of vectors, or [9, N] of matrices row by row.
+        rows: rows of the left matrices, three by three arrays [N].
+        planes: [3, N] vectors, or [9, N] matrices in row-major order.
 
     >>> one, zero = np.ones(1), np.zeros(1)
     >>> multiply_rows([[zero, one, zero], [one, zero, zero], [zero, zero, one]], np.array([[5.0], [6], [7]]))
@@ -180,7 +188,7 @@ def multiply_rows(rows: Sequence[Sequence[NDArray[Any]]], planes: NDArray[Any]) 
 
 
 def decorrelate_colours(colours: NDArray[Any]) -> NDArray[Any]:
-    """[3, N] green, and what red and blue have more of it: channels change alike.
+    """Returns green, red − green and blue − green, [3, N], since the channels are correlated.
 
     >>> decorrelate_colours(np.array([[5], [3], [2]])).ravel(), restore_colours(np.array([[3], [2], [-1]])).ravel()
     (array([ 3,  2, -1]), array([5, 3, 2]))
@@ -190,25 +198,25 @@ def decorrelate_colours(colours: NDArray[Any]) -> NDArray[Any]:
 
 
 def restore_colours(planes: NDArray[Any]) -> NDArray[Any]:
-    """[3, N] red, green and blue of ``decorrelate_colours``."""
+    """Inverts ``decorrelate_colours``; returns red, green and blue, [3, N]."""
     green, red, blue = planes
     return np.stack([red + green, green, blue + green])
 
 
 def relative_rotations(after: Array, before: Array) -> Float:
-    """[4, N] what turns one rotation to another."""
+    """Returns the rotations [4, N] that take ``before`` to ``after``."""
     w, x, y, z = before.astype(np.float64)
     return np.asarray(products(after.astype(np.float64), np.stack([w, -x, -y, -z])))
 
 
 def rotation_vectors(turns: NDArray[Any]) -> NDArray[Any]:
-    """[3, N] 2 tan(θ/2) about the axis of each turn [4, N]; near θ where it is small."""
+    """Returns 2 tan(θ/2) times the axis of each rotation [4, N], as [3, N]; the length is close to θ for small θ."""
     w = turns[0]
     return np.asarray(turns[1:] * (2 * np.where(w < 0, -1, 1) / np.maximum(np.abs(w), 1e-6)))
 
 
 def rotations_of_vectors(vectors: NDArray[Any]) -> NDArray[Any]:
-    """[4, N] unit quaternions of ``rotation_vectors``."""
+    """Inverts ``rotation_vectors``; returns unit quaternions [4, N]."""
     squares = 1 + np.square(vectors).sum(axis=0) / 4
     return np.asarray(np.concatenate([np.ones_like(vectors[:1]), vectors / 2]) / np.sqrt(squares))
 

@@ -1,4 +1,4 @@
-"""The end of a compact file, for a writer that goes on with it after a stop."""
+"""Encoder state at the end of a compact file, from which a writer resumes an interrupted file."""
 
 from __future__ import annotations
 
@@ -12,11 +12,16 @@ from scas4d_core.compact.records import Record
 
 @dataclass(frozen=True, eq=False)
 class EncoderState:
-    """The end of a file that is gone on with.
+    """State from which a writer continues a file.
 
     Attributes:
-        head: of the file. records: up to the last state. record: the record of that. state: that, as it is read.
-        born, clusters: of all Gaussians so far, as they were coded. since_key: states since the last key.
+        head: header of the file.
+        records: records up to the last state.
+        record: record of the last state.
+        state: the last state as decoded.
+        born: all Gaussians so far, as decoded from their birth records.
+        clusters: clusters of all Gaussians so far.
+        since_key: number of states since the last key frame.
     """
 
     head: FileHeader

@@ -1,6 +1,7 @@
-"""One state as bytes, coded against a reference that the reader has: cluster motion, and residuals of each Gaussian.
+"""Encodes one state against a reference state known to the reader: cluster motion, and residuals per Gaussian.
 
-The reference is a decoded state, so errors do not add up: what one frame leaves wrong, the next one sees. Numpy only.
+The reference is a decoded state, so errors do not accumulate: the next frame corrects the errors of the previous one.
+Needs only numpy.
 """
 
 from __future__ import annotations
@@ -33,25 +34,29 @@ Array = NDArray[np.float32]
 Float = NDArray[np.float64]
 
 MIN_VOLUME_RATIO = 0.1
-"""A decoded Gaussian whose volume is not between this part of the true one and its inverse is coded exactly: thin ones,
-whose error in an axis is as large as the axis, would lose their volume or turn inside out."""
+"""Bound on the ratio of decoded to true volume; outside this ratio and its inverse, a Gaussian is coded exactly.
+
+This affects thin Gaussians whose axis error is as large as the axis: they would lose their volume or be inverted.
+"""
 SLACK = 1 + 1e-4
-"""On bounds, for the rounding of float32."""
+"""Tolerance factor on bounds, for float32 rounding."""
 SHIFT_STEP = 0.5
-"""Step of a cluster's motion in parts of the middle step of a centre."""
+"""Quantization step of a cluster's translation, relative to the median step of a centre."""
 LARGEST_STEP = 1e90
-"""Larger ones are none of a state; what is made of them would not be finite."""
+"""Exclusive upper bound on valid steps; larger ones would produce non-finite states."""
 COARSEST = 0.01
-"""Step of A at most."""
+"""Maximum quantization step of A."""
 _STEPS = struct.Struct("<dd")
 """Steps of A and t."""
 
 
 @dataclass(frozen=True)
 class EncodedFrame:
-    """A state as bytes, and as a reader will have it.
+    """An encoded state, and the state as decoded by a reader.
 
     Attributes:
+        body: the encoded bytes.
+        decoded: the state as decoded by a reader.
         errors: the largest error of each attribute, in the units of ``Bounds``.
     """
 
@@ -61,10 +66,13 @@ class EncodedFrame:
 
 
 def encode(reference: Columns, state: Columns, clusters: Clusters, bounds: Bounds) -> EncodedFrame:
-    """Codes a state of the same Gaussians as the reference.
+    """Encodes a state that has the same Gaussians as the reference.
 
     Args:
-        reference: [N] as the reader has it. state: [N] exact. clusters: of the N.
+        reference: [N] reference Gaussians, as decoded by the reader.
+        state: [N] exact Gaussians.
+        clusters: clusters of the N Gaussians.
+        bounds: error bounds.
 
     >>> from scas4d_core.gaussians import Gaussians
     >>> before = Gaussians.of_points(np.random.default_rng(0).normal(size=(300, 3)), radius=0.1)
@@ -116,12 +124,14 @@ def encode(reference: Columns, state: Columns, clusters: Clusters, bounds: Bound
 
 @dataclass(frozen=True, eq=False)
 class FrameDelta:
-    """Changes that the body of one state encodes.
+    """The changes encoded in the body of one state.
 
     Attributes:
-        steps: of A and t. motion: [12, clusters] in these steps.
-        residuals: of each attribute, [R] rows and [P, R] whole steps.
-        rows, values: what is coded exactly, [E] and [12, E]. retired, environment: None where they are as before.
+        steps: quantization steps of A and t.
+        motion: [12, clusters] A and t in these steps.
+        residuals: rows [R] and quantized residuals [P, R] of each attribute.
+        rows, values: exactly coded rows [E] and their values [12, E].
+        retired, environment: new values, or None if unchanged.
     """
 
     steps: tuple[float, float]
@@ -134,13 +144,14 @@ class FrameDelta:
 
     @classmethod
     def read(cls, body: bytes, reference: Columns, clusters: Clusters) -> FrameDelta:
-        """Reads a body.
+        """Parses the body of a state.
 
         Args:
-            reference, clusters: of the same Gaussians.
+            body: the encoded bytes.
+            reference, clusters: reference state and clusters of the same Gaussians.
 
         Raises:
-            PlaneError: the bytes are no such state.
+            PlaneError: the bytes are not such a state.
         """
         if len(body) < _STEPS.size:
             raise PlaneError(f"{len(body)} bytes are no state")
@@ -164,10 +175,13 @@ class FrameDelta:
     def apply_shape(
         self, state: Columns, clusters: Clusters, bounds: Bounds, places: NDArray[np.intp] | None
     ) -> Columns:
-        """A state with the changes of centres, axes and rotations; what is glossy turns with its cluster.
+        """Applies the changes of centres, axes and rotations to a state; gloss rotates with its cluster.
 
         Args:
-            places: column of ``state`` of each row; None: they are the same.
+            state: reference Gaussians, possibly a subset.
+            clusters: clusters of these Gaussians.
+            bounds: error bounds.
+            places: column of ``state`` for each coded row; None if they are identical.
         """
         partial = DecodedState.of(bounds, _predict(state, clusters, self.motion, self.steps))
         for name in SHAPE:
@@ -177,7 +191,7 @@ class FrameDelta:
         return apply_exact(partial.state, self.rows if places is None else places[self.rows], self.values)
 
     def apply_appearance(self, state: Columns, bounds: Bounds) -> Columns:
-        """A state with all other changes."""
+        """Applies all other changes to a state."""
         partial = DecodedState(bounds, state, np.zeros(0, np.float32))
         for name in appearance_attributes(state):
             partial = partial.apply_residual(name, scattered(*self.residuals[name], coded_shape(state, name)[1]))
@@ -185,19 +199,23 @@ class FrameDelta:
 
 
 def decode(reference: Columns, clusters: Clusters, bounds: Bounds, body: bytes) -> Columns:
-    """The state that was coded.
+    """Decodes an encoded state.
 
     Args:
-        reference, clusters, bounds: as they were given to ``encode``.
+        reference, clusters, bounds: the same values as passed to ``encode``.
+        body: the encoded bytes.
 
     Raises:
-        PlaneError: the bytes are no such state.
+        PlaneError: the bytes are not such a state.
     """
     return apply_deltas(reference, clusters, bounds, [FrameDelta.read(body, reference, clusters)])
 
 
 def apply_deltas(reference: Columns, clusters: Clusters, bounds: Bounds, changes: Sequence[FrameDelta]) -> Columns:
-    """A state after several changes, one by one, of the same Gaussians; what stands all the while is not touched."""
+    """Applies several changes of the same Gaussians in order.
+
+    Gaussians whose shape is not coded by any change are skipped.
+    """
     if _codes_all_rows(reference, clusters):
         for change in changes:
             reference = change.apply_appearance(change.apply_shape(reference, clusters, bounds, None), bounds)
@@ -217,13 +235,13 @@ def apply_deltas(reference: Columns, clusters: Clusters, bounds: Bounds, changes
 
 
 def errors_of(decoded: Columns, state: Columns) -> dict[str, float]:
-    """The largest error of each attribute of a decoded state, in the units of ``Bounds``."""
+    """Returns the largest error of each attribute of a decoded state, in the units of ``Bounds``."""
     apart = {name: float(errors.max(initial=0)) for name, errors in _shape_errors(decoded, state).items()}
     return apart | _appearance_errors(decoded, state)
 
 
 def _shape_errors(decoded: Columns, state: Columns) -> dict[str, Array]:
-    """[N] the error of each Gaussian in centre, axes and rotation."""
+    """Returns the error of each Gaussian [N] in centre, axes and rotation."""
     sizes = np.maximum(state.sizes(), np.float32(1e-12))
     turns = rotation_vectors(relative_rotations(state.rotations, decoded.rotations))
     return {
@@ -234,7 +252,7 @@ def _shape_errors(decoded: Columns, state: Columns) -> dict[str, Array]:
 
 
 def _appearance_errors(decoded: Columns, state: Columns) -> dict[str, float]:
-    """The largest errors in what a Gaussian looks like."""
+    """Returns the largest errors of the appearance attributes."""
 
     def largest(found: Array, true: Array) -> float:
         return float(np.abs(found - true).max(initial=0))
@@ -249,17 +267,17 @@ def _appearance_errors(decoded: Columns, state: Columns) -> dict[str, float]:
 
 
 def _codes_all_rows(reference: Columns, clusters: Clusters) -> bool:
-    """True where all rows are coded: if all move, or have gloss, a search for those that stand only takes time."""
+    """Returns whether all rows are coded: if all move or any has gloss, searching static rows would only cost time."""
     return reference.gloss is not None or bool(clusters.labels.all())
 
 
 def _changing(
     reference: Columns, state: Columns, clusters: Clusters, bounds: Bounds
 ) -> tuple[NDArray[np.intp] | None, dict[str, float]]:
-    """[E] the Gaussians whose shape or place is coded: they move, or are off by more than the bounds; None for all.
+    """Returns the Gaussians [E] whose shape or position is coded, because they move or exceed the bounds; None for all.
 
     Returns:
-        And the largest errors of the others.
+        The rows, and the largest errors of the other Gaussians.
     """
     if _codes_all_rows(reference, clusters):
         return None, {}
@@ -271,14 +289,14 @@ def _changing(
 
 
 def _predict(reference: Columns, clusters: Clusters, planes: NDArray[np.int64], steps: tuple[float, float]) -> Columns:
-    """The reference, moved with its clusters."""
+    """Moves the reference with its clusters."""
     table = planes.T.astype(np.float64)
     motion = ClusterMotion(table[:, :9].reshape(-1, 3, 3) * steps[0], table[:, 9:] * steps[1])
     return motion.predict(clusters, reference)
 
 
 def _steps(clusters: Clusters, reference: Columns, bounds: Bounds) -> tuple[float, float]:
-    """Steps of A and t, such that both move a Gaussian by a part of its own step."""
+    """Returns the steps of A and t, chosen so that each moves a Gaussian by a fraction of its own step."""
     moving = clusters.labels > 0
     if not moving.any():
         return 1.0, 1.0
@@ -289,7 +307,7 @@ def _steps(clusters: Clusters, reference: Columns, bounds: Bounds) -> tuple[floa
 
 
 def _out_of_bounds(found: Columns, true: Columns, bounds: Bounds) -> NDArray[np.bool_]:
-    """[N] bool: the Gaussians whose centre or axes are further off than the bounds, or whose volume is lost."""
+    """Returns which Gaussians [N] exceed the bounds of centre or axes, or lose their volume."""
     sizes = true.sizes()
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(found.factors - true.factors).max(axis=0) <= SLACK * bounds.axes * sizes
@@ -298,7 +316,7 @@ def _out_of_bounds(found: Columns, true: Columns, bounds: Bounds) -> NDArray[np.
 
 
 def lost_volume(found: Columns, true: Columns) -> NDArray[np.bool_]:
-    """[N] bool: the Gaussians whose decoded volume is another than the true one, where that has any."""
+    """Returns which Gaussians [N] have a decoded volume that differs too much from a nonzero true volume."""
     with np.errstate(over="ignore", invalid="ignore"):
         volumes, volumes_decoded = true.volumes(), found.volumes()
         low, high = (
@@ -315,10 +333,12 @@ def apply_exact(
     retired: NDArray[np.bool_] | None = None,
     environment: Array | None = None,
 ) -> Columns:
-    """A state with what is coded exactly: centres and axes [12, E] of some rows, who is retired, what is mirrored.
+    """Applies exactly coded values: centres and axes [12, E] of some rows, the retired mask and the environment.
 
     Args:
-        rows, values: None for no rows. retired, environment: None where the state's own hold.
+        state: the state to change.
+        rows, values: rows and their values; None for no rows.
+        retired, environment: new values; None keeps those of the state.
     """
     if rows is not None and values is not None and len(rows):
         means, factors = state.means.copy(), state.factors.copy()

@@ -1,4 +1,4 @@
-"""The head of a compact file: what its numbers mean. JSON, so that any language reads it."""
+"""The header of a compact file, which defines the meaning of its numbers. It is JSON, readable from any language."""
 
 from __future__ import annotations
 
@@ -14,18 +14,20 @@ from scas4d_core.compact.bounds import Bounds
 from scas4d_core.compact.records import FileError, FormatError
 
 VERSION = 1
-"""Of the format (docs/format.md); files of another one are refused."""
+"""Version of the format (docs/format.md); files of other versions are rejected."""
 
 
 @dataclass(frozen=True)
 class FileHeader:
-    """Facts that hold for a whole file.
+    """Metadata of a whole file.
 
     Attributes:
-        world: from the user's world to that of the states. bounds: of every state.
-        background: RGB in 0…1 behind everything. rig: the cameras in the user's world, None where it is not known.
-        frames_per_second: nominal, None where it is not known: each frame has its own time.
-        metadata: about the file, JSON values.
+        world: transform from the user's world to the world of the states.
+        bounds: error bounds of every state.
+        background: background colour, RGB in 0…1.
+        rig: cameras in the user's world, or None if unknown.
+        frames_per_second: nominal frame rate, or None if unknown; each frame has its own time.
+        metadata: JSON values about the file.
 
     >>> head = FileHeader(WorldFrame(np.zeros(3)))
     >>> FileHeader.read(head.text(), "a file").bounds == head.bounds
@@ -40,7 +42,7 @@ class FileHeader:
     metadata: Mapping[str, Any] = field(default_factory=dict)
 
     def text(self) -> bytes:
-        """As it is written."""
+        """Returns the header serialized as JSON."""
         cameras = None if self.rig is None else [_camera_record(camera) for camera in self.rig.cameras]
         record = {
             "format": "scas4d",
@@ -58,10 +60,15 @@ class FileHeader:
 
     @classmethod
     def read(cls, text: bytes, name: str) -> FileHeader:
-        """The head of a file of this name.
+        """Parses the header of a file.
+
+        Args:
+            text: serialized header.
+            name: name of the file, for messages.
 
         Raises:
-            FileError: it is none. FormatError: it is of another version of the format.
+            FileError: the text is not a valid header.
+            FormatError: the file has another version of the format.
         """
         try:
             record = json.loads(text)

@@ -1,4 +1,4 @@
-"""The index at the end of a compact file: where all records are."""
+"""The index at the end of a compact file, which lists the offsets of all records."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from scas4d_core.compact.records import HEAD_SIZE, Record, RecordKind, parse_hea
 
 FOOTER_MAGIC = b"s4dINDEX"
 _FOOTER = struct.Struct("<Q8s")
-"""Place of the record of the index; the last bytes of the file."""
+"""Last bytes of the file: offset of the index record, and magic bytes."""
 _COUNT = struct.Struct("<I")
 NO_INDEX = (ValueError, TypeError, OverflowError, RecursionError, struct.error, zstandard.ZstdError)
-"""Errors of bytes that are no index; the file is listed by its records then."""
+"""Exceptions raised by bytes that are not a valid index; the reader then scans the records."""
 _ROW = np.dtype(
     [("kind", "u1"), ("frame", "<i8"), ("time", "<f8"), ("offset", "<u8"), ("size", "<u4"), ("checksum", "<u4")]
 )
 
 
 def index_body(records: Sequence[Record], about: bytes) -> bytes:
-    """The body of an index: number of records, their table, and JSON about the whole file."""
+    """Returns the body of an index: record count, table of records, and JSON about the whole file."""
     rows = [(one.kind, one.frame, one.time, one.offset, one.size, one.checksum) for one in records]
     return _COUNT.pack(len(rows)) + compress(np.array(rows, _ROW).tobytes() + about)
 
 
 def footer(offset: int) -> bytes:
-    """The last bytes of a file whose index is at an offset."""
+    """Returns the last bytes of a file whose index starts at the given offset."""
     return _FOOTER.pack(offset, FOOTER_MAGIC)
 
 
 def read_index(file: BinaryIO, name: str) -> tuple[list[Record], dict[str, Any]] | None:
-    """The records of a file and what is said of the whole; None where it ends without an index, or a damaged one."""
+    """Returns the records of a file and the JSON values about it, or None if the index is missing or damaged."""
     size = file.seek(0, 2)
     if size < _FOOTER.size + HEAD_SIZE:
         return None
@@ -58,7 +58,7 @@ def read_index(file: BinaryIO, name: str) -> tuple[list[Record], dict[str, Any]]
 def _parsed(body: bytes, end: int) -> tuple[list[Record], dict[str, Any]] | None:
     (count,) = _COUNT.unpack_from(body)
     size = zstandard.frame_content_size(body[_COUNT.size :])
-    if not count * _ROW.itemsize <= size <= end:  # a table is never longer than the records that it lists
+    if not count * _ROW.itemsize <= size <= end:  # the table cannot be longer than the records it lists
         return None
     data = decompress(body[_COUNT.size :], size)
     rows = np.frombuffer(data, _ROW, count)

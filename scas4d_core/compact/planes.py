@@ -1,7 +1,7 @@
-"""Integers as bytes: planes of small values, packed to 2, 4 or 8 bits with escapes, then zstandard.
+"""Encodes integers as bytes: planes of small values, packed to 2, 4 or 8 bits with escapes, then zstandard.
 
-A plane is one component of an attribute over all rows, mostly zeros and ones. Zstandard's Huffman coder spends a bit at
-least on each byte, so values that need a fraction of a bit are packed several to a byte first.
+A plane is one component of an attribute over all rows, mostly zeros and ones. Zstandard's Huffman coder spends at least
+one bit per byte, so values with less than a bit of entropy are first packed several to a byte.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ Ints = NDArray[np.int32]
 Unsigned = NDArray[np.uint32]
 
 LEVEL = 3
-"""Of zstandard: higher ones take several times as long for one to two percent."""
+"""Compression level of zstandard; higher levels take several times as long and save one to two percent."""
 NARROW = (2, 4, 8)
-"""Bits a value; 0 is a plane of zeros alone."""
+"""Possible bits per value; 0 marks a plane of zeros."""
 WIDE = 16
-"""Mode of a plane in two: the low bytes, and a plane of the rest."""
+"""Mode of a plane that is split in two: the low bytes, and a plane of the remaining bits."""
 ESCAPE = 24
-"""Bits that an escaped value takes, about: four bytes, of which one or two are not zero."""
+"""Approximate cost of an escaped value in bits: four bytes, of which one or two are nonzero."""
 MOST = 1 << 31
-"""Values are smaller than this in size."""
+"""Exclusive upper bound on the absolute value of a number."""
 _HEAD = struct.Struct("<BII")
-"""Mode, escapes, bytes that follow; of a wide plane, those of its low bytes."""
+"""Mode, number of escapes, and number of bytes that follow (in a wide plane, of its low bytes)."""
 
 
 class PlaneError(ValueError):
-    """Bytes that are no plane of so many values."""
+    """Raised if bytes are not a plane with the expected number of values."""
 
 
 def pack(values: NDArray[Any]) -> bytes:
-    """[N] integers, each below 2³¹ in size, as bytes that say how they are packed.
+    """Encodes integers [N], each below 2³¹ in absolute value, as self-describing bytes.
 
     >>> unpack(pack(np.array([0, -1, 3, 1000])), 4)[0]
     array([   0,   -1,    3, 1000], dtype=int32)
@@ -64,19 +64,19 @@ def _packed(unsigned: Unsigned) -> bytes:
 
 
 def unpack(data: bytes | memoryview, count: int, offset: int = 0) -> tuple[Ints, int]:
-    """[count] integers of a plane that begins at ``offset``, and where it ends.
+    """Decodes the plane at ``offset`` to integers [count]; also returns the offset of its end.
 
     Raises:
-        PlaneError: no plane of so many values is there.
+        PlaneError: the bytes are not a plane with this number of values.
     """
     unsigned, end = _unpacked(data, count, offset, 4)
     return (unsigned >> 1).view(np.int32) ^ -(unsigned & 1).view(np.int32), end
 
 
 def _unpacked(data: bytes | memoryview, count: int, offset: int, wider: int) -> tuple[Unsigned, int]:
-    """Values without sign; ``wider``: bytes that a value may have still."""
+    """Decodes unsigned values; ``wider`` is the number of bytes that a value may still have."""
     if len(data) < offset + _HEAD.size:
-        raise PlaneError(f"the data end at byte {len(data)}, within a plane")
+        raise PlaneError(f"the data ends at byte {len(data)}, within a plane")
     bits, escapes, size = _HEAD.unpack_from(data, offset)
     offset += _HEAD.size
     if bits == 0:
@@ -101,15 +101,15 @@ def _unpacked(data: bytes | memoryview, count: int, offset: int, wider: int) -> 
 
 
 def compress(data: bytes) -> bytes:
-    """Bytes as one frame of zstandard, which has their number."""
+    """Compresses bytes to one zstandard frame that records the uncompressed size."""
     return zstandard.ZstdCompressor(level=LEVEL, write_content_size=True).compress(data)
 
 
 def decompress(data: bytes | memoryview, size: int) -> bytes:
-    """The ``size`` bytes in a frame of zstandard.
+    """Decompresses a zstandard frame of ``size`` bytes.
 
     Raises:
-        PlaneError: it has another number of bytes, or is damaged. Nothing larger is allocated.
+        PlaneError: the frame has another size, or is damaged. At most ``size`` bytes are allocated.
     """
     try:
         if zstandard.frame_content_size(data) != size:
@@ -123,7 +123,7 @@ def decompress(data: bytes | memoryview, size: int) -> bytes:
 
 
 def _bits(unsigned: Unsigned) -> int:
-    """The packing that should come out smallest, by the entropy of its values and what escapes cost."""
+    """Returns the packing with the smallest estimated size, from the entropy of the values and the cost of escapes."""
     count = len(unsigned)
     below = np.bincount(np.minimum(unsigned, 256), minlength=257)
     costs = []
@@ -132,14 +132,14 @@ def _bits(unsigned: Unsigned) -> int:
         escapes = int(below[most:].sum())
         shares = np.append(below[:most], escapes) / count
         entropy = -float(shares[shares > 0] @ np.log2(shares[shares > 0]))
-        costs.append(count * max(entropy, bits / 8) + ESCAPE * escapes)  # a byte takes a bit at least
+        costs.append(count * max(entropy, bits / 8) + ESCAPE * escapes)  # Huffman coding needs at least a bit per byte
     narrow = int(np.argmin(costs))
-    wide = below[256] * 32 > count  # many are above a byte
+    wide = below[256] * 32 > count  # many values exceed a byte
     return WIDE if wide else NARROW[narrow]
 
 
 def _joined(small: NDArray[np.uint8], bits: int) -> NDArray[np.uint8]:
-    """Values of so many bits, several to a byte, the first lowest."""
+    """Packs values of ``bits`` bits several to a byte, the first in the lowest bits."""
     per_byte = 8 // bits
     if per_byte == 1:
         return small

@@ -1,4 +1,4 @@
-"""Reads a compact file, also one that is being written or was cut. Needs numpy and zstandard alone."""
+"""Reads a compact file, even while it is being written or if it was truncated. Needs only numpy and zstandard."""
 
 from __future__ import annotations
 
@@ -38,25 +38,27 @@ __all__ = ["CompactReader", "DamagedFileError", "FileError"]
 
 STATES = (RecordKind.KEY, RecordKind.DELTA)
 AT_ONCE = 8
-"""States whose changes are held at a time."""
+"""Maximum number of states decoded at a time."""
 MAX_PER_BYTE = 4
-"""Gaussians per byte at most; a wrong count must not fill the memory."""
+"""Maximum number of Gaussians per byte, so that a wrong count cannot exhaust the memory."""
 
 
 class CompactReader:
-    """Reads the states of a file, in any order.
+    """Reads the states of a file in any order.
 
     Args:
-        path: of the file.
+        path: path of the file.
 
     Attributes:
-        head: world, bounds, background, cameras.
-        damage: what is damaged so that frames after it are not listed; None where nothing is.
-        about: what the index says of the whole file: the largest ``errors`` by attribute; empty where there is none.
+        head: world transform, bounds, background and cameras.
+        damage: description of damage after which no frames are listed, or None.
+        about: values about the whole file from the index, such as the largest ``errors`` by attribute; empty without an
+            index.
 
     Raises:
-        FileNotFoundError: it is not there.
-        FileError: it is no compact file. DamagedFileError: its head is damaged.
+        FileNotFoundError: the file does not exist.
+        FileError: the file is not a compact file.
+        DamagedFileError: its header is damaged.
 
     >>> CompactReader("README.md")
     Traceback (most recent call last):
@@ -114,7 +116,7 @@ class CompactReader:
         self._file.close()
 
     def refresh(self) -> list[int]:
-        """Picks up what was written since; returns the frames that are new."""
+        """Reads the records appended since the last call; returns the new frames."""
         if self._whole or self.damage is not None:
             return []
         known = len(self._frames)
@@ -133,24 +135,25 @@ class CompactReader:
 
     @property
     def frames(self) -> list[int]:
-        """Indices of the frames, rising."""
+        """Frame indices in increasing order."""
         return list(self._frames)
 
     @property
     def times(self) -> NDArray[np.float64]:
-        """[T] seconds, in the order of ``frames``."""
+        """[T] times in seconds, in the order of ``frames``."""
         return np.array([record.time for record in self._states], np.float64)
 
     @property
     def count(self) -> int:
-        """Gaussians that there have been by the last frame."""
+        """Number of Gaussians in the last frame, including retired ones."""
         return sum(self._born_count(record) for record in self._births)
 
     def state(self, index: int) -> Gaussians:
-        """The state of a frame, in the world of ``head.world``; its arrays must not be written to.
+        """Returns the state of a frame in the world of ``head.world``. Its arrays must not be modified.
 
         Raises:
-            FileError: there is no such frame. DamagedFileError: bytes that it needs are damaged.
+            FileError: the file has no such frame.
+            DamagedFileError: bytes needed for the frame are damaged.
         """
         place = bisect_right(self._frames, index) - 1
         if place < 0 or self._frames[place] != index:
@@ -170,17 +173,20 @@ class CompactReader:
         return state.gaussians()
 
     def copy_records(self, first: int, last: int, file: BinaryIO) -> list[int]:
-        """Copies the records of some frames to another file, which has no index then: their states keep their bits.
+        """Copies the records of a range of frames to another file, without an index. Decoded states stay bit-identical.
 
         Args:
-            first, last: frames, both counted in.
+            first, last: first and last frame, inclusive.
+            file: output file.
 
         Returns:
-            The frames of the copy, up to the first that is damaged. It begins with this file's first frame and the key
-            before ``first`` that the others depend on.
+            The copied frames, up to the first damaged one. They include this file's first frame and the key frame
+            before
+            ``first``, on which the others depend.
 
         Raises:
-            FileError: no frame lies between. DamagedFileError: the first, or a record that it depends on, is damaged.
+            FileError: no frame is in the range.
+            DamagedFileError: the first frame, or a record that it depends on, is damaged.
         """
         wanted = [place for place, index in enumerate(self._frames) if first <= index <= last]
         if not wanted:
@@ -205,7 +211,7 @@ class CompactReader:
         return copied
 
     def parts(self, index: int | None = None) -> NDArray[np.int64] | None:
-        """[N] part of each Gaussian, −1 for none, as it was last seen up to a frame; None where none was."""
+        """Returns the part of each Gaussian [N], −1 for none, as last stored up to a frame; None if there is none."""
         records = [record for record in self._parts if index is None or record.frame <= index]
         if not records:
             return None
@@ -220,11 +226,11 @@ class CompactReader:
 
     @property
     def is_closed(self) -> bool:
-        """True for a file that was closed: it ends with its index."""
+        """Whether the file is complete, that is, ends with its index."""
         return self._whole
 
     def encoder_state(self) -> EncoderState:
-        """All that a writer needs to go on after the last state; there has to be one."""
+        """Returns the state that a writer needs to append to the file, which must contain a state."""
         place = len(self._states) - 1
         self.state(self._frames[place])
         record, columns = self._states[place], self._last
@@ -236,19 +242,19 @@ class CompactReader:
         return EncoderState(self.head, records, record, columns[1], born, clusters, place - key)
 
     def sizes(self) -> list[tuple[int, int, int]]:
-        """Index, bytes of the file since the state before, and checksum of the state, of each frame."""
+        """Returns (frame index, bytes since the previous state, checksum of the state) for each frame."""
         ends = [0, *(one.end for one in self._states)]
         return [(one.frame, one.end - before, one.checksum) for one, before in zip(self._states, ends, strict=False)]
 
     def end_before(self, index: int) -> int:
-        """Bytes of the file up to the records of a frame."""
+        """Returns the number of bytes before the records of a frame."""
         return min(one.offset - HEAD_SIZE for one in self._records if one.frame >= index)
 
     def note(self, index: int) -> dict[str, Any]:
-        """The note on a frame, JSON values; empty where there is none.
+        """Returns the note on a frame as JSON values; empty if there is none.
 
         Raises:
-            DamagedFileError: it is damaged.
+            DamagedFileError: the note is damaged.
         """
         record = self._notes.get(index)
         if record is None:
@@ -262,7 +268,7 @@ class CompactReader:
         self._records.append(record)
         if record.kind is RecordKind.BORN:
             self._births.append(record)
-            if not self._states:  # the first frame is the first born
+            if not self._states:  # the first frame is its own birth record
                 self._states.append(record)
                 self._frames.append(record.frame)
         elif record.kind in STATES:
@@ -278,12 +284,17 @@ class CompactReader:
             self._notes[record.frame] = record
 
     def _count_births(self, place: int) -> int:
-        """Times that Gaussians were born by a state; −1 for that which they are themselves."""
+        """Returns the number of birth records up to a state, or −1 if the state itself is the birth record."""
         state = self._states[place]
         return -1 if state.kind is RecordKind.BORN else sum(birth.frame <= state.frame for birth in self._births)
 
     def _decoded(self, places: list[int], before: Columns | None) -> Columns:
-        """The last of some states of the same Gaussians, of which only the first may be a key; ``before`` them."""
+        """Decodes consecutive states of the same Gaussians and returns the last; only the first of them may be a key.
+
+        Args:
+            places: positions of the states.
+            before: the state before them, if decoded.
+        """
         first = self._states[places[0]]
         born, clusters = self._newborn_until(first.frame)
         if first.kind is RecordKind.BORN:
@@ -299,7 +310,7 @@ class CompactReader:
             raise self._damaged(self._states[places[-1]], error) from None
 
     def _change(self, place: int, reference: Columns, clusters: Clusters) -> FrameDelta:
-        """Changes that the record of a state encodes."""
+        """Decodes the changes in the record of a state."""
         record = self._states[place]
         body = read_body(self._file, record, self.path.name)
         if record.kind is RecordKind.DELTA:
@@ -313,7 +324,7 @@ class CompactReader:
             raise self._damaged(record, error) from None
 
     def _newborn_until(self, index: int) -> tuple[Columns, Clusters]:
-        """All Gaussians that are born up to a frame, as they were coded then, and their clusters."""
+        """Returns all Gaussians born up to a frame, as decoded from their birth records, and their clusters."""
         wanted = [record for record in self._births if record.frame <= index]
         if not wanted:
             raise DamagedFileError(f"{self.path.name}: the Gaussians of frame {index} are missing")
@@ -338,7 +349,7 @@ class CompactReader:
         return int.from_bytes(self._file.read(4), "little")
 
     def _counted(self, body: bytes, record: Record) -> int:
-        """The number of Gaussians that a body begins with; what it holds takes some bits each."""
+        """Returns the Gaussian count at the start of a body, after a plausibility check against its size."""
         count = int.from_bytes(body[:4], "little")
         if len(body) < 4 or count > MAX_PER_BYTE * len(body) + 1024:
             raise self._damaged(record, PlaneError(f"{count} Gaussians in {len(body)} bytes"))

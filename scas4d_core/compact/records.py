@@ -1,7 +1,7 @@
-"""Records of a compact file: a head with checksum, so that a file is listed without its bodies, and a body with one.
+"""Records of a compact file: a header with checksum, so that files are listed without reading bodies, and a body.
 
-A file is read while it is written: what is not whole at its end is not there yet. Earlier damage is reported with
-its place.
+A file can be read while it is written: an incomplete record at its end is ignored. Damage before that is reported with
+its offset.
 """
 
 from __future__ import annotations
@@ -18,54 +18,58 @@ from typing import Any, BinaryIO
 from scas4d_core.compact.planes import PlaneError, compress, decompress
 
 MAGIC = b"s4dR"
-"""First bytes of each record; of the file, too."""
+"""First bytes of each record, and thus of the file."""
 _HEAD = struct.Struct("<4sB3xqdII")
-"""Magic, kind, frame, time in seconds, bytes of the body, CRC-32 of the body; then the CRC-32 of these."""
+"""Magic, kind, frame, time in seconds, size of the body, CRC-32 of the body; the CRC-32 of this header follows."""
 _CHECKSUM = struct.Struct("<I")
 HEAD_SIZE = _HEAD.size + _CHECKSUM.size
 COUNT_BYTES = 4
 LONGEST = 1 << 24
-"""Bytes of a note's text at most: what a damaged file asks for must not fill the memory."""
+"""Maximum size of a note's text in bytes, so that a damaged file cannot exhaust the memory."""
 
 
 class RecordKind(IntEnum):
-    """Kinds of records, by what their body holds."""
+    """Kinds of records, by the content of their body."""
 
     HEAD = 1
     """JSON: version, world, bounds."""
     BORN = 2
-    """Gaussians without a reference: those of the first frame, or born in this one."""
+    """Gaussians coded without a reference: those of the first frame, or newborn ones."""
     KEY = 3
-    """A key state, coded against the newborn Gaussians."""
+    """A key state, coded against the birth records of its Gaussians."""
     DELTA = 4
-    """A state, coded against the one before."""
+    """A state, coded against the previous one."""
     PARTS = 5
-    """A part of each Gaussian."""
+    """The part label of each Gaussian."""
     INDEX = 6
-    """Where all records are; the last."""
+    """Offsets of all records; the last record of a file."""
     NOTE = 7
-    """JSON about the frame whose state follows."""
+    """JSON about the frame whose state follows next."""
 
 
 class FileError(ValueError):
-    """A file that is no compact file, or of another version; the message names the file and the fault."""
+    """Raised if a file is not a compact file, or has another version; the message names the file and the problem."""
 
 
 class FormatError(FileError):
-    """A compact file of another version of the format; it stays as it is."""
+    """Raised if a compact file has another format version; the file is left unchanged."""
 
 
 class DamagedFileError(FileError):
-    """A compact file with damaged bytes; the message names the file and the place."""
+    """Raised if a compact file has damaged bytes; the message names the file and the offset."""
 
 
 @dataclass(frozen=True)
 class Record:
-    """Place of a record in a file.
+    """Location of a record in a file.
 
     Attributes:
-        kind: of its body. frame: index, −1 for none. time: seconds. offset: of its body in the file. size: of the body,
-            bytes. checksum: CRC-32 of the body.
+        kind: kind of the body.
+        frame: frame index, −1 for none.
+        time: time in seconds.
+        offset: offset of the body in the file.
+        size: size of the body in bytes.
+        checksum: CRC-32 of the body.
     """
 
     kind: RecordKind
@@ -77,16 +81,16 @@ class Record:
 
     @property
     def end(self) -> int:
-        """Of its body, in the file."""
+        """Offset of the end of the body in the file."""
         return self.offset + self.size
 
     def at(self, offset: int) -> Record:
-        """The record in a file, where its head begins at an offset."""
+        """Returns the record with its header at the given file offset."""
         return replace(self, offset=offset + HEAD_SIZE)
 
 
 def record_bytes(kind: RecordKind, body: bytes, frame: int = -1, time: float = 0.0) -> bytes:
-    """A record.
+    """Serializes a record.
 
     >>> import io
     >>> file = io.BytesIO(record_bytes(RecordKind.KEY, b"abc", 7, 0.5))
@@ -99,25 +103,27 @@ def record_bytes(kind: RecordKind, body: bytes, frame: int = -1, time: float = 0
 
 
 def checksum_bytes(record: Record) -> bytes:
-    """The checksum of a record's body, as a delta begins with that of the state before."""
+    """Returns the checksum of a record's body; a delta starts with that of the previous state."""
     return _CHECKSUM.pack(record.checksum)
 
 
 def scan(file: BinaryIO, offset: int, name: str) -> Iterator[Record]:
-    """The whole records from an offset on; the rest of one that is not whole is not there yet.
+    """Yields the complete records from an offset on, ignoring an incomplete one at the end.
 
     Args:
-        name: of the file, for errors.
+        file: the open file.
+        offset: offset of the first record to read.
+        name: name of the file, for messages.
 
     Raises:
-        DamagedFileError: bytes that are no record stand where one begins.
+        DamagedFileError: the bytes where a record should begin are not a record.
     """
     file.seek(0, 2)
     size = file.tell()
     while offset + HEAD_SIZE <= size:
         file.seek(offset)
         data = file.read(HEAD_SIZE)
-        if not any(data) and _is_zero(file):  # a power cut came before the bytes, and after the length of the file
+        if not any(data) and _is_zero(file):  # after a power cut, the file's length may be on disk without its data
             return
         record = parse_head(data, offset, name)
         if record.end > size:
@@ -127,7 +133,7 @@ def scan(file: BinaryIO, offset: int, name: str) -> Iterator[Record]:
 
 
 def _is_zero(file: BinaryIO) -> bool:
-    """True where only zeros follow."""
+    """Returns whether only zeros follow."""
     while piece := file.read(1 << 20):
         if any(piece):
             return False
@@ -135,10 +141,11 @@ def _is_zero(file: BinaryIO) -> bool:
 
 
 def checked_records(path: Path) -> Iterator[int]:
-    """Reads all whole records of a file, and yields the bytes of each.
+    """Verifies all complete records of a file, and yields the body size of each.
 
     Raises:
-        FileNotFoundError: it is not there. DamagedFileError: a record is damaged.
+        FileNotFoundError: the file does not exist.
+        DamagedFileError: a record is damaged.
     """
     with path.open("rb") as file:
         for record in scan(file, 0, path.name):
@@ -147,10 +154,11 @@ def checked_records(path: Path) -> Iterator[int]:
 
 
 def parse_head(data: bytes, offset: int, name: str) -> Record:
-    """The record whose head stands at an offset.
+    """Parses the header of the record at an offset.
 
     Raises:
-        DamagedFileError: it is none.
+        DamagedFileError: the bytes are not a record header.
+        FileError: the record has an unknown kind.
     """
     head = data[: _HEAD.size]
     if len(data) < HEAD_SIZE or head[:4] != MAGIC or _CHECKSUM.unpack_from(data, _HEAD.size)[0] != zlib.crc32(head):
@@ -162,10 +170,10 @@ def parse_head(data: bytes, offset: int, name: str) -> Record:
 
 
 def read_body(file: BinaryIO, record: Record, name: str) -> bytes:
-    """The body of a record.
+    """Reads the body of a record.
 
     Raises:
-        DamagedFileError: it fails its checksum, or the file ends within it.
+        DamagedFileError: the checksum does not match, or the file ends within the body.
     """
     file.seek(record.offset)
     body = file.read(record.size)
@@ -178,13 +186,13 @@ def read_body(file: BinaryIO, record: Record, name: str) -> bytes:
 
 
 def note_bytes(note: Mapping[str, Any]) -> bytes:
-    """The body of a note: u32 bytes of the text, then the text as a zstandard frame.
+    """Returns the body of a note: text size as u32, then the text as a zstandard frame.
 
     Args:
-        note: JSON values.
+        note: JSON values of the note.
 
     Raises:
-        ValueError: it is not valid JSON, or longer than 16 MB.
+        ValueError: the note is not valid JSON, or is longer than 16 MB.
 
     >>> read_note(note_bytes({"psnr": 36.5}))
     {'psnr': 36.5}
@@ -196,10 +204,10 @@ def note_bytes(note: Mapping[str, Any]) -> bytes:
 
 
 def read_note(body: bytes) -> dict[str, Any]:
-    """The note in a body.
+    """Parses the body of a note.
 
     Raises:
-        PlaneError: there is none.
+        PlaneError: the body is not a note.
     """
     size = int.from_bytes(body[:COUNT_BYTES], "little")
     if len(body) <= COUNT_BYTES or size > LONGEST:

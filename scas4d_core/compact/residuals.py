@@ -1,4 +1,4 @@
-"""A state that is decoded attribute by attribute, in whole steps of what the bounds allow. Numpy only."""
+"""Decodes a state attribute by attribute, with residuals quantized to the error bounds. Needs only numpy."""
 
 from __future__ import annotations
 
@@ -28,22 +28,22 @@ from scas4d_core.gaussians import rotation_rows
 Array = NDArray[np.float32]
 
 SCALE_STEP = 0.08
-"""Step of the logarithm of a size; so the size that steps are parts of is within four percent of the true one."""
+"""Quantization step of the log of a size. The size that steps are relative to is within 4 % of the true one."""
 MARGIN = 0.95
-"""Of steps that are parts of a size, for that."""
+"""Safety factor on steps that are relative to a size, to cover the size's own quantization error."""
 LARGEST = 1 << 30
-"""Residuals from here on, in steps, are coded exactly, as are numbers that are not finite."""
+"""Residuals of at least this many steps are coded exactly, as are non-finite numbers."""
 SHAPE = ("sizes", "rotations", "factors", "means")
-"""Attributes that are coded first, in this order: each helps the next."""
+"""Attributes that are coded first, in this order; each improves the prediction of the next."""
 
 
 def appearance_attributes(state: Columns) -> tuple[str, ...]:
-    """Attributes that are coded after the shape, each by itself."""
+    """Returns the attributes that are coded after the shape, independently of each other."""
     return ("colours", "foreground") if state.gloss is None else ("colours", "foreground", "gloss")
 
 
 def coded_shape(state: Columns, name: str) -> tuple[int, int]:
-    """Components and rows of an attribute that are coded."""
+    """Returns the numbers of components and rows that are coded of an attribute."""
     if name == "gloss" and state.gloss is not None:
         return 3, state.gloss.shape[1]
     return {"sizes": 1, "factors": 9, "foreground": 1}.get(name, 3), len(state)
@@ -51,19 +51,20 @@ def coded_shape(state: Columns, name: str) -> tuple[int, int]:
 
 @dataclass(frozen=True, eq=False)
 class DecodedState:
-    """A partly decoded state: the prediction of the clusters, and attributes one after the other.
+    """A partially decoded state: the prediction by the clusters, refined by one attribute after another.
 
-    What comes first helps the next: axes turn with the rotation, and steps are parts of the decoded size.
+    Earlier attributes refine the prediction of later ones: axes are rotated by the decoded rotation, and steps scale
+    with the decoded size.
     """
 
     bounds: Bounds
     state: Columns
     sizes: Array
-    """[N] metres, as decoded so far."""
+    """[N] sizes in metres, as decoded so far."""
 
     @classmethod
     def of(cls, bounds: Bounds, state: Columns) -> DecodedState:
-        """The prediction of the clusters, before any residual is decoded."""
+        """Returns the prediction by the clusters, before any residual is applied."""
         return cls(bounds, state, state.sizes())
 
     def _step(self, name: str) -> Array | np.float32:
@@ -76,7 +77,7 @@ class DecodedState:
         return np.float32(2 * (bounds.colour if name == "colours" else bounds.gloss))
 
     def residual(self, name: str, state: Columns) -> NDArray[Any]:
-        """[P, N] what a state has beside, in whole steps."""
+        """Returns the residual [P, N] of a state with respect to the prediction, in quantization steps."""
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             if name == "sizes":
                 steps = np.rint(np.log(state.sizes() / self.sizes) / SCALE_STEP)
@@ -90,7 +91,7 @@ class DecodedState:
         return np.asarray(decorrelate_colours(levels) if name == "colours" else levels)
 
     def apply_residual(self, name: str, residual: Ints) -> DecodedState:
-        """The same with another attribute."""
+        """Returns the state with the residual of one attribute applied."""
         if not residual.any():
             return self
         if name == "sizes":
@@ -113,12 +114,15 @@ class DecodedState:
         factors = np.stack(multiply_rows(rotation_rows(turns), self.state.factors))
         rotations = products(turns, self.state.rotations)
         rotations /= np.sqrt(np.square(rotations).sum(axis=0))
-        # What does not turn keeps its bits, whichever other rows are coded with it.
+        # Rows without rotation stay bit-identical, whichever other rows are coded with them.
         rotations = np.where(vectors.any(axis=0), rotations, self.state.rotations)
         return replace(self, state=self.state.replace(rotations=rotations, factors=factors))
 
 
 def whole_steps(found: NDArray[Any]) -> tuple[Ints, NDArray[np.bool_]]:
-    """[P, N] as whole numbers, 0 for those that are none or too large, and [N] whether a row has any of these."""
+    """Rounds residuals [P, N] to int32 and marks rows [N] with values that are not finite or too large.
+
+    Such values become 0.
+    """
     outside = ~(np.abs(found) < LARGEST)
     return np.where(outside, 0, found).astype(np.int32), outside.any(axis=0)

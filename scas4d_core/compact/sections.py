@@ -1,4 +1,4 @@
-"""Sections of a coded state: residuals of rows, masks, exact arrays; none is unpacked to more than the rows need."""
+"""Sections of a coded state: residuals of rows, masks and exact arrays. Decoding allocates only what the rows need."""
 
 from __future__ import annotations
 
@@ -13,18 +13,20 @@ from scas4d_core.compact.planes import Ints, PlaneError, compress, decompress, p
 Floats = NDArray[np.float32]
 
 SPARSE = 0.6
-"""Where a smaller share of the rows changed, a mask says which."""
+"""Share of changed rows below which a mask marks them."""
 NONE, ALL, SOME = 0, 1, 2
-"""First byte of a section: values of no row, of all rows, or of the rows in a mask."""
+"""First byte of a section: it has values of no row, of all rows, or of the rows in a mask."""
 LARGEST_ARRAY = 1 << 24
-"""Bytes; no exact array is larger."""
+"""Maximum size of an exact array in bytes."""
 
 
 def write_residuals(planes: Ints, rows: NDArray[np.intp] | None = None, total: int = 0) -> bytes:
-    """[P, N] residuals of an attribute: of no row, of all, or of those that a mask names; component by component.
+    """Encodes residuals [P, N] of an attribute, component by component, for no row, all rows or masked rows.
 
     Args:
-        rows: [N] those of ``total`` that the planes are of; None: they are of all.
+        planes: residuals [P, N].
+        rows: [N] rows among ``total`` that the planes belong to; None for all rows.
+        total: number of all rows, if ``rows`` is given.
 
     >>> planes = np.array([[0, 0, 5, 0], [0, 0, 1, 0]])
     >>> read_residuals(write_residuals(planes), 0, 2, 4)[0]
@@ -46,13 +48,13 @@ def write_residuals(planes: Ints, rows: NDArray[np.intp] | None = None, total: i
 
 
 def read_residuals(body: bytes, offset: int, components: int, rows: int) -> tuple[Ints, int]:
-    """[components, rows] residuals of a section, and where it ends; raises PlaneError."""
+    """Decodes the residuals [components, rows] of a section; also returns the offset of its end. Raises PlaneError."""
     chosen, values, offset = read_coded_rows(body, offset, components, rows)
     return scattered(chosen, values, rows), offset
 
 
 def scattered(rows: NDArray[np.intp], planes: Ints, total: int) -> Ints:
-    """[P, total] residuals of all rows, of [P, R] those of some in rising order; 0 for the others.
+    """Expands residuals [P, R] of some rows, in increasing order, to [P, total]; other rows are 0.
 
     >>> scattered(np.array([1, 3]), np.array([[7, 9]]), 4)
     array([[0, 7, 0, 9]], dtype=int32)
@@ -65,7 +67,11 @@ def scattered(rows: NDArray[np.intp], planes: Ints, total: int) -> Ints:
 
 
 def read_coded_rows(body: bytes, offset: int, components: int, rows: int) -> tuple[NDArray[np.intp], Ints, int]:
-    """[R] the rows that a section has residuals of, [components, R] these, and where it ends; raises PlaneError."""
+    """Decodes a section to its coded rows [R], their residuals [components, R], and the offset of its end.
+
+    Raises:
+        PlaneError: the bytes are not such a section.
+    """
     kind, offset = _read_kind(body, offset)
     if kind == NONE:
         return np.zeros(0, np.intp), np.zeros((components, 0), np.int32), offset
@@ -80,12 +86,12 @@ def read_coded_rows(body: bytes, offset: int, components: int, rows: int) -> tup
 
 
 def write_mask(mask: NDArray[np.bool_] | None) -> bytes:
-    """[N] bool, a bit each; None: unchanged."""
+    """Encodes a boolean mask [N] with one bit per entry; None means unchanged."""
     return bytes([NONE]) if mask is None else bytes([SOME]) + _sized(compress(np.packbits(mask).tobytes()))
 
 
 def read_mask(body: bytes, offset: int, rows: int) -> tuple[NDArray[np.bool_] | None, int]:
-    """[rows] bool of a section, None where it is unchanged, and where it ends."""
+    """Decodes a mask [rows], or None if it is unchanged; also returns the offset of the section's end."""
     kind, offset = _read_kind(body, offset)
     return (None, offset) if kind == NONE else _read_bits(body, offset, rows)
 
@@ -96,7 +102,7 @@ def _read_bits(body: bytes, offset: int, rows: int) -> tuple[NDArray[np.bool_], 
 
 
 def write_array(array: NDArray[Any] | None) -> bytes:
-    """A float32 array of any shape, exactly; None: unchanged."""
+    """Encodes a float32 array of any shape exactly; None means unchanged."""
     if array is None:
         return bytes([NONE])
     shape = struct.pack(f"<B{array.ndim}I", array.ndim, *array.shape)
@@ -104,7 +110,7 @@ def write_array(array: NDArray[Any] | None) -> bytes:
 
 
 def read_array(body: bytes, offset: int) -> tuple[Floats | None, int]:
-    """The array of a section, None where it is unchanged, and where it ends."""
+    """Decodes an array, or None if it is unchanged; also returns the offset of the section's end."""
     kind, offset = _read_kind(body, offset)
     if kind == NONE:
         return None, offset
@@ -122,7 +128,7 @@ def read_array(body: bytes, offset: int) -> tuple[Floats | None, int]:
 
 
 def write_exact(rows: NDArray[np.intp], values: NDArray[Any]) -> bytes:
-    """[E] rows with [P, E] float32 values that are coded exactly."""
+    """Encodes rows [E] and their float32 values [P, E] exactly."""
     if not len(rows):
         return bytes([NONE])
     data = rows.astype("<u4").tobytes() + values.astype("<f4").tobytes()
@@ -130,12 +136,12 @@ def write_exact(rows: NDArray[np.intp], values: NDArray[Any]) -> bytes:
 
 
 def read_exact(body: bytes, offset: int, most: int, width: int) -> tuple[NDArray[np.intp], Floats, int]:
-    """The rows, below ``most``, and values of a section, and where it ends."""
+    """Decodes exactly coded rows, each below ``most``, and their values; also returns the end offset."""
     kind, offset = _read_kind(body, offset)
     if kind == NONE:
         return np.zeros(0, np.intp), np.zeros((width, 0), np.float32), offset
     if len(body) < offset + 4:
-        raise PlaneError(f"the data end at byte {len(body)}, within a count")
+        raise PlaneError(f"the data ends at byte {len(body)}, within a count")
     (count,) = struct.unpack_from("<I", body, offset)
     if not 0 < count <= most:
         raise PlaneError(f"{count} of {most} rows cannot be coded exactly")
@@ -148,9 +154,9 @@ def read_exact(body: bytes, offset: int, most: int, width: int) -> tuple[NDArray
 
 
 def _read_kind(body: bytes, offset: int) -> tuple[int, int]:
-    """The first byte of a section, and where the next frame is."""
+    """Returns the first byte of a section, and the offset after it."""
     if offset >= len(body):
-        raise PlaneError(f"the data end at byte {len(body)}, before a section")
+        raise PlaneError(f"the data ends at byte {len(body)}, before a section")
     kind = body[offset]
     if kind not in (NONE, ALL, SOME):
         raise PlaneError(f"a section of kind {kind} cannot be at byte {offset}")
@@ -162,9 +168,9 @@ def _sized(data: bytes) -> bytes:
 
 
 def _read_sized(body: bytes, offset: int, size: int) -> tuple[bytes, int]:
-    """The ``size`` bytes that ``compress`` returned, and where they end."""
+    """Decompresses a block of ``size`` bytes; also returns the offset of the block's end."""
     if len(body) < offset + 4:
-        raise PlaneError(f"the data end at byte {len(body)}, within a size")
+        raise PlaneError(f"the data ends at byte {len(body)}, within a size")
     (length,) = struct.unpack_from("<I", body, offset)
     if len(body) < offset + 4 + length:
         raise PlaneError(f"{length} bytes at byte {offset + 4} end after the data, at {len(body)}")

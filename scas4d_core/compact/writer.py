@@ -1,4 +1,4 @@
-"""Writes a compact file, frame by frame; what is written can be read at once."""
+"""Writes a compact file frame by frame; written frames can be read immediately."""
 
 from __future__ import annotations
 
@@ -33,21 +33,23 @@ from scas4d_core.compact.records import (
 from scas4d_core.gaussians import Gaussians
 
 ERRORS = "errors"
-"""Name of a frame's largest errors in its note."""
+"""Key under which a note stores the largest errors of its frame."""
 KEY_EVERY = 8
-"""Frames from a key to the next: a reader decodes at most so many for one."""
+"""Interval between key frames; to decode one frame, a reader decodes at most this many."""
 
 
 class CompactWriter:
     """Writes the states of a scene to a new file.
 
     Args:
-        path: of the file, which must not exist. head: what holds for all frames. key_every: frames from key to key.
-        clustered: False: no clusters are looked for, which take most of the time of a file of one frame; frames that
-            follow would take more room.
+        path: path of the file, which must not exist.
+        head: header of the file.
+        key_every: interval between key frames.
+        clustered: False skips clustering, which dominates the time for a file of one frame; further frames would become
+            larger.
 
     Attributes:
-        errors: the largest error of each attribute so far, in the units of ``Bounds``.
+        errors: largest error of each attribute so far, in the units of ``Bounds``.
 
     Raises:
         FileExistsError: the file exists.
@@ -71,7 +73,7 @@ class CompactWriter:
     ) -> None:
         if key_every < 1:
             raise FileError(f"key_every is {key_every}; give 1 or more")
-        text = head.text()  # a head that is not valid JSON leaves no file
+        text = head.text()  # serialized first, so an invalid header creates no file
         self.path = Path(path)
         self.head = head
         self.errors: dict[str, float] = {}
@@ -84,19 +86,20 @@ class CompactWriter:
         self._last: Columns | None = None
         self._since_key = 0
         self._opacities: NDArray[np.float32] | None = None
-        """Exact ones of all that are born; None where they are not known yet."""
+        """Exact opacities of all Gaussians so far; None if unknown."""
         self._record = Record(RecordKind.HEAD, -1, 0.0, 0, 0, 0)
         """The record of the last state."""
         self._append(record_bytes(RecordKind.HEAD, text))
 
     @classmethod
     def resume(cls, path: Path | str, key_every: int = KEY_EVERY) -> CompactWriter:
-        """Goes on with a file that was not closed, after its last whole state; what stands behind that is cut off.
+        """Continues an unclosed file after its last complete state; anything after it is truncated.
 
-        ``errors`` are those of the frames with a note, and of those that follow.
+        ``errors`` cover the frames that have a note, and all frames added from now on.
 
         Raises:
-            FileNotFoundError: it is not there. FileError: it has its index already, or no state, or is damaged.
+            FileNotFoundError: the file does not exist.
+            FileError: the file is complete, has no state, or is damaged.
         """
         with CompactReader(path) as reader:
             if reader.is_closed:
@@ -134,12 +137,14 @@ class CompactWriter:
         """Writes the state of a frame; returns its largest error by attribute.
 
         Args:
-            index: above that of every frame before. time: seconds. state: the Gaussians of the frame before, in their
-                order, and after them those that are born in this one, with their ids.
-            note: JSON values about the frame, written before its state, with its ``errors``.
+            index: frame index, greater than all previous ones.
+            time: time in seconds.
+            state: the Gaussians of the previous frame in the same order, followed by the newborn ones with their ids.
+            note: JSON values about the frame; written before its state, together with its ``errors``.
 
         Raises:
-            FileError: the frame cannot follow those before. ValueError: the note is not valid JSON.
+            FileError: the frame cannot follow the previous ones.
+            ValueError: the note is not valid JSON.
         """
         self._check(index, state)
         note_bytes(note or {})
@@ -161,7 +166,7 @@ class CompactWriter:
             coded = encode(born if key else before, columns, self._clusters, self.head.bounds)
             reference = (
                 b"" if key else checksum_bytes(self._record)
-            )  # a reader must not decode it against another state
+            )  # lets a reader detect a mismatched reference state
             records.append((RecordKind.KEY if key else RecordKind.DELTA, reference + coded.body))
             decoded, errors = coded.decoded, coded.errors
         if note is not None:
@@ -173,13 +178,14 @@ class CompactWriter:
         return errors
 
     def add_parts(self, index: int, labels: NDArray[np.integer]) -> None:
-        """Writes the part of each Gaussian, as it is seen from the last frame on.
+        """Writes the part of each Gaussian, valid from the last frame on.
 
         Args:
-            index: of the last frame. labels: [N], −1 for none.
+            index: index of the last frame.
+            labels: [N] part labels, −1 for none.
 
         Raises:
-            FileError: another frame, or labels of another number of Gaussians.
+            FileError: the index is not that of the last frame, or the number of labels is wrong.
         """
         values = np.asarray(labels, np.int64)
         known = 0 if self._born is None else len(self._born)
@@ -191,10 +197,10 @@ class CompactWriter:
         self._append(record_bytes(RecordKind.PARTS, len(values).to_bytes(4, "little") + pack(values + 1), index))
 
     def _check(self, index: int, state: Gaussians) -> None:
-        """Refuses a state that cannot follow those before; nothing is written then."""
+        """Rejects a state that cannot follow the previous ones, before anything is written."""
         last, name = self._record.frame, self.path.name
         if index <= last:
-            raise FileError(f"{name}: frame {index} cannot follow frame {last}; add frames in rising order")
+            raise FileError(f"{name}: frame {index} cannot follow frame {last}; add frames in ascending order")
         if not len(state):
             raise FileError(f"{name}: frame {index} has no Gaussian; begin with a frame that has some")
         if (born := self._born) is not None:
@@ -215,7 +221,7 @@ class CompactWriter:
             )
 
     def close(self) -> None:
-        """Writes the index. A file without it is read all the same, after a look at each record."""
+        """Writes the index and closes the file. A file without an index remains readable by scanning its records."""
         if self._file.closed:
             return
         body = index_body(self._records, json.dumps({"errors": self.errors}).encode())
@@ -227,25 +233,25 @@ class CompactWriter:
 
     @property
     def frames(self) -> int:
-        """Number of frames that are written."""
+        """Number of frames written."""
         return sum(record.kind in STATES for record in self._records) + (self._last is not None)
 
     @property
     def last_frame(self) -> int:
-        """Index of the last frame; −1 without one."""
+        """Index of the last frame, or −1 if there is none."""
         return self._record.frame
 
     def sync(self) -> None:
-        """Has the disk confirm all that was written."""
+        """Flushes all written data to disk (fsync)."""
         os.fsync(self._file.fileno())
 
     def abandon(self) -> None:
-        """Closes the file without an index: it can be gone on with, after a disk that took nothing, too."""
+        """Closes the file without an index, even after a disk error; the file can be resumed later."""
         with suppress(OSError):
             self._file.close()
 
     def _add_newborn(self, state: Columns) -> bytes:
-        """Takes in the Gaussians that are not known yet; returns the body of their record."""
+        """Registers the newborn Gaussians of a state; returns the body of their birth record."""
         if self._last is None:
             born = state
             clusters = Clusters.of(state.gaussians()) if self._clustered else Clusters(np.zeros(len(state), np.int64))

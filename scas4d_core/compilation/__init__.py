@@ -1,1 +1,1 @@
-"""Compiles the kernels before they are needed, in several processes, and knows which are cached."""
+"""Compiles kernels ahead of their first use in several processes, and tracks which ones are cached."""

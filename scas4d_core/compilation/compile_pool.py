@@ -1,8 +1,8 @@
-"""Processes that compile kernels side by side, and those who wait for them.
+"""A pool of processes that compile kernels in parallel, and functions that wait for them.
 
-Each process of the pool takes the first kernel that nobody compiles, until none is left. At most one process a core
-compiles for one cache at a time, for service, tests and commands alike. Which process compiled a kernel changes
-no bit of its results.
+Each process of the pool compiles the first kernel that no other process has claimed, until none is left. At most one
+process per core compiles for one cache at a time; the limit is shared by service, tests and commands. Results are
+bit-identical whichever process compiled a kernel.
 """
 
 from __future__ import annotations
@@ -24,32 +24,41 @@ from scas4d_core.compilation.manifest import KernelGroup, kernels_of
 log = logging.getLogger("scas4d.kernels")
 
 MAX_PROCESSES = 4
-"""Processes of the pool at most: each takes some 350 MB, and the longest kernel takes a sixth of the time of all."""
+"""Maximum number of processes. Each needs about 350 MB, and the slowest kernel takes a sixth of the total time."""
 NICE = 10
-"""Added to the niceness of a process that compiles what nobody waits for yet: frames, views and requests go ahead."""
+"""Added to the niceness of processes that compile ahead, so that frames, views and requests have priority."""
 GC_THRESHOLDS = (200_000, 20, 1000)
-"""Thresholds of Python's garbage collection: a compiler makes millions of objects that live. With the defaults it
-costs a tenth of the time; without any, a process takes half as much memory again."""
+"""Thresholds of Python's garbage collector, tuned for a compiler with millions of long-lived objects.
+
+The default thresholds cost a tenth of the time; disabling collection raises memory use by half.
+"""
 POLL_S = 0.05
 PARENT_EVERY_S = 0.5
 TRIES = 2
-"""Pools that are started for the same kernels: the first may have been killed."""
+"""Number of pools started for the same kernels; the first one may have been killed."""
 
 OnProgress = Callable[[int, int], None]
-"""Called with the number of kernels that are compiled, and that of all which are waited for."""
+"""Called with the number of compiled kernels and the total number to wait for."""
 
 _pool: list[subprocess.Popen[bytes]] = []
-"""The processes that this one has started."""
+"""Processes started by this process."""
 
 
 def processes() -> int:
-    """Returns how many processes compile at a time: one a core."""
+    """Returns how many processes may compile at a time: one per core, at most `MAX_PROCESSES`."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return min(cores, MAX_PROCESSES)
 
 
 def compile_kernels(wanted: Iterable[str], then: Iterable[str]) -> int:
-    """Compiles what nobody else does, in a process of the pool; returns how many kernels could not be compiled."""
+    """Compiles kernels that no other process compiles; runs in a process of the pool.
+
+    Returns the number of kernels that could not be compiled.
+
+    Args:
+        wanted: names of the groups to compile first.
+        then: names of the groups to compile afterwards at low priority.
+    """
     _end_with_parent()
     gc.freeze()
     gc.set_threshold(*GC_THRESHOLDS)
@@ -85,14 +94,15 @@ def _compile_all(marks: CompiledMarkers, groups: Iterable[KernelGroup]) -> int:
 def wait_for_kernels(
     wanted: Iterable[KernelGroup], then: Iterable[KernelGroup] = (), on_progress: OnProgress | None = None
 ) -> bool:
-    """Waits until the cache has the kernels of the groups ``wanted``, which other processes compile if need be.
+    """Waits until the kernels of the groups ``wanted`` are cached; starts processes to compile them if needed.
 
     Args:
-        then: groups that the same processes go on with, and that nobody waits for here.
-        on_progress: called at the beginning where there is something to wait for, and with every kernel.
+        wanted: groups to wait for.
+        then: groups that the same processes compile afterwards, without waiting for them here.
+        on_progress: called at the start if there are kernels to wait for, and whenever more kernels are compiled.
 
     Returns:
-        False where they could not be compiled beforehand: they are where they are first called.
+        False if the kernels could not be compiled ahead of time; they are then compiled on their first call.
     """
     wanted, then = tuple(wanted), tuple(then)
     kernels = kernels_of(wanted)
@@ -114,7 +124,7 @@ def wait_for_kernels(
         _pool[:] = [process for process in _pool if process.poll() is None]
         if not _pool and not marks.is_compiling(processes()):
             if tries == TRIES:
-                log.warning("kernels could not be compiled beforehand; the first frames wait for them")
+                log.warning("kernels could not be compiled in advance; the first frames wait for them")
                 return False
             tries += 1
             if not _start(wanted, then):
@@ -125,7 +135,7 @@ def wait_for_kernels(
 
 
 def _start(wanted: Iterable[KernelGroup], then: Iterable[KernelGroup]) -> bool:
-    # The same sources: they may be where only this process looks.
+    # Pass sys.path on, since the sources may be reachable only through this process's path.
     program = (
         "import sys; groups = [given.split(';') if given else [] for given in sys.argv[1:3]]; "
         "sys.path[:] = sys.argv[3:]; "
@@ -135,15 +145,15 @@ def _start(wanted: Iterable[KernelGroup], then: Iterable[KernelGroup]) -> bool:
     for _ in range(processes()):
         try:
             process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
-        except OSError:  # no interpreter to be found from inside another program
+        except OSError:  # no interpreter found, e.g. in an embedded Python
             return False
-        threading.Thread(target=process.wait, daemon=True).start()  # else it would stay a zombie
+        threading.Thread(target=process.wait, daemon=True).start()  # otherwise it would remain a zombie
         _pool.append(process)
     return True
 
 
 def _end_with_parent() -> None:
-    """Ends this process soon after the one that started it."""
+    """Exits this process soon after its parent process has ended."""
     parent = os.getppid()
 
     def watch() -> None:

@@ -1,8 +1,7 @@
-"""The marks of compiled kernels: empty files beside the cache, and the locks of those who compile.
+"""Markers of compiled kernels: empty files next to the cache, and lock files of the compiling processes.
 
-A mark says that a kernel is in the cache for this version, this checkout and this processor. Numba keeps what it
-compiled by the path of the source, so a checkout elsewhere has marks of its own. Locks end with the process that holds
-them.
+A marker means that a kernel is cached for this version, checkout and processor. Numba keys its cache by source path, so
+each checkout has its own markers. Locks are released when their process ends.
 """
 
 from __future__ import annotations
@@ -17,15 +16,15 @@ from scas4d_core.compilation.manifest import Kernel
 from scas4d_core.kernels.cache import locked
 
 SLOT_WAIT_S = 1.0
-"""For so long a process tries to get a place: somebody may just look whether it is taken."""
+"""Seconds for which a process retries to get a slot, because `is_compiling` briefly locks slots to check them."""
 
 
 def open_markers() -> CompiledMarkers | None:
-    """Returns the marks for this process; None where there is no cache."""
+    """Returns the markers for this process, or None if there is no cache."""
     import numba
     from llvmlite import binding
 
-    from scas4d_core.kernels import jit  # names the cache's folder
+    from scas4d_core.kernels import jit  # sets the cache folder
 
     folder = numba.config.CACHE_DIR  # type: ignore[attr-defined]
     where = hashlib.sha256(str(Path(jit.__file__).parent).encode()).hexdigest()[:8]
@@ -33,18 +32,18 @@ def open_markers() -> CompiledMarkers | None:
     target = f"{named}{numba.config.CPU_FEATURES or ''}" if named else binding.get_host_cpu_name()  # type: ignore[attr-defined]
     if not folder:
         return None
-    digest = hashlib.sha256(target.encode()).hexdigest()[:8]  # features of a processor make a name too long for a file
+    digest = hashlib.sha256(target.encode()).hexdigest()[:8]  # the feature list is too long for a file name
     return CompiledMarkers(Path(folder) / f"compiled-{digest}-{where}")
 
 
 class CompiledMarkers:
-    """The marks in a folder, which is made.
+    """The markers in a folder, which is created if needed.
 
     Args:
-        folder: of this version, checkout and processor.
+        folder: folder for this version, checkout and processor.
 
     Raises:
-        OSError: the folder cannot be made.
+        OSError: the folder cannot be created.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -52,24 +51,24 @@ class CompiledMarkers:
         folder.mkdir(parents=True, exist_ok=True)
 
     def missing(self, kernels: Iterable[Kernel]) -> list[Kernel]:
-        """Returns those of the kernels that have no mark."""
+        """Returns the kernels that have no marker."""
         there = {path.name for path in self.folder.iterdir()}
         return [kernel for kernel in kernels if kernel.key not in there]
 
     def add(self, kernel: Kernel) -> None:
         """Marks a kernel as compiled."""
-        with suppress(OSError):  # for want of room: it is compiled all the same
+        with suppress(OSError):  # e.g. disk full; the kernel is compiled anyway
             (self.folder / kernel.key).touch()
 
     @contextmanager
     def claim(self, kernel: Kernel) -> Iterator[bool]:
-        """Yields True to one process at a time, which may compile the kernel, and False to the others."""
+        """Yields True to one process at a time, which may compile the kernel, and False to all others."""
         with locked(self.folder / f"{kernel.key}.lock", wait=False) as mine:
             yield mine
 
     @contextmanager
     def slot(self, slots: int) -> Iterator[bool]:
-        """Yields True to as many processes at a time as there are slots, and False to the others."""
+        """Yields True to at most ``slots`` processes at a time, and False to all others."""
         until = time.monotonic() + SLOT_WAIT_S
         while True:
             for number in range(slots):
@@ -83,7 +82,7 @@ class CompiledMarkers:
             time.sleep(0.05)
 
     def is_compiling(self, slots: int) -> bool:
-        """Returns whether any process has a place."""
+        """Returns whether any process holds a slot."""
         for number in range(slots):
             with locked(self._slot_file(number), wait=False) as mine:
                 if not mine:

@@ -1,4 +1,4 @@
-"""Compiles one kernel of the manifest for its types, into the cache."""
+"""Compiles one kernel of the manifest for its argument types, into the cache."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scas4d_core.compilation.manifest import Kernel
 
 
 def types_of(arguments: str) -> tuple[Any, ...]:
-    """Returns Numba's types of arguments that are written as in ``Kernel``.
+    """Parses argument types in the notation of ``Kernel`` to Numba types.
 
     >>> types_of("f i*2 none s2")
     (float32, UniTuple(int64, 2), none, Array(int32, 2, 'C', False, aligned=True))
@@ -34,10 +34,10 @@ def _type_of(word: str) -> Any:
 
 
 def compile_kernel(kernel: Kernel) -> None:
-    """Compiles a kernel, or loads it where the cache has it; afterwards the cache has it.
+    """Compiles a kernel into the cache, or loads it if it is cached already.
 
     Raises:
-        Exception: the function is not there, or Numba cannot compile it for these types.
+        Exception: the function does not exist, or Numba cannot compile it for these types.
     """
     function = getattr(import_module(f"scas4d_core.{kernel.module}"), kernel.name)
     function.compile(types_of(kernel.arguments))

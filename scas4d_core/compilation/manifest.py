@@ -1,8 +1,8 @@
-"""The kernels that scenes call, with the types of their arguments, by what needs them.
+"""Kernels that scenes call, with their argument types, grouped by the stage that needs them.
 
-Numba compiles a kernel when it is first called, for the types it is called with. This list says them beforehand, so
-that processes can share the work; a test compares it with what a scene calls. A kernel that is missing here still
-works: the process that calls it compiles it, and waits.
+Numba compiles a kernel on its first call, for the types of that call. This list states the types in advance so that
+several processes can share the work; a test compares it with the calls of a scene. A kernel missing from the list still
+works, but the process that first calls it has to compile it.
 """
 
 from __future__ import annotations
@@ -14,28 +14,27 @@ from enum import StrEnum
 
 
 class KernelGroup(StrEnum):
-    """Groups of kernels, by what needs them."""
+    """Groups of kernels, by the stage that needs them."""
 
     FIRST_FRAME = "first frame"
-    """Frame 0, and every view."""
+    """Needed for frame 0 and for every view."""
     UPDATE = "update"
-    """Updates, with whatever effects are on."""
+    """Needed for updates with any combination of effects."""
     ENTANGLED = "update, entangled covariance"
     SEPARATE = "update, separate covariance"
     STEREO = "stereo"
-    """First points from pictures alone."""
+    """Needed to compute initial points from images alone."""
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """A kernel for the types of its arguments.
+    """A kernel for given argument types.
 
     Attributes:
-        group: what needs it.
-        module, name: of the function, within ``scas4d_core``.
-        arguments: a word each. f, i, b: float32, int64, truth value; none: None. d is float64, u and s are uint32 and
-            int32, w is uint64, y is uint8, and a number after the letter makes an array of as many axes. i*2: a tuple
-            of two.
+        group: group that the kernel belongs to.
+        module, name: module within ``scas4d_core``, and name of the function.
+        arguments: one word per argument. f, d: float32, float64; i, s: int64, int32; u, w, y: uint32, uint64, uint8; b:
+            bool; none: None. A number after the letter is the number of array axes; i*2 is a tuple of two int64.
     """
 
     group: KernelGroup
@@ -45,7 +44,7 @@ class Kernel:
 
     @property
     def key(self) -> str:
-        """A name for files, of this kernel and these types alone."""
+        """File name that is unique to this kernel and its argument types."""
         return f"{self.module}.{self.name}-{hashlib.sha256(self.arguments.encode()).hexdigest()[:8]}"
 
 
@@ -54,7 +53,7 @@ def _of(group: KernelGroup, *rows: str) -> tuple[Kernel, ...]:
     return tuple(Kernel(group, module, name, arguments) for module, name, arguments in split)
 
 
-# In each group those that take longest to compile come first: the work is then shared best.
+# In each group, the kernels that compile slowest come first, which balances the load best.
 KERNELS = (
     *_of(
         KernelGroup.FIRST_FRAME,
@@ -107,10 +106,10 @@ KERNELS = (
 
 
 def kernels_of(groups: Iterable[KernelGroup]) -> list[Kernel]:
-    """Returns the kernels of some groups, group after group as they are asked for."""
+    """Returns the kernels of the given groups, in the order of the groups."""
     return [kernel for group in groups for kernel in KERNELS if kernel.group == group]
 
 
 def groups_of_update(covariance: str) -> tuple[KernelGroup, ...]:
-    """Returns the groups that updates need; ``covariance`` as in the settings of updates."""
+    """Returns the groups that updates need; ``covariance`` is the update setting of that name."""
     return (KernelGroup.SEPARATE if covariance == "separate" else KernelGroup.ENTANGLED), KernelGroup.UPDATE

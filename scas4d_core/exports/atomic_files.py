@@ -1,4 +1,4 @@
-"""Writes files whole or not at all, and imports packages that only an export needs. Standard library only."""
+"""Writes files atomically, and imports packages that only some exports need. Needs only the standard library."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from scas4d_core.errors import InputError, message_of
 
 @contextmanager
 def atomic_path(path: Path | str) -> Iterator[Path]:
-    """Gives a temporary name beside ``path``; in the end that file is renamed to ``path``, or removed on an error.
+    """Yields a temporary path next to ``path``; on success that file is renamed to ``path``, on an error it is deleted.
 
-    The temporary name keeps the suffix, by which some libraries choose the format.
+    The temporary name keeps the suffix, because some libraries choose the format from it.
 
     Raises:
         InputError: the folder or the file cannot be written, or the disk is full.
@@ -35,15 +35,15 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
             yield beside
             beside.replace(target)
     finally:
-        with suppress(OSError):  # the error that matters is on its way
+        with suppress(OSError):  # do not mask the original error
             beside.unlink(missing_ok=True)
 
 
 def check_writable(path: Path | str) -> None:
-    """Makes and removes a file beside ``path``, so that a long export fails at its start.
+    """Creates and removes a file next to ``path``, so that a long export fails early.
 
     Raises:
-        InputError: the folder cannot be written.
+        InputError: the folder is not writable.
 
     >>> check_writable("no_such_folder/a.glb")
     Traceback (most recent call last):
@@ -62,7 +62,7 @@ def _beside(target: Path) -> Path:
 
 @contextmanager
 def translate_write_errors(path: Path | str) -> Iterator[None]:
-    """Turns an ``OSError`` into an ``InputError`` that names the output."""
+    """Converts an ``OSError`` to an ``InputError`` that names the output."""
     try:
         yield
     except OSError as error:
@@ -76,10 +76,11 @@ def import_optional(name: str, export: str) -> Any:
     """Imports a package of the extra ``exports``.
 
     Args:
-        name: of the module. export: the format, for the message.
+        name: name of the module.
+        export: the format, for the message.
 
     Raises:
-        InputError: it is not installed; the remedy is the command that installs it.
+        InputError: the package is not installed; the message includes the command that installs it.
 
     >>> import_optional("no_such_package", "usd")
     Traceback (most recent call last):

@@ -1,7 +1,7 @@
-"""The Gaussians of one frame as the formats need them: split, in the user's world, with harmonics and ids.
+"""The Gaussians of one frame as needed by exports: covariances decomposed, in the user's world, with harmonics and ids.
 
-The half turn about x leads from OpenCV axes (x right, y down, z forward) to those of glTF, SPZ and USD (x right, y up,
-z towards the viewer). It is a rotation, so nothing is mirrored, and it is its own inverse.
+OpenCV axes are x right, y down, z forward; those of glTF, SPZ and USD are x right, y up, z towards the viewer. A half
+turn about x converts one to the other. It is a rotation, so nothing is mirrored, and it is its own inverse.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ Float = NDArray[np.float64]
 HALF_TURN = np.diag([1.0, -1.0, -1.0])
 """[3, 3] rotation by 180° about x."""
 _SOME_DIRECTION = np.array([[0.48, 0.6, 0.64]])
-"""A direction at which no harmonic up to degree 3 is 0."""
+"""A direction in which no harmonic up to degree 3 is zero."""
 HARMONIC_SIGNS: Float = np.sign(basis_of(_SOME_DIRECTION @ HALF_TURN) / basis_of(_SOME_DIRECTION))[0]
-"""[16] factors of the harmonics' coefficients under the half turn: each harmonic is even or odd in (y, z)."""
+"""[16] signs of the harmonics' coefficients under the half turn; each harmonic is even or odd in (y, z)."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cloud:
-    """The Gaussians of one frame that are to be written.
+    """The exported Gaussians of one frame.
 
     Attributes:
-        splats: means, scales, rotations, opacities and colours; those of degree 0 where colours depend on direction.
-        harmonics: [N, K, 3] coefficients of RGB − 0.5, K = 1, or 16 where colours depend on direction.
+        splats: means, scales, rotations, opacities and colours; for view-dependent colours, the component of degree 0.
+        harmonics: [N, K, 3] coefficients of RGB − 0.5; K = 1, or 16 for view-dependent colours.
         ids: [N] int64.
     """
 
@@ -44,7 +44,7 @@ class Cloud:
         return len(self.ids)
 
     def half_turned(self) -> Cloud:
-        """The same Gaussians in axes that are turned by 180° about x: y up, z towards the viewer.
+        """Rotates the axes by 180° about x, so that y points up and z towards the viewer.
 
         >>> seen = cloud_of(Gaussians.of_points([[1, 2, 3]], radius=0.1), WorldFrame(np.zeros(3)))
         >>> seen.half_turned().splats.means
@@ -62,7 +62,7 @@ class Cloud:
         )
 
     def scaled(self, length: float) -> Cloud:
-        """The same Gaussians with all lengths multiplied by ``length``, as by metres in one of the user's units.
+        """Multiplies all lengths by ``length``, for example by the metres per unit of the user's world.
 
         >>> seen = cloud_of(Gaussians.of_points([[1, 2, 3]], radius=0.5), WorldFrame(np.zeros(3)))
         >>> seen.scaled(100).splats.scales
@@ -73,20 +73,21 @@ class Cloud:
         )
 
     def rows(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> Cloud:
-        """The Gaussians of some rows ([N] bool, or indices)."""
+        """Returns the Gaussians of the given rows ([N] bool, or indices)."""
         kept = {name: getattr(self.splats, name)[chosen] for name in Splats.__dataclass_fields__}
         return Cloud(Splats(**kept), self.harmonics[chosen], self.ids[chosen])
 
 
 def cloud_of(gaussians: Gaussians, world: WorldFrame, *, retired: bool = False) -> Cloud:
-    """Converts a state to what is written of it, in the user's world and units, OpenCV axes.
+    """Converts a state to the exported Gaussians, in the user's world and units with OpenCV axes.
 
     Args:
-        gaussians: N Gaussians in the inside world. world: user's world to inside.
-        retired: whether those that are retired are kept, with opacity 0; else they are left out.
+        gaussians: N Gaussians in the internal world.
+        world: transform from the user's world to the internal world.
+        retired: True keeps retired Gaussians with opacity 0; False omits them.
 
     Raises:
-        InputError: rows that are not finite or have no volume, named by row and id.
+        InputError: rows are not finite or have no volume; the message names row and id.
 
     >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1).retire([0])
     >>> found = cloud_of(state, WorldFrame(np.zeros(3), metres_per_unit=0.5))
@@ -103,7 +104,7 @@ def cloud_of(gaussians: Gaussians, world: WorldFrame, *, retired: bool = False) 
 
 
 def linear_light(colours: NDArray[np.floating]) -> Float:
-    """Decodes colours from the sRGB curve (IEC 61966-2-1) to linear light; they are first clipped to 0…1.
+    """Converts colours from the sRGB curve (IEC 61966-2-1) to linear light, after clipping them to 0…1.
 
     >>> linear_light(np.array([0.0, 0.5, 1.0])).round(4)
     array([0.   , 0.214, 1.   ])

@@ -1,4 +1,4 @@
-"""Writes a sequence as a compact 4D file (``scas4d_core.compact``): it loses neither ids nor what moves."""
+"""Writes a sequence as a compact 4D file (``scas4d_core.compact``), which preserves ids and which Gaussians move."""
 
 from __future__ import annotations
 
@@ -19,12 +19,15 @@ Colour = tuple[float, float, float]
 
 
 class CompactSequence:
-    """Writes a sequence, frame by frame; the file appears whole, with ``finish``, or not at all.
+    """Writes a sequence frame by frame. The file appears atomically on ``finish``.
 
     Args:
-        path: of the file; replaced where it is there. world: user's world to inside. rig: in the user's world, or None.
-        labels: [N] part of each Gaussian by row, negative for none; None: no parts.
-        frames_per_second: nominal, or None. background: RGB in 0…1 behind everything.
+        path: path of the file; an existing one is replaced.
+        world: transform from the user's world to the internal world.
+        rig: rig in the user's world, or None.
+        labels: [N] part of each Gaussian by row, negative for none; None for no parts.
+        frames_per_second: nominal frame rate, or None.
+        background: background colour, RGB in 0…1.
 
     Raises:
         InputError: the file cannot be written.
@@ -65,10 +68,10 @@ class CompactSequence:
                 raise
 
     def add(self, index: int, time: float, gaussians: Gaussians) -> None:
-        """Adds a frame: its index, its time in seconds, and its state in the inside world.
+        """Adds a frame: its index, its time in seconds, and its state in the internal world.
 
         Raises:
-            InputError: it cannot follow those before, or has values that are not finite.
+            InputError: the frame cannot follow the previous ones, or has non-finite values.
         """
         with translate_write_errors(self.path):
             try:
@@ -79,12 +82,12 @@ class CompactSequence:
         self._latest, self._count = index, len(gaussians)
 
     def finish(self) -> None:
-        """Completes the file and gives it its name."""
+        """Completes the file and renames it to its final name."""
         if self._labels is not None and self._count:
             with translate_write_errors(self.path):
                 self._writer.add_parts(self._latest, part_labels(self._labels, self._count))
         self._stack.close()
 
     def discard(self) -> None:
-        """Removes what was written."""
+        """Deletes the incomplete file."""
         self._stack.__exit__(Exception, Exception("given up"), None)

@@ -1,4 +1,4 @@
-"""The formats of exports: their names, suffixes, conventions, and what each loses. docs/exports.md shows this table."""
+"""Export formats: names, suffixes, conventions and losses. docs/exports.md shows this table."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scas4d_core.exports.usd import SUFFIXES as USD_SUFFIXES
 USER_AXES = "the user's: x right, y down, z forward"
 Y_UP = "x right, y up, z towards the viewer"
 WITH_PARTS = ("usd", "s4d")
-"""Formats that have parts where there are any, and do without."""
+"""Formats that include parts if there are any."""
 
 
 @dataclass(frozen=True)
@@ -21,12 +21,17 @@ class Format:
     """The conventions of one format.
 
     Attributes:
-        name: as it is asked for. suffixes: of its files; the first is that of numbered files.
-        numbered: a sequence is a numbered file a frame; else it is one file.
-        needs_parts: it cannot be written without parts.
-        axes, unit: of positions. colour: its space and form. scale, opacity: linear, or their logarithm or logit.
-        shape: how a covariance is encoded. ids: where the ids are, or "lost". lost: what a reader cannot get back.
-        package: to be installed beside those that a reconstruction needs, or "".
+        name: name used to select the format.
+        suffixes: suffixes of its files; the first is used for numbered files.
+        numbered: whether a sequence is one numbered file per frame, instead of a single file.
+        needs_parts: whether the format requires parts.
+        axes, unit: axes and unit of positions.
+        colour: colour space and representation.
+        scale, opacity: linear, or logarithm or logit.
+        shape: encoding of the covariance.
+        ids: location of the ids, or "lost".
+        lost: information that a reader cannot recover.
+        package: package required in addition to those for a reconstruction, or "".
     """
 
     name: str
@@ -173,14 +178,14 @@ FORMATS: Mapping[str, Format] = MappingProxyType({each.name: each for each in _F
 """All formats by name."""
 
 COLUMNS = ("name", "suffixes", "axes", "unit", "colour", "scale", "opacity", "shape", "ids", "lost")
-"""Columns of the table."""
+"""Columns of the documentation's table."""
 
 
 def format_of(name: str) -> Format:
-    """The format of a name.
+    """Returns the format with the given name.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no such format.
 
     >>> format_of("glb").scale
     'linear, float32'
@@ -194,10 +199,10 @@ def format_of(name: str) -> Format:
 
 
 def check_suffix(path: Path, format: Format) -> None:
-    """Refuses a path for one file whose suffix is another format's.
+    """Checks that the path of a single output file has a suffix of the format.
 
     Raises:
-        InputError: it has no suffix of this format.
+        InputError: the suffix does not belong to the format.
 
     >>> check_suffix(Path("a.txt"), FORMATS["tracks"])
     Traceback (most recent call last):
@@ -211,13 +216,13 @@ def check_suffix(path: Path, format: Format) -> None:
 
 
 def table() -> str:
-    """Returns the table as Markdown; formats that differ in nothing but their name share a line.
+    """Returns the table as Markdown; formats that differ only in their name share a line.
 
     >>> print(table().splitlines()[0])
     | name | suffixes | sequence | axes | unit | colour | scale | opacity | shape | ids | lost |
     """
     heads = [*COLUMNS[:2], "sequence", *COLUMNS[2:]]
-    names: dict[tuple[str, ...], list[str]] = {}  # formats that share everything but the name share a line
+    names: dict[tuple[str, ...], list[str]] = {}  # names, keyed by the other cells
     for each in FORMATS.values():
         cells = {column: str(getattr(each, column)) for column in COLUMNS}
         cells["suffixes"] = " ".join(f"`{suffix}`" for suffix in each.suffixes)

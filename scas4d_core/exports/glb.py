@@ -1,6 +1,6 @@
 """The container ``.glb`` (glTF 2.0, section 4): a JSON chunk and a binary chunk, with accessors into the latter.
 
-Written by hand: a document of splats needs a tenth of glTF, and no package.
+Implemented without a package, because splats need only a small subset of glTF.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from scas4d_core.errors import InputError
 from scas4d_core.exports.atomic_files import atomic_path
 
 COMPONENTS = {np.dtype("<f4"): 5126, np.dtype("<u2"): 5123, np.dtype("u1"): 5121}
-"""Component types of glTF by dtype."""
+"""glTF component types by dtype."""
 SHAPES = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4"}
-"""Types of glTF by the shape of an element."""
+"""glTF element types by the shape of an element."""
 ARRAY_BUFFER = 34962
-"""Target of the views of vertex attributes."""
+"""Target of buffer views with vertex attributes."""
 LONGEST = 2**32 - 1
-"""Bytes of a file: its header counts them in 32 bits."""
+"""Maximum file size in bytes; the header stores it in 32 bits."""
 GENERATOR = "SCas4D"
 
 
@@ -32,8 +32,8 @@ class Binary:
     """Collects the arrays of one file.
 
     Attributes:
-        accessors, views: of the document.
-        length: bytes of the binary chunk so far.
+        accessors, views: accessors and buffer views of the document.
+        length: current size of the binary chunk in bytes.
 
     >>> binary = Binary()
     >>> binary.add(np.float32([[0, 0, 2], [1, 0, 2]]), vertices=True, bounds=True)
@@ -51,13 +51,15 @@ class Binary:
     def add(
         self, array: NDArray[Any], *, vertices: bool = False, bounds: bool = False, normalized: bool = False
     ) -> int:
-        """Adds an array as an accessor with a view of its own; returns its index.
+        """Adds an array as an accessor with its own buffer view; returns the accessor's index.
 
         Args:
-            array: [N, …] of a dtype in ``COMPONENTS`` and N ≥ 1; its rows must fill a multiple of 4 bytes where it
-                holds vertices.
-            vertices: whether it is an attribute of a primitive. bounds: whether min and max are written, as glTF asks
-                for positions and times. normalized: whether integers stand for 0…1.
+            array: [N, …] array with N ≥ 1 and a dtype in ``COMPONENTS``. Rows of vertex attributes must have a multiple
+                of 4
+                bytes.
+            vertices: whether the array is a vertex attribute.
+            bounds: whether to write min and max, which glTF requires for positions and times.
+            normalized: whether integers represent 0…1.
         """
         given = np.ascontiguousarray(array)
         accessor: dict[str, Any] = {
@@ -79,14 +81,15 @@ class Binary:
         return len(self.accessors) - 1
 
     def write(self, path: Path | str, document: Mapping[str, Any]) -> None:
-        """Writes a document with these arrays, whole or not at all.
+        """Writes a document with these arrays atomically.
 
         Args:
-            path: of the file. document: the JSON without asset, buffers, views and accessors; ``asset_extras`` in it
-                becomes the asset's ``extras``.
+            path: path of the file.
+            document: JSON document without asset, buffers, views and accessors; its ``asset_extras`` become the asset's
+                ``extras``.
 
         Raises:
-            InputError: more than 4 GiB, or the file cannot be written.
+            InputError: the file would exceed 4 GiB, or cannot be written.
 
         >>> from tempfile import TemporaryDirectory
         >>> with TemporaryDirectory() as folder:

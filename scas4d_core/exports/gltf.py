@@ -1,15 +1,15 @@
 """Writes a frame as ``.glb`` with KHR_gaussian_splatting, as ratified by Khronos (its README in KhronosGroup/glTF).
 
-Scale is linear and not negative, opacity linear in 0…1, rotation a unit quaternion (x, y, z, w), all float32; harmonics
-have the signs and the order of 3DGS. Drafts before the ratified text had the logarithm of the scale.
+Scale is linear and nonnegative, opacity linear in 0…1, rotation a unit quaternion (x, y, z, w), all float32. Harmonics
+have the signs and the order of 3DGS. Drafts before the ratified text used the logarithm of the scale.
 
-glTF has y up, z towards the viewer, metres. Positions, rotations and harmonics are turned by 180° about x and brought
-to metres *in the data*, and the node stays at identity: the extension says that a reader SHOULD turn harmonics by the
-node's rotation, so not all will, and the half turn only changes signs, so nothing is lost by it. ``asset.extras`` has
-``metres_per_unit``, which leads back.
+glTF has y up, z towards the viewer, and metres. Positions, rotations and harmonics are rotated by 180° about x and
+converted to metres *in the data*, and the node's transform is the identity. The extension says that a reader SHOULD
+rotate harmonics with the node, so some readers will not; the half turn only changes signs, so it is lossless.
+``asset.extras`` has ``metres_per_unit`` for the inverse conversion.
 
-``COLOR_0`` (linear light, 16 bits) is what readers without the extension show as points. ``_ID`` holds the ids as
-float32, exact below 2²⁴; it is left out where one is larger.
+``COLOR_0`` (linear light, 16 bits) is shown as points by readers without the extension. ``_ID`` contains the ids as
+float32, exact below 2²⁴; it is omitted if an id is larger.
 """
 
 from __future__ import annotations
@@ -26,21 +26,23 @@ from scas4d_core.gaussians import Gaussians
 
 EXTENSION = "KHR_gaussian_splatting"
 POINTS = 0
-"""Mode of a primitive."""
+"""Primitive mode of points."""
 EXACT_IDS = 2**24
-"""Below, float32 holds every whole number; glTF allows no 32-bit integers in vertices."""
+"""Limit below which float32 represents all integers; glTF allows no 32-bit integers as vertex attributes."""
 DEGREES = ((0,), (1, 2, 3), (4, 5, 6, 7, 8), (9, 10, 11, 12, 13, 14, 15))
 """Rows of the harmonics by degree."""
 
 
 def write_glb(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None:
-    """Writes one frame, whole or not at all, without the Gaussians that are retired in it.
+    """Writes one frame atomically, without its retired Gaussians.
 
     Args:
-        path: of the file. gaussians: in the inside world. world: user's world to inside.
+        path: path of the file.
+        gaussians: state in the internal world.
+        world: transform from the user's world to the internal world.
 
     Raises:
-        InputError: rows that are not finite or have no volume, more than 4 GiB, or the file cannot be written.
+        InputError: rows are not finite or have no volume, the file would exceed 4 GiB, or it cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -51,7 +53,7 @@ def write_glb(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None
     cloud = cloud_of(gaussians, world).scaled(world.metres_per_unit).half_turned()
     binary = Binary()
     document: dict[str, Any] = {"scene": 0, "scenes": [{}], "asset_extras": asset_extras(world)}
-    if len(cloud):  # an accessor of no elements is not allowed
+    if len(cloud):  # glTF does not allow empty accessors
         document |= {
             "scenes": [{"nodes": [0]}],
             "nodes": [{"name": "gaussians", "mesh": 0}],
@@ -62,10 +64,11 @@ def write_glb(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None
 
 
 def splat_primitive(binary: Binary, cloud: Cloud) -> dict[str, Any]:
-    """Adds the attributes of a cloud to a file, and returns the primitive that names them.
+    """Adds the attributes of a cloud to a file, and returns the primitive that refers to them.
 
     Args:
-        binary: of the file. cloud: at least one Gaussian, in the axes and the unit of glTF.
+        binary: arrays of the file.
+        cloud: at least one Gaussian, in glTF's axes and unit.
 
     >>> cloud = cloud_of(Gaussians.of_points([[0, 0, 2]], radius=0.1), WorldFrame(np.zeros(3)))
     >>> sorted(splat_primitive(Binary(), cloud)["attributes"])[:3]
@@ -101,7 +104,7 @@ def splat_primitive(binary: Binary, cloud: Cloud) -> dict[str, Any]:
 
 
 def asset_extras(world: WorldFrame) -> dict[str, Any]:
-    """Describes how the file's world relates to the user's: position · (1, −1, −1) / ``metres_per_unit``.
+    """Returns extras that relate the file's world to the user's: position · (1, −1, −1) / ``metres_per_unit``.
 
     >>> asset_extras(WorldFrame(np.zeros(3), metres_per_unit=0.01))["metres_per_unit"]
     0.01

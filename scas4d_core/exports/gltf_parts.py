@@ -1,13 +1,14 @@
-"""Writes an articulated asset: one ``.glb`` whose nodes are the parts, each with its splats and its rigid motion.
+"""Writes an articulated asset: one ``.glb`` with a node per part, which contains its splats and its rigid motion.
 
-Each node has the Gaussians of the first frame in the part's own frame, and an animation of translation and rotation
-(linear; seconds since the first frame). Gaussians without a part, which do not move, are in the node ``standing``.
-Axes, units and attributes are those of ``gltf``. Lost are bending within a part, Gaussians that are born later, changes
-of colour and size, and that highlights stay with the world: here they turn with the part.
+Each node has the Gaussians of the first frame in the part's local frame, and an animation of translation and rotation
+(linear; seconds since the first frame). Gaussians without a part do not move and are in the node ``standing``. Axes,
+units and attributes are those of ``gltf``. Deformation within a part, Gaussians born later, and changes of colour and
+size are lost. Highlights rotate with the part instead of staying fixed in the world.
 
-``extras`` of a node report what the rigid motion leaves: ``residual_rms``, the weighted RMS distance between the rigid
-prediction and the means over all frames after the first, ``residual_worst``, that of the worst frame, and its index
-``worst_frame``. They are in the user's units, and ``…_percent`` in percent of the extent of what moves.
+The ``extras`` of a node report the residual of the rigid motion. ``residual_rms`` is the weighted RMS distance between
+the rigid prediction and the means over all frames after the first. ``residual_worst`` is that of the worst frame, whose
+index is ``worst_frame``. They are in the user's units, and with the suffix ``_percent`` in percent of the extent of the
+moving Gaussians.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ Float = NDArray[np.float64]
 
 @dataclass
 class _Keyframes:
-    """The keys of one part's animation, in the axes and the unit of glTF, and its residuals in the user's."""
+    """Key frames of one part's animation in glTF's axes and unit, and residuals in the user's unit."""
 
     times: list[float] = field(default_factory=list)
     frames: list[int] = field(default_factory=list)
@@ -44,7 +45,7 @@ class _Keyframes:
     def add(self, index: int, seconds: float, pose: PartPose, metres: float) -> None:
         quaternion = quaternion_of(HALF_TURN @ pose.rotation @ HALF_TURN)
         if self.quaternions and quaternion @ self.quaternions[-1] < 0:
-            quaternion = -quaternion  # the short way between keys
+            quaternion = -quaternion  # interpolate along the shorter arc
         self.times.append(seconds)
         self.frames.append(index)
         self.positions.append(HALF_TURN @ pose.position * metres)
@@ -53,10 +54,12 @@ class _Keyframes:
 
 
 class PartAsset:
-    """Writes the asset of a sequence; holds the first frame, and 64 bytes a part of each later one.
+    """Writes the asset of a sequence. Keeps the first frame in memory, and 64 bytes per part of each later one.
 
     Args:
-        path: of the file. world: user's world to inside. labels: [N] part of each Gaussian by row, negative for none.
+        path: path of the file.
+        world: transform from the user's world to the internal world.
+        labels: [N] part of each Gaussian by row, negative for none.
 
     Raises:
         InputError: the folder cannot be written.
@@ -87,10 +90,12 @@ class PartAsset:
         """Adds a frame.
 
         Args:
-            index: of the frame. time: seconds, later than those before. gaussians: in the inside world.
+            index: frame index.
+            time: time in seconds, later than all previous ones.
+            gaussians: state in the internal world.
 
         Raises:
-            InputError: the time does not rise, or no Gaussian of the first frame belongs to a part.
+            InputError: the time does not increase, or no Gaussian of the first frame belongs to a part.
         """
         if self._motion is None:
             self._motion = PartMotion(self._labels, gaussians, self._world)
@@ -106,7 +111,7 @@ class PartAsset:
             self._keys[pose.part].add(index, time - self._begin, pose, self._world.metres_per_unit)
 
     def finish(self) -> None:
-        """Writes the file, whole or not at all.
+        """Writes the file atomically.
 
         Raises:
             InputError: there was no frame, or the file cannot be written.
@@ -119,7 +124,7 @@ class PartAsset:
         meshes: list[dict[str, Any]] = []
         samplers: list[dict[str, Any]] = []
         channels: list[dict[str, Any]] = []
-        times: dict[tuple[float, ...], int] = {}  # parts that are always there share one accessor
+        times: dict[tuple[float, ...], int] = {}  # parts present in the same frames share one accessor
         left = self._first.present.copy()
         for part, keys in self._keys.items():
             rows = self._motion.rows(part)
@@ -157,11 +162,11 @@ class PartAsset:
         )
 
     def discard(self) -> None:
-        """Gives the frames up; nothing was written."""
+        """Discards the frames; nothing has been written."""
         self._first, self._motion, self._keys = None, None, {}
 
     def _residuals(self, keys: _Keyframes) -> dict[str, Any]:
-        """The extras of a part: what its rigid motion leaves."""
+        """Returns the extras of a part, which describe the residual of its rigid motion."""
         assert self._motion is not None
         after = np.array(keys.residuals[1:] or [0.0])
         rms, worst = float(np.sqrt(np.mean(np.square(after)))), int(after.argmax())

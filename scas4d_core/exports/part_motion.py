@@ -1,7 +1,7 @@
-"""Fits the rigid motion of parts since the first frame: weighted Kabsch over the means of their Gaussians.
+"""Fits the rigid motion of parts since the first frame with weighted Kabsch over the means of their Gaussians.
 
-A Gaussian weighs as much as it covers of a picture. Where the means leave a turn open, as on a thin rod that turns
-about itself, the material rotations of the Gaussians decide.
+A Gaussian is weighted by its image coverage. If the means leave a rotation undetermined, such as that of a thin rod
+about its axis, the Gaussians' material rotations determine it.
 """
 
 from __future__ import annotations
@@ -21,22 +21,24 @@ from scas4d_core.query.parts import coverage
 Float = NDArray[np.float64]
 
 ROUNDS = 20
-"""Of weights and fits; after about ten nothing changes."""
+"""Maximum number of reweighting iterations; results stop changing after about ten."""
 PRECISION = 1e-6
-"""Of positions, as a share of the part's size: float32, some metres from the origin."""
+"""Precision of positions relative to the part's size, for float32 some metres from the origin."""
 PULL = 1e-9
-"""Share of the points' spread that pulls towards the rotation ``near``; it decides only what the points leave open."""
+"""Weight of the prior rotation ``near`` relative to the points' spread; it matters only if R is ambiguous."""
 
 
 @dataclass(frozen=True, eq=False)
 class PartPose:
-    """A part in one frame. A point x₀ of it in its own frame is at ``rotation @ x₀ + position`` in the user's world.
+    """A part in one frame. A point x₀ in its local frame is at ``rotation @ x₀ + position`` in the user's world.
 
-    The part's own frame has the user's axes and, as its origin, the weighted centre of the part in the first frame.
+    The local frame has the user's axes; its origin is the weighted centre of the part in the first frame.
 
     Attributes:
-        part: the label. rotation: [3, 3] since the first frame. position: [3] of the origin, user's units.
-        residual: weighted RMS distance between the rigid prediction and the means, user's units.
+        part: label of the part.
+        rotation: [3, 3] rotation since the first frame.
+        position: [3] position of the origin, in the user's units.
+        residual: weighted RMS distance between the rigid prediction and the means, in the user's units.
     """
 
     part: int
@@ -46,25 +48,26 @@ class PartPose:
 
     @property
     def quaternion(self) -> Float:
-        """[4] (w, x, y, z), w ≥ 0."""
+        """[4] quaternion (w, x, y, z) of the rotation, w ≥ 0."""
         return quaternion_of(self.rotation)
 
 
 class PartMotion:
-    """Follows parts from a first frame on; holds that frame's means, and none of the later frames.
+    """Tracks parts from a first frame on. Stores the means of that frame, but no later frames.
 
-    Gaussians that were born after the first frame or are retired in a frame do not count in it.
+    Gaussians that were born after the first frame, or are retired in the current one, are ignored.
 
     Args:
-        labels: [N] part of each Gaussian by row, negative for none. first: the first frame's state, in the inside
-            world. world: user's world to inside.
+        labels: [N] part of each Gaussian by row, negative for none.
+        first: state of the first frame in the internal world.
+        world: transform from the user's world to the internal world.
 
     Attributes:
-        parts: the labels that have a Gaussian in the first frame, rising.
-        extent: of the moving Gaussians in the first frame, user's units; residuals are also given in percent of it.
+        parts: labels that have a Gaussian in the first frame, in increasing order.
+        extent: extent of the moving Gaussians in the first frame, in the user's units; the reference for percentages.
 
     Raises:
-        InputError: labels of another shape, or no Gaussian of the first frame belongs to a part.
+        InputError: the labels have an invalid shape or type, or no Gaussian of the first frame belongs to a part.
 
     >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2], [0, 1, 2]], radius=0.1)
     >>> motion = PartMotion(np.zeros(3, int), state, WorldFrame(np.zeros(3), metres_per_unit=0.5))
@@ -87,11 +90,11 @@ class PartMotion:
         self._first_turns = first.rotations
 
     def rows(self, part: int) -> NDArray[np.intp]:
-        """Rows of a part that are there in the first frame."""
+        """Returns the rows of a part that are present in the first frame."""
         return np.flatnonzero((self._labels == part) & self._present)
 
     def poses(self, gaussians: Gaussians) -> list[PartPose]:
-        """Poses of the parts in a later frame, or in the first; a part of which no Gaussian is there has none."""
+        """Returns the poses of the parts in the first or a later frame; parts without present Gaussians are omitted."""
         part_poses = []
         means = self._world.to_user(gaussians.means)
         for part in self.parts:
@@ -104,7 +107,7 @@ class PartMotion:
         return part_poses
 
     def _mean_material_rotation(self, gaussians: Gaussians, rows: NDArray[np.intp], weights: Float) -> Float:
-        """[3, 3] weighted mean of the Gaussians' rotations since the first frame; about a rotation."""
+        """Returns the weighted mean [3, 3] of the rotations since the first frame, approximately a rotation."""
         now = quaternions_to_matrices(gaussians.rotations[rows].astype(np.float64))
         then = quaternions_to_matrices(self._first_turns[rows].astype(np.float64))
         turn: Float = np.einsum("n,nik,njk->ij", weights, now, then)
@@ -119,11 +122,11 @@ class PartMotion:
 def majority_motion(
     before: NDArray[Any], after: NDArray[Any], weights: NDArray[Any] | None = None, near: NDArray[Any] | None = None
 ) -> tuple[Float, Float, float]:
-    """Finds the rigid motion of most points, as ``rigid_motion`` does of all; takes and returns the same.
+    """Fits the rigid motion of most points; arguments and results are those of ``rigid_motion``.
 
-    Points that move otherwise count the less, the farther they are from it (Cauchy weights about the median distance,
-    Holland and Welsch 1977): a part that was found from motion has Gaussians of its neighbours, and of the inside,
-    which no picture holds. The distance that is left is that of all points.
+    Outliers get Cauchy weights scaled by the median distance (Holland and Welsch 1977). They occur because a part
+    segmented by motion includes Gaussians of its neighbours, and interior ones that no image constrains. The returned
+    RMS distance is that of all points.
 
     >>> before = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [2, 2, 2]])
     >>> shift = majority_motion(before, before + np.where(np.arange(6)[:, None] < 5, [0, 0, 1], [5, 0, 0]))[1]
@@ -138,7 +141,7 @@ def majority_motion(
         apart = np.linalg.norm(old @ turn.T + shift - new, axis=1)
         scale = max(_median(apart, mass), PRECISION * size)
         if scale <= 0 or (len(old) and apart.max() <= PRECISION * size):
-            break  # all of it moves as one
+            break  # all points already fit
         turn, shift, _ = rigid_motion(old, new, mass / (1 + np.square(apart / scale)), near)
     share = mass / mass.sum() if mass.sum() > 0 else np.full(len(old), 1 / max(len(old), 1))
     apart = np.square(old @ turn.T + shift - new).sum(axis=1)
@@ -146,7 +149,7 @@ def majority_motion(
 
 
 def _median(values: Float, weights: Float) -> float:
-    """The value below which half of the weight is."""
+    """Returns the weighted median."""
     order = np.argsort(values)
     sums = np.cumsum(weights[order])
     if not sums.size or not sums[-1] > 0:
@@ -157,17 +160,18 @@ def _median(values: Float, weights: Float) -> float:
 def rigid_motion(
     before: NDArray[Any], after: NDArray[Any], weights: NDArray[Any] | None = None, near: NDArray[Any] | None = None
 ) -> tuple[Float, Float, float]:
-    """Finds R and t with the least weighted sum of |R·before + t − after|² (Kabsch 1976).
+    """Finds R and t that minimize the weighted sum of |R·before + t − after|² (Kabsch 1976).
 
-    Points on a line or in one place leave a turn open; of all that fit, the one nearest to ``near`` is taken. Points in
-    a plane do not: a mirror image is no rotation, and the determinant of R is +1.
+    Collinear or coincident points leave R ambiguous; the solution nearest to ``near`` is returned. Coplanar points
+    determine R, because reflections are excluded: its determinant is +1.
 
     Args:
-        before, after: [M, 3], M ≥ 1. weights: [M], not negative; None: all the same.
-        near: [3, 3] a rotation, or about one; None: no turn.
+        before, after: [M, 3] points, M ≥ 1.
+        weights: [M] nonnegative weights; None for equal weights.
+        near: [3, 3] exact or approximate rotation; None for the identity.
 
     Returns:
-        R [3, 3], t [3], and the weighted RMS distance that is left.
+        R [3, 3], t [3], and the weighted RMS residual.
 
     >>> before = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0]])
     >>> quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
@@ -193,7 +197,7 @@ def rigid_motion(
 
 
 def quaternion_of(rotation: NDArray[Any]) -> Float:
-    """[4] unit quaternion (w, x, y, z), w ≥ 0, of a rotation matrix [3, 3].
+    """Converts a rotation matrix [3, 3] to a unit quaternion [4] (w, x, y, z), w ≥ 0.
 
     >>> quaternion_of(np.diag([1.0, -1, -1]))  # a half turn about x
     array([0., 1., 0., 0.])
@@ -203,7 +207,7 @@ def quaternion_of(rotation: NDArray[Any]) -> Float:
 
 
 def part_labels(labels: NDArray[Any], count: int) -> NDArray[np.int64]:
-    """[count] labels: those given, cut or with −1 for Gaussians that were born later.
+    """Truncates labels to ``count`` entries, or pads them with −1 for Gaussians that were born later.
 
     >>> part_labels(np.array([0, 1]), 3)
     array([ 0,  1, -1])

@@ -1,4 +1,4 @@
-"""Exports a sequence of frames: numbered files in a folder or a ``.zip``, or one file, by the format."""
+"""Exports a sequence of frames: numbered files in a folder or a ``.zip``, or one file, depending on the format."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.ply import write_ply
 
 Progress = Callable[[int, int], None]
-"""Called after each frame with its index and the number of frames that are done."""
+"""Called after each frame with its index and the number of frames done."""
 
 FRAME_WRITERS: dict[str, Callable[[Path, Gaussians, WorldFrame], None]] = {
     "ply": write_ply,
@@ -37,7 +37,7 @@ FRAME_WRITERS: dict[str, Callable[[Path, Gaussians, WorldFrame], None]] = {
     "spz4": lambda path, gaussians, world: write_spz(path, gaussians, world, version=4),
     "glb": write_glb,
 }
-"""Writers of a frame, by format."""
+"""Functions that write one frame, by format."""
 
 
 class SequenceWriter(Protocol):
@@ -50,7 +50,7 @@ class SequenceWriter(Protocol):
         """Completes the output."""
 
     def discard(self) -> None:
-        """Removes what is not complete."""
+        """Removes the incomplete output."""
 
 
 def export_sequence(
@@ -66,30 +66,32 @@ def export_sequence(
     background: Colour = (0.0, 0.0, 0.0),
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Writes frames in a format; holds one state at a time.
+    """Writes frames in a format, with at most one state in memory.
 
-    Numbered files are ``frame_000012.ply`` for the frame of index 12. Each is written under a temporary name and
-    renamed; those that are there already are replaced. A ``.zip`` and a single file appear when they are whole. Where
-    an error ends the export, numbered files that are whole stay in a folder; of other outputs nothing is left.
+    Numbered files are named ``frame_000012.ply`` for frame 12. Each is written atomically and replaces an existing one.
+    A ``.zip`` or a single file appears only when it is complete. After an error, complete numbered files remain in a
+    folder; other outputs are removed.
 
     Args:
-        states: index, time in seconds and state of each frame, rising; the states in the inside world. With a
-            ``CompactReader``: ``((i, t, reader.state(i)) for i, t in zip(reader.frames, reader.times))``.
+        states: index, time in seconds and state of each frame, in increasing order, with states in the internal world.
+            For a ``CompactReader``: ``((i, t, reader.state(i)) for i, t in zip(reader.frames, reader.times))``.
         format: a name in ``FORMATS``.
-        out: for numbered files a folder, which is made, or a ``.zip``; else a file with the format's suffix.
-        world: user's world to inside. rig: in the user's world; for USD and ``s4d``.
-        parts: [N] part of each Gaussian by row, negative for none; for ``glb-parts``, ``poses``, USD and ``s4d``.
-        ids: the Gaussians of ``tracks``; None: all that move.
-        frames_per_second: of USD's time codes; None: by the first two frames.
-        background: RGB in 0…1 behind everything; only ``s4d`` has it.
-        progress: called with each frame.
+        out: for numbered files, a folder (created if missing) or a ``.zip``; else a file with the format's suffix.
+        world: transform from the user's world to the internal world.
+        rig: rig in the user's world; used by USD and ``s4d``.
+        parts: [N] part of each Gaussian by row, negative for none; used by ``glb-parts``, ``poses``, USD and ``s4d``.
+        ids: ids of the Gaussians for ``tracks``; None for all moving ones.
+        frames_per_second: nominal frame rate for ``s4d``, and rate of USD's time codes. None derives the latter from
+            the first two frames.
+        background: background colour, RGB in 0…1; stored only by ``s4d``.
+        progress: called after each frame.
 
     Returns:
-        The paths of the numbered files, or of the one file.
+        The paths of the numbered files, or of the single file.
 
     Raises:
-        InputError: unknown format, no frame, parts missing, a package missing, an output that cannot be written, or
-            Gaussians that cannot be exported. Errors of ``states`` pass unchanged.
+        InputError: the format is unknown, there is no frame, parts or a package are missing, the output cannot be
+            written, or Gaussians cannot be exported. Exceptions from ``states`` propagate unchanged.
 
     >>> from tempfile import TemporaryDirectory
     >>> import numpy as np
@@ -131,7 +133,7 @@ def export_sequence(
 
 
 def other_frames(out: Path, format: Format, frames: Collection[int]) -> list[Path]:
-    """Numbered files of this format in a folder that are of other frames, as an earlier, longer export leaves them.
+    """Returns numbered files of this format for other frames, which an earlier, longer export left in the folder.
 
     >>> other_frames(Path("no_such_folder"), format_of("ply"), [0])
     []
@@ -146,7 +148,7 @@ def other_frames(out: Path, format: Format, frames: Collection[int]) -> list[Pat
 def _chain(
     waiting: list[tuple[int, float, Gaussians]], coming: Iterator[tuple[int, float, Gaussians]]
 ) -> Iterator[tuple[int, float, Gaussians]]:
-    """The frame that waits and then the others; no reference to a frame is kept."""
+    """Yields the waiting frame and then the others, without keeping a reference to a frame."""
     yield waiting.pop()
     yield from coming
 
@@ -169,7 +171,7 @@ def _writer(
         return CompactSequence(target, world, rig, parts, frames_per_second, background)
     if wanted.name == "tracks":
         return TrackTable(target, world, ids)
-    assert parts is not None  # the others need them
+    assert parts is not None  # required by the remaining formats
     return PartAsset(target, world, parts) if wanted.name == "glb-parts" else PoseTable(target, world, parts)
 
 
@@ -182,7 +184,7 @@ class _Folder:
             folder.mkdir(parents=True, exist_ok=True)
 
     def path_of(self, index: int) -> Path:
-        """The file of a frame."""
+        """Returns the path of a frame's file."""
         return self.folder / f"frame_{index:06d}{self._format.suffixes[0]}"
 
     def add(self, index: int, time: float, gaussians: Gaussians) -> None:
@@ -191,14 +193,17 @@ class _Folder:
             FRAME_WRITERS[self._format.name](self.path_of(index), gaussians, self._world)
 
     def finish(self) -> None:
-        """Nothing is left to do."""
+        """Does nothing, because each file is already complete."""
 
     def discard(self) -> None:
-        """Files that are whole stay."""
+        """Keeps the complete files."""
 
 
 class _Zip:
-    """Numbered files in a ``.zip``, stored as they are; each is written to a folder first, so one is held on disk."""
+    """Numbered files in an uncompressed ``.zip``.
+
+    Each is first written to a temporary folder, so at most one is on disk at a time.
+    """
 
     def __init__(self, path: Path, format: Format, world: WorldFrame) -> None:
         self._path = path
@@ -221,12 +226,12 @@ class _Zip:
             file.unlink()
 
     def finish(self) -> None:
-        """Gives the archive its name."""
+        """Completes the archive and renames it to its final name."""
         self._beside.cleanup()
         self._output.__exit__(None, None, None)
 
     def discard(self) -> None:
-        """Removes the archive that is not whole."""
+        """Deletes the incomplete archive."""
         self._beside.cleanup()
         self._output.__exit__(Exception, Exception("given up"), None)
 

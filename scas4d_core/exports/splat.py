@@ -1,9 +1,9 @@
 """Writes and reads the ``.splat`` format of antimatter15/splat (its ``convert.py`` and ``main.js``).
 
-No header; 32 bytes a Gaussian, little-endian: position 3×float32, scale 3×float32 (linear standard deviations), RGBA
-4×uint8, rotation 4×uint8 (w, x, y, z) as q·128 + 128. The axes and the unit are those of the 3DGS ``.ply``: the user's.
-Colour is that of degree 0, opacity is linear. Viewers draw a file while it loads, so the largest and most opaque
-Gaussians come first, as ``convert.py`` sorts them; row order and ids are lost.
+There is no header, just 32 bytes per Gaussian, little-endian: position 3×float32, scale 3×float32 (linear standard
+deviations), RGBA 4×uint8, rotation 4×uint8 (w, x, y, z) as q·128 + 128. Axes and unit are the user's, as in the 3DGS
+``.ply``. Colour is that of degree 0, and opacity is linear. Viewers render a file while it loads, so the largest and
+most opaque Gaussians come first, as sorted by ``convert.py``. Row order and ids are lost.
 """
 
 from __future__ import annotations
@@ -20,20 +20,22 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.ply import Splats
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rotation", "u1", 4)])
-"""One Gaussian, 32 bytes."""
+"""Layout of one Gaussian, 32 bytes."""
 
 
 def write_splat(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None:
-    """Writes one frame, whole or not at all, without the Gaussians that are retired in it.
+    """Writes one frame atomically, without its retired Gaussians.
 
-    Of q and −q, which are the same rotation, the one with a negative largest component is written: +1 has no byte, −1
-    has.
+    Of the equivalent quaternions q and −q, the one with a negative largest component is written, because a byte can
+    represent −1 but not +1.
 
     Args:
-        path: of the file. gaussians: in the inside world. world: user's world to inside.
+        path: path of the file.
+        gaussians: state in the internal world.
+        world: transform from the user's world to the internal world.
 
     Raises:
-        InputError: rows that are not finite or have no volume, or the file cannot be written.
+        InputError: rows are not finite or have no volume, or the file cannot be written.
 
     >>> from tempfile import TemporaryDirectory
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
@@ -57,10 +59,10 @@ def write_splat(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> No
 
 
 def read_splat(path: Path | str) -> Splats:
-    """Reads a file, in its own order; rotations are normalized.
+    """Reads a file in its row order; rotations are normalized.
 
     Raises:
-        InputError: it is not there, or no multiple of 32 bytes.
+        InputError: the file does not exist, or its size is not a multiple of 32 bytes.
 
     >>> read_splat("README.md")
     Traceback (most recent call last):

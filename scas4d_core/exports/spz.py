@@ -1,14 +1,14 @@
-"""Writes and reads SPZ (Niantic, github.com/nianticlabs/spz), versions 3 (gzip) and 4 (zstd), by the package gsply.
+"""Writes and reads SPZ (Niantic, github.com/nianticlabs/spz), versions 3 (gzip) and 4 (zstd), with the package gsply.
 
-Axes are RUB, as SPZ's README states: x right, y up, z backward, the user's world turned by 180° about x. gsply turns
-nothing, so this file does. Lengths are metres, for which the format's ranges are made. Rounding, from gsply 0.4.6 and
-Niantic's ``load-spz.cc``:
+As SPZ's README states, axes are RUB: x right, y up, z backward, that is, the user's world rotated by 180° about x.
+gsply does not convert axes, so this module does. Lengths are in metres, which the format's ranges are designed for.
+Quantization, from gsply 0.4.6 and Niantic's ``load-spz.cc``:
 
-- positions: 24-bit fixed point, ±2⁻ᶠ⁻¹ m; f, the fractional bits, is the largest that holds the frame;
-- scales: a byte a logarithm, 16 steps to a factor of e: ±3.2 %; below 45 µm or above 379 m they are clipped;
-- rotations: the smallest three components in 10 bits each, ±0.0007 a component;
-- opacity: a byte, linear, ±0.002; colour: a byte over −0.44…1.44, ±0.0037;
-- harmonics of degree 1 to 3: a byte over −1…1, ±0.004, clipped beyond.
+- positions: 24-bit fixed point, ±2⁻ᶠ⁻¹ m; the fractional bits f are the most with which the frame fits;
+- scales: the logarithm in one byte, 16 steps per factor of e: ±3.2 %, clipped below 45 µm or above 379 m;
+- rotations: the smallest three components in 10 bits each, ±0.0007 per component;
+- opacity: one byte, linear, ±0.002; colour: one byte over −0.44…1.44, ±0.0037;
+- harmonics of degree 1 to 3: one byte over −1…1, ±0.004, clipped beyond.
 """
 
 from __future__ import annotations
@@ -25,23 +25,25 @@ from scas4d_core.gaussians import Gaussians
 from scas4d_core.query.ply import OPACITY_MARGIN, SH_DEGREE_0, Splats
 
 VERSIONS = (3, 4)
-"""Containers that gsply writes: 3 is read by most viewers, 4 by recent ones."""
+"""Versions that gsply writes: 3 is supported by most viewers, 4 by recent ones."""
 POSITION_BITS = 23
-"""Bits of a position beside its sign."""
+"""Bits of a position without its sign."""
 MAX_FRACTIONAL_BITS = 24
-"""The most that gsply takes."""
+"""Maximum that gsply accepts."""
 
 
 def write_spz(path: Path | str, gaussians: Gaussians, world: WorldFrame, version: int = 3) -> None:
-    """Writes one frame, whole or not at all, without the Gaussians that are retired in it.
+    """Writes one frame atomically, without its retired Gaussians.
 
     Args:
-        path: of the file. gaussians: in the inside world. world: user's world to inside.
+        path: path of the file.
+        gaussians: state in the internal world.
+        world: transform from the user's world to the internal world.
         version: 3 or 4.
 
     Raises:
-        InputError: another version, gsply (for 4 also zstandard) is missing, rows that are not finite or have no
-            volume, a position beyond 4,194 km, or the file cannot be written.
+        InputError: the version is not supported; gsply (for 4 also zstandard) is missing; rows are not finite or have
+            no volume; a position exceeds 4,194 km; or the file cannot be written.
 
     >>> write_spz("a.spz", Gaussians.of_points([[0, 0, 2]], radius=0.1), WorldFrame(np.zeros(3)), version=2)
     Traceback (most recent call last):
@@ -71,10 +73,10 @@ def write_spz(path: Path | str, gaussians: Gaussians, world: WorldFrame, version
 
 
 def fractional_bits(cloud: Cloud) -> int:
-    """The most bits after the point with which all positions fit into 24: a step is 2⁻ᶠ of their unit.
+    """Returns the most fractional bits f with which all positions fit into 24 bits; a step is 2⁻ᶠ of their unit.
 
     Raises:
-        InputError: a position is too far away.
+        InputError: a position is too far from the origin.
 
     >>> fractional_bits(cloud_of(Gaussians.of_points([[0, 0, 5]], radius=0.1), WorldFrame(np.zeros(3))))
     20
@@ -90,13 +92,14 @@ def fractional_bits(cloud: Cloud) -> int:
 
 
 def read_spz(path: Path | str, metres_per_unit: float = 1.0) -> Splats:
-    """Reads a file of version 1 to 4; of the harmonics only degree 0. Axes are turned back to OpenCV's.
+    """Reads a file of version 1 to 4, with harmonics of degree 0 only, and converts it to OpenCV axes.
 
     Args:
-        path: of the file. metres_per_unit: metres in one of the units that are wanted.
+        path: path of the file.
+        metres_per_unit: metres per unit of the result.
 
     Raises:
-        InputError: gsply is missing, or it cannot read the file.
+        InputError: gsply is missing, or cannot read the file.
 
     >>> read_spz("README.md")
     Traceback (most recent call last):

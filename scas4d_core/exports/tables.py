@@ -1,7 +1,7 @@
-"""Writes tracks and the poses of parts as CSV, for spreadsheets and scripts. World, axes and units are the user's.
+"""Writes tracks and part poses as CSV, for spreadsheets and scripts. World, axes and units are the user's.
 
-Times are in seconds. Frames are rows in the order in which they come; a Gaussian or a part that is not there in a frame
-has no row for it. Coordinates have 12 significant digits: the origin of a world may be far away.
+Times are in seconds. Rows are ordered by frame; a Gaussian or part that is absent in a frame has no row for it.
+Coordinates have 12 significant digits, because the origin of a world may be far away.
 """
 
 from __future__ import annotations
@@ -45,20 +45,21 @@ class _Table:
             self._rows.writerows(rows)
 
     def finish(self) -> None:
-        """Gives the file its name."""
+        """Renames the file to its final name."""
         self._stack.close()
 
     def discard(self) -> None:
-        """Removes what was written."""
+        """Deletes the incomplete file."""
         self._stack.__exit__(Exception, Exception("given up"), None)
 
 
 class TrackTable(_Table):
-    """Writes the means of Gaussians, frame by frame; the column ``confidence`` is empty, because it is not known.
+    """Writes the means of Gaussians frame by frame; the column ``confidence`` is empty because it is unknown.
 
     Args:
-        path: of the file. world: user's world to inside.
-        ids: the Gaussians; None: in each frame all that move.
+        path: path of the file.
+        world: transform from the user's world to the internal world.
+        ids: ids of the Gaussians; None writes all moving ones in each frame.
 
     Raises:
         InputError: the file cannot be written.
@@ -79,7 +80,7 @@ class TrackTable(_Table):
         self._ids = None if ids is None else np.asarray(ids, np.int64).reshape(-1)
 
     def add(self, index: int, time: float, gaussians: Gaussians) -> None:
-        """Adds a frame: its index, its time in seconds, and its state in the inside world."""
+        """Adds a frame: its index, its time in seconds, and its state in the internal world."""
         chosen = gaussians.moving if self._ids is None else gaussians.present & np.isin(gaussians.ids, self._ids)
         ids = gaussians.ids[chosen].tolist()
         means = self._world.to_user(gaussians.means[chosen])
@@ -91,12 +92,15 @@ class TrackTable(_Table):
 class PoseTable(_Table):
     """Writes the rigid motion of parts since the first frame (``part_motion``), frame by frame.
 
-    A point x of a part, in the user's world at the first frame, is at R (x − t₀) + t in a later one: t is (tx, ty, tz),
-    R the rotation of the unit quaternion (qw, qx, qy, qz), and t₀ the translation of the first frame.
-    ``residual`` is the weighted RMS distance between this and the means of the part's Gaussians, user's units.
+    A point x of a part, in the user's world at the first frame, is at R (x − t₀) + t in a later one. Here, t is (tx,
+    ty, tz), R is the rotation of the unit quaternion (qw, qx, qy, qz), and t₀ is t in the first frame.
+    ``residual`` is the weighted RMS distance between this prediction and the means of the part's Gaussians, in the
+    user's units.
 
     Args:
-        path: of the file. world: user's world to inside. labels: [N] part of each Gaussian by row, negative for none.
+        path: path of the file.
+        world: transform from the user's world to the internal world.
+        labels: [N] part of each Gaussian by row, negative for none.
 
     Raises:
         InputError: the file cannot be written.
@@ -118,7 +122,7 @@ class PoseTable(_Table):
         self._motion: PartMotion | None = None
 
     def add(self, index: int, time: float, gaussians: Gaussians) -> None:
-        """Adds a frame: its index, its time in seconds, and its state in the inside world.
+        """Adds a frame: its index, its time in seconds, and its state in the internal world.
 
         Raises:
             InputError: no Gaussian of the first frame belongs to a part.
@@ -132,12 +136,14 @@ class PoseTable(_Table):
 
 
 def write_tracks(path: Path | str, tracks: Tracks, times: ArrayLike) -> None:
-    """Writes tracks that were asked for, with their confidence; what is not there in a frame has no row.
+    """Writes queried tracks with their confidence; points absent in a frame have no row.
 
-    The column ``id`` has the Gaussian that carries the point most, so that two points may have the same.
+    The column ``id`` has the Gaussian with the largest weight for the point, so two points may share an id.
 
     Args:
-        path: of the file. tracks: T frames, Q points. times: [T] seconds.
+        path: path of the file.
+        tracks: tracks of Q points over T frames.
+        times: [T] times in seconds.
 
     Raises:
         InputError: the file cannot be written.
@@ -169,5 +175,5 @@ def write_tracks(path: Path | str, tracks: Tracks, times: ArrayLike) -> None:
 
 
 def _text(value: float, digits: int = 12) -> str:
-    """A number with so many significant digits; −0 is 0."""
+    """Formats a number with ``digits`` significant digits; −0 becomes 0."""
     return f"{value:.{digits}g}" if value else "0"

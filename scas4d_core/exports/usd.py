@@ -1,17 +1,17 @@
-"""Writes a sequence as USD (usd-core 26.03 or later): UsdVol.ParticleField3DGaussianSplat with samples over time.
+"""Writes a sequence as USD (usd-core 26.03 or later): UsdVol.ParticleField3DGaussianSplat with time samples.
 
-``/World/Gaussians`` has one fixed set of Gaussians for all frames: opacity is 0 before the birth of one and while it is
-retired. By the schema, scales and opacities are linear, harmonics lie together by Gaussian. Colours are values of
-pictures (sRGB); the schema has no place for that, so ``colorSpace`` of the harmonics names it. ``primvars:scas4d:id``
-and ``primvars:scas4d:part`` have the ids and the parts. ``/World/Parts/part_k`` are Xforms with the rigid motion of
-each part since the first frame, and its residual (``part_motion``). ``/World/Tracks`` are the centres of up to
-``MAX_TRACKS`` moving Gaussians as UsdGeomPoints, a guide. ``/World/Cameras`` are those of the rig.
+``/World/Gaussians`` has one fixed set of Gaussians for all frames; opacity is 0 before birth and during retirement. As
+the schema requires, scales and opacities are linear, and harmonics are grouped by Gaussian. Colours are sRGB image
+values; the schema cannot express that, so ``colorSpace`` of the harmonics states it. ``primvars:scas4d:id`` and
+``primvars:scas4d:part`` have the ids and the parts. ``/World/Parts/part_k`` are Xforms with the rigid motion of each
+part since the first frame, and its residual (``part_motion``). ``/World/Tracks`` shows the centres of up to
+``MAX_TRACKS`` moving Gaussians as UsdGeomPoints with purpose guide. ``/World/Cameras`` has the cameras of the rig.
 
-The stage is y up: the user's world is turned by 180° about x. Its unit is the user's, ``metersPerUnit`` gives it. A
-time code is seconds since the first frame times ``timeCodesPerSecond``.
+The stage is y up, that is, the user's world rotated by 180° about x. Its unit is the user's, with ``metersPerUnit``. A
+time code is the seconds since the first frame times ``timeCodesPerSecond``.
 
-Frames are saved one by one, so that memory does not grow with their number; a copy beside the target takes the room
-of the file on disk meanwhile.
+Frames are saved one by one, so memory use does not grow with their number. In return, a temporary copy next to the
+target doubles the disk space during the export.
 """
 
 from __future__ import annotations
@@ -42,28 +42,30 @@ from scas4d_core.gaussians import Gaussians
 
 SUFFIXES = (".usdc", ".usda", ".usdz", ".usd")
 MAX_TRACKS = 500
-"""Gaussians that are shown as tracks, evenly over the rows of those that move in the first frame."""
+"""Maximum number of Gaussians shown as tracks, evenly spaced over the moving rows of the first frame."""
 TRACK_WIDTH = 0.005
-"""Diameter of a track's point, of the extent of the tracks."""
+"""Diameter of a track's point, relative to the extent of the tracks."""
 REACH = 3.0
-"""Standard deviations to which the extent of the Gaussians goes."""
+"""Number of standard deviations covered by the extent of the Gaussians."""
 COLOUR_SPACE = "srgb_rec709_scene"
-"""USD's name for the primaries and the curve of sRGB."""
+"""USD's name for the primaries and transfer function of sRGB."""
 DEFAULT_RATE = 24.0
-"""Time codes per second where there is no rate, as with a single frame; USD's own default."""
+"""Time codes per second if the rate is unknown, as for a single frame; USD's own default."""
 
 
 class UsdSequence:
-    """Writes a sequence, frame by frame; the file appears whole, with ``finish``, or not at all.
+    """Writes a sequence frame by frame. The file appears atomically on ``finish``.
 
     Args:
-        path: ``.usdc`` (or ``.usd``, the same), ``.usda`` (text, about three times as large), ``.usdz``.
-        world: user's world to inside. rig: in the user's world, or None.
-        labels: [N] part of each Gaussian by row, negative for none; None: no parts.
-        frames_per_second: time codes a second; None: by the first two frames.
+        path: output path with suffix ``.usdc`` or ``.usd`` (binary), ``.usda`` (text, about three times as large) or
+            ``.usdz``.
+        world: transform from the user's world to the internal world.
+        rig: rig in the user's world, or None.
+        labels: [N] part of each Gaussian by row, negative for none; None for no parts.
+        frames_per_second: time codes per second; None derives them from the first two frames.
 
     Raises:
-        InputError: usd-core is missing or older, another suffix, or the folder cannot be written.
+        InputError: usd-core is missing or too old, the suffix is not USD's, or the folder is not writable.
 
     >>> from tempfile import TemporaryDirectory
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
@@ -119,11 +121,12 @@ class UsdSequence:
         """Adds a frame.
 
         Args:
-            index: of the frame. time: seconds, later than those before. gaussians: in the inside world; rows keep
-                their meaning, and their number never falls.
+            index: frame index.
+            time: time in seconds, later than all previous ones.
+            gaussians: state in the internal world. Rows keep their identity, and their number never decreases.
 
         Raises:
-            InputError: the time does not rise, rows that are not finite or have no volume, or the disk is full.
+            InputError: the time does not increase, rows are not finite or have no volume, or the disk is full.
         """
         if self._first_index is not None and not time > self._latest:
             raise InputError(
@@ -135,7 +138,7 @@ class UsdSequence:
             self._first_index, self._begin = index, time
             self._define(gaussians, cloud)
         elif self._rate is None:
-            self._rate = float(f"{1 / (time - self._begin):.5g}")  # times of the day are rounded; 29.97 stays
+            self._rate = float(f"{1 / (time - self._begin):.5g}")  # absorb rounding of large times, but keep 29.97
         self._latest = time
         code = self._code(time)
         of = cloud.splats
@@ -158,7 +161,7 @@ class UsdSequence:
         self._save()
 
     def finish(self) -> None:
-        """Completes the stage and gives the file its name.
+        """Completes the stage and renames the file to its final name.
 
         Raises:
             InputError: there was no frame, or the file cannot be written.
@@ -174,7 +177,7 @@ class UsdSequence:
             self.discard()
 
     def discard(self) -> None:
-        """Removes what is beside the target."""
+        """Removes the temporary files next to the target."""
         self._channels, self._poses, self._stage, self._layer = {}, {}, None, None
         shutil.rmtree(self._folder, ignore_errors=True)
 
@@ -182,12 +185,12 @@ class UsdSequence:
         return round((time - self._begin) * (self._rate or DEFAULT_RATE), 4)
 
     def _save(self) -> None:
-        """Writes what is new to the disk and frees it: USD reads saved arrays from the file when it needs them."""
+        """Saves new samples to disk and frees their memory; USD reads saved arrays from the file on demand."""
         with translate_usd_errors(self.path):
             self._layer.Save()
 
     def _head(self) -> None:
-        """Defines the world, the axes, the unit and the cameras."""
+        """Defines the world prim, axes, unit and cameras."""
         geometry, names = self._geometry, self._tf.MakeValidIdentifier
         geometry.SetStageUpAxis(self._stage, geometry.Tokens.y)
         geometry.SetStageMetersPerUnit(self._stage, self._world.metres_per_unit)
@@ -204,7 +207,7 @@ class UsdSequence:
                 set_camera(prim, camera, self._world.metres_per_unit)
 
     def _define(self, first: Gaussians, cloud: Cloud) -> None:
-        """Defines the Gaussians, the tracks and the parts by the first frame."""
+        """Defines the Gaussians, tracks and parts from the first frame."""
         gaussians = self._splat.Define(self._stage, "/World/Gaussians")
         gaussians.CreateRadianceSphericalHarmonicsDegreeAttr(round(cloud.harmonics.shape[1] ** 0.5) - 1)
         gaussians.CreateProjectionModeHintAttr("perspective")
@@ -256,7 +259,7 @@ class UsdSequence:
             residual.Set(pose.residual, code)
 
     def _complete(self) -> None:
-        """Lengthens early samples, writes ids, parts and the range of time."""
+        """Pads early samples, and writes ids, parts and the time range."""
         for channel in self._channels.values():
             for _ in channel.lengthen():
                 self._layer.Save()
@@ -277,17 +280,17 @@ class UsdSequence:
         self._layer.Save()
 
     def _convert(self, beside: Path) -> None:
-        """Brings the stage to the format of the target."""
+        """Converts the stage to the target's format."""
         if beside.suffix == ".usdz":
             done = import_optional("pxr.UsdUtils", "usd").CreateNewUsdzPackage(self._layer.realPath, str(beside))
         else:
-            done = self._layer.Export(str(beside))  # without the samples that were replaced
+            done = self._layer.Export(str(beside))  # exporting drops replaced samples
         if not done:
             raise InputError(f"out {str(self.path)!r} cannot be written by USD", "give a path that may be written to")
 
 
 def _extent(means: NDArray[Any], reach: NDArray[Any]) -> NDArray[Any]:
-    """[2, 3] lowest and highest corner of the box around points [N, 3] with radii [N]; 0 where there are none."""
+    """Returns the corners [2, 3] of the bounding box of points [N, 3] with radii [N]; zeros if there are no points."""
     if not len(means):
         return np.zeros((2, 3))
     return np.stack([np.min(means - reach[:, None], axis=0), np.max(means + reach[:, None], axis=0)])

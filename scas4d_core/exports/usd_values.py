@@ -1,4 +1,4 @@
-"""Values of USD: arrays of Gaussians as typed attributes, poses and cameras in USD's axes, and samples over time."""
+"""USD values: arrays of Gaussians as typed attributes, poses and cameras in USD's axes, and time samples."""
 
 from __future__ import annotations
 
@@ -18,20 +18,21 @@ from scas4d_core.exports.cloud import HALF_TURN
 Array = NDArray[Any]
 
 FOCAL_LENGTH = 50.0
-"""Of every camera, tenths of the stage's unit as USD has it; the apertures follow from it, and only ratios matter."""
+"""Focal length of every camera, in tenths of the stage's unit as USD defines it. Apertures scale with it."""
 NEAREST, FARTHEST = 0.01, 1000.0
-"""Clipping range of cameras, metres."""
+"""Clipping range of cameras in metres."""
 
 
 class AnimatedValues:
-    """Samples of one attribute with a value a Gaussian; a sample is written only where the value changes.
+    """Time samples of an attribute with one value per Gaussian; samples are written only when values change.
 
-    USD interpolates between samples, so before a change the value of the frame before is written as well. Gaussians
-    that are born later make a sample longer: earlier ones are lengthened in the end (``lengthen``).
+    USD interpolates between samples, so before a change the previous frame's value is written too. Later births make
+    samples longer, so earlier samples are padded at the end (``lengthen``).
 
     Args:
-        attribute: of USD. typed: turns an array of numpy into one of USD.
-        unborn: the value before the birth; None: that of the birth.
+        attribute: USD attribute.
+        typed: converts a numpy array to a USD array.
+        unborn: value before a birth; None uses the value at birth.
     """
 
     def __init__(self, attribute: Any, typed: Callable[[Array], Any], unborn: float | None = None) -> None:
@@ -42,7 +43,7 @@ class AnimatedValues:
         self._born = 0
 
     def set(self, values: Array, code: float) -> None:
-        """Sets the values [N, …] at a time code; N never falls."""
+        """Sets the values [N, …] at a time code; N never decreases."""
         given = np.asarray(values, np.float32)
         if len(given) > self._born:
             self._births.append(given[self._born :].copy())
@@ -56,12 +57,12 @@ class AnimatedValues:
         self._last, self._unwritten = given, None
 
     def _is_stored(self, before: Array, after: Array) -> bool:
-        """True where the samples before, lengthened, have these values already."""
+        """Returns whether the previous samples, after padding, already have these values."""
         grown = len(after) > len(before)
         return not (grown and self._unborn is not None) and np.array_equal(before, after[: len(before)])
 
     def lengthen(self) -> Iterator[None]:
-        """Gives all samples the full length; pauses after each, so that it can be saved."""
+        """Pads all samples to the full length; yields after each, so that the caller can save it."""
         if len(self._births) < 2:
             return
         full = np.concatenate(self._births)
@@ -74,7 +75,7 @@ class AnimatedValues:
                 yield
 
     def store_constant_as_default(self) -> None:
-        """Makes a lone sample the default value, which readers without time see."""
+        """Converts a single sample to the default value, which readers without time support use."""
         codes = self._attribute.GetTimeSamples()
         if len(codes) == 1:
             value = self._attribute.Get(codes[0])
@@ -83,22 +84,22 @@ class AnimatedValues:
 
 
 def points_of(values: Array) -> Any:
-    """[N, 3] as an array of USD."""
+    """Converts [N, 3] to a USD array."""
     return import_optional("pxr.Vt", "usd").Vec3fArray.FromNumpy(np.ascontiguousarray(values, np.float32))
 
 
 def floats_of(values: Array) -> Any:
-    """[N] as an array of USD."""
+    """Converts [N] to a USD array."""
     return import_optional("pxr.Vt", "usd").FloatArray.FromNumpy(np.ascontiguousarray(values, np.float32))
 
 
 def quaternions_of(values: Array) -> Any:
-    """[N, 4] (x, y, z, w), as USD has them in memory, as an array of USD."""
+    """Converts [N, 4] quaternions (x, y, z, w), USD's memory layout, to a USD array."""
     return import_optional("pxr.Vt", "usd").QuatfArray.FromNumpy(np.ascontiguousarray(values, np.float32))
 
 
 def to_stage_pose(rotation: Array, position: Array) -> tuple[Array, Array]:
-    """A pose in the user's world, [3, 3] and [3], in the axes of the stage; the part's own axes turn as well.
+    """Converts a pose in the user's world, [3, 3] and [3], and the part's local axes to the stage's axes.
 
     >>> to_stage_pose(np.eye(3), np.array([1.0, 2, 3]))[1]
     array([ 1., -2., -3.])
@@ -109,14 +110,15 @@ def to_stage_pose(rotation: Array, position: Array) -> tuple[Array, Array]:
 def set_camera(prim: Any, camera: Camera, metres_per_unit: float) -> None:
     """Fills a UsdGeomCamera from a camera in the user's world.
 
-    A camera of USD looks along −z with y up, the half turn of one of OpenCV. Its window at the focal length f has the
-    size (w/fx, h/fy)·f and lies off the axis by ((w/2 − cx)/fx, (cy − h/2)/fy)·f.
+    A USD camera looks along −z with y up, which is an OpenCV camera after a half turn. At the focal length f, its
+    window
+    has the size (w/fx, h/fy)·f and the offset ((w/2 − cx)/fx, (cy − h/2)/fy)·f from the axis.
     """
     gf, geometry = import_optional("pxr.Gf", "usd"), import_optional("pxr.UsdGeom", "usd")
     pose = np.eye(4)
     pose[:3, :3] = HALF_TURN @ camera.rotation.T @ HALF_TURN
     pose[:3, 3] = HALF_TURN @ camera.centre
-    prim.AddTransformOp().Set(gf.Matrix4d(*pose.T.ravel().tolist()))  # USD multiplies rows from the left
+    prim.AddTransformOp().Set(gf.Matrix4d(*pose.T.ravel().tolist()))  # USD uses row vectors
     prim.CreateProjectionAttr(geometry.Tokens.perspective)
     prim.CreateFocalLengthAttr(FOCAL_LENGTH)
     prim.CreateHorizontalApertureAttr(FOCAL_LENGTH * camera.width / camera.fx)
@@ -129,7 +131,7 @@ def set_camera(prim: Any, camera: Camera, metres_per_unit: float) -> None:
 
 @contextmanager
 def translate_usd_errors(path: Path) -> Iterator[None]:
-    """Turns errors of USD and of the system, while a file is written, into an ``InputError`` that names the output."""
+    """Converts errors of USD and the system during writing to an ``InputError`` that names the output."""
     failure = import_optional("pxr.Tf", "usd").ErrorException
     try:
         with translate_write_errors(path):

@@ -264,7 +264,7 @@ def first_trainer(
     surroundings.
     """
     if len(positions) == 0:
-        raise ValueError("the first cloud holds no point; give points, masks, or more overlapping cameras")
+        raise ValueError("the first cloud has no points; give points, masks, or more overlapping cameras")
     rng = np.random.default_rng(settings.seed)
     most = max(1, int(INITIAL_SHARE * budget(views, scene, settings)))
     parameters = initial_parameters(positions, colours, foreground, most, rng)

@@ -37,7 +37,7 @@ def adjusted_rand_index(
         raise ValueError(f"labels have shape {labels.shape}, the truth {truth.shape}; render at the size of the truth")
     counted = truth != 0 if foreground is None else np.asarray(foreground) != 0
     if counted.shape != truth.shape:
-        raise ValueError(f"foreground has shape {counted.shape}; give {truth.shape} as the labels have")
+        raise ValueError(f"foreground has shape {counted.shape}; give {truth.shape} like the labels")
     if not counted.any():
         raise ValueError("no pixel is foreground: nothing to compare")
     return float(adjusted_rand_score(truth[counted].ravel(), labels[counted].ravel()))

@@ -154,7 +154,7 @@ def track_error_3d(
     frames = np.arange(len(truth)) != query
     pooled = distances[np.ix_(frames, moving)].ravel()
     if pooled.size == 0:
-        raise ValueError("no point moves, or there is only the query frame: nothing to measure")
+        raise ValueError("no point moves, or there is only the query frame, so there is nothing to measure")
     pooled = np.where(np.isfinite(pooled), pooled, np.inf) * (100.0 / extent)
     # Inverted CDF, because interpolation between two infinities gives NaN.
     ninety = np.quantile(pooled, 0.9, method="inverted_cdf")

@@ -93,11 +93,11 @@ def parts(
     rows = np.flatnonzero(newest.moving)
     if rows.size == 0:
         raise InputError(
-            "no Gaussian moves (foreground > 0.5), so there are no parts", "ask again when something has moved"
+            "no Gaussian moves (foreground > 0.5), so there are no parts", "try again when something has moved"
         )
     if count is not None and not 1 <= count <= rows.size:
         raise InputError(
-            f"count {count} must be between 1 and the {rows.size} moving Gaussians", "give no more than these"
+            f"count {count} must be between 1 and the {rows.size} moving Gaussians", "give at most this many"
         )
 
     if previous is not None and previous.shape != (len(newest),):

@@ -1,1 +1,1 @@
-"""Committed states on disk: history, frame files, chunks of older states, retention."""
+"""Committed states on disk: history, frame files, chunks of older states, and retention."""

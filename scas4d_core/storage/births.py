@@ -1,7 +1,7 @@
-"""Births, retirements and revivals of Gaussians: their log, the lives that follow from it, the place of the born.
+"""Births, retirements and revivals of Gaussians: the event log, lifetimes, and roots of newborn Gaussians.
 
-Each frame's file holds the log of all frames up to it, so that retention, which deletes files, takes nothing from it.
-A birth has a file of its own, which all later frames need. Numpy only.
+Each frame's file contains the log of all frames up to it, so the log survives when retention deletes files. Each birth
+has its own file, which all later frames need. Needs only numpy.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from scas4d_core.gaussians import Gaussians, quaternion_products, quaternions_to
 Int = NDArray[np.int64]
 
 COLUMNS = 4
-"""Of the log: frame, kind, first id, last id."""
+"""Columns of the log: frame, kind, first id, last id."""
 NO_EVENTS: Int = np.zeros((0, COLUMNS), np.int64)
 NO_PARENT = -1
-"""Parent of a Gaussian that starts a structure of its own."""
+"""Parent of a Gaussian that starts its own structure."""
 
 
 class Event(IntEnum):
-    """The kinds of events in a log."""
+    """Kinds of events in a log."""
 
     BORN = 0
     RETIRED = 1
@@ -35,11 +35,14 @@ class Event(IntEnum):
 
 @dataclass(frozen=True)
 class Life:
-    """The frames in which a Gaussian came and went.
+    """The lifetime of a Gaussian.
 
     Attributes:
-        id: of the Gaussian. born: the first frame, for those that it began with. retired, revived: rising; it is there
-            from its birth or a revival on, and from a retirement on it is not.
+        id: id of the Gaussian.
+        born: frame of its birth; for initial Gaussians, the first frame.
+        retired, revived: increasing frames of its retirements and revivals. It is present from its birth or a revival
+            until
+            the next retirement.
     """
 
     id: int
@@ -49,10 +52,13 @@ class Life:
 
 
 def events_of(index: int, kind: Event, rows: NDArray[np.intp], ids: Int) -> Int:
-    """[E, 4] log of one kind of event in a frame; where rows and ids follow one another they are one row of the log.
+    """Returns the log [E, 4] of one kind of event in a frame; runs of consecutive rows and ids share one log row.
 
     Args:
-        rows: of the Gaussians, rising. ids: [N] of all, by row.
+        index: frame of the events.
+        kind: kind of the events.
+        rows: rows of the Gaussians, in increasing order.
+        ids: [N] ids of all Gaussians, by row.
 
     >>> events_of(5, Event.RETIRED, np.array([0, 1, 3]), ids=np.array([3, 4, 5, 7])).tolist()
     [[5, 1, 3, 4], [5, 1, 7, 7]]
@@ -66,15 +72,16 @@ def events_of(index: int, kind: Event, rows: NDArray[np.intp], ids: Int) -> Int:
 
 
 def births_in(events: Int) -> list[tuple[int, int, int]]:
-    """Frame, first id and last id of each birth in a log, in the order of their rows."""
+    """Returns (frame, first id, last id) of each birth in a log, in row order."""
     return [(int(frame), int(first), int(last)) for frame, kind, first, last in events if kind == Event.BORN]
 
 
 def retired_after(events: Int, ids: Int) -> NDArray[np.bool_]:
-    """[N] bool: the Gaussians that are retired at the end of a log.
+    """Returns which Gaussians [N] are retired at the end of a log.
 
     Args:
-        ids: [N] of all Gaussians, by row; those of one event lie in rows that follow one another.
+        events: the log.
+        ids: [N] ids of all Gaussians, by row; the Gaussians of one event are in consecutive rows.
 
     >>> events = np.array([[5, 1, 3, 4], [6, 2, 4, 4]])
     >>> retired_after(events, np.array([2, 3, 4]))
@@ -90,10 +97,12 @@ def retired_after(events: Int, ids: Int) -> NDArray[np.bool_]:
 
 
 def revived_in(events: Int, index: int, ids: Int) -> Int:
-    """Rows of the Gaussians that came back in a frame.
+    """Returns the rows of the Gaussians that were revived in a frame.
 
     Args:
-        ids: [N] of all Gaussians, by row.
+        events: the log.
+        index: the frame.
+        ids: [N] ids of all Gaussians, by row.
 
     >>> revived_in(np.array([[5, 1, 3, 4], [6, 2, 4, 4]]), 6, np.array([2, 3, 4]))
     array([2])
@@ -104,7 +113,7 @@ def revived_in(events: Int, index: int, ids: Int) -> Int:
 
 
 def rows_among(ids: Int, wanted: Int) -> Int:
-    """[Q] rows of ids; −1 for one that is not among them.
+    """Returns the row of each wanted id, [Q], or −1 if there is none.
 
     >>> rows_among(np.array([7, 3, 5]), np.array([5, 4, 7]))
     array([ 2, -1,  0])
@@ -117,10 +126,12 @@ def rows_among(ids: Int, wanted: Int) -> Int:
 
 
 def lives_of(events: Int, wanted: Iterable[int], first: int) -> list[Life]:
-    """The lives of Gaussians, by id, as a log records them.
+    """Returns the lifetimes of the wanted Gaussians according to a log.
 
     Args:
-        events: the log. first: the first frame, in which those are born that no event bears.
+        events: the log.
+        wanted: ids of the Gaussians.
+        first: the first frame, which is the birth frame of Gaussians without a birth event.
     """
     lives = []
     for id in wanted:
@@ -131,13 +142,15 @@ def lives_of(events: Int, wanted: Iterable[int], first: int) -> list[Life]:
 
 
 def extend_roots(roots: Gaussians, state: Gaussians, parents: Int | None) -> Gaussians:
-    """The roots of a state: Θ_0 with each Gaussian born since at the place that it would have had there.
+    """Returns the roots of a state: Θ_0, extended by newborn Gaussians at the positions they would have had in it.
 
-    Clusters and neighbours are made of them. A born Gaussian goes back as its parent has come, rigidly; one without
-    a parent has its place where it was born.
+    Clusters and neighbours are computed from the roots. A newborn Gaussian is moved back by the inverse rigid motion of
+    its parent; one without a parent keeps its position at birth.
 
     Args:
-        roots: before this frame, [N]. state: after it, [N + B]. parents: [B] parents; None: none has one.
+        roots: [N] roots before this frame.
+        state: [N + B] state after this frame.
+        parents: [B] rows of the parents; None if no newborn has one.
     """
     count, born = len(roots), state.rows(np.arange(len(roots), len(state)))
     if len(born):

@@ -1,8 +1,8 @@
-"""Chunks: compact files in the folder of a history that hold older frames, one after the other. Numpy, zstandard.
+"""Chunks: compact files in a history's folder, each with a run of older frames. Needs numpy and zstandard.
 
-``states_<index>.s4d`` begins with the frame of that index. A frame is in a chunk when its state's record is whole; the
-note before it is the frame's report. Where a frame has a file of its own, too, that holds. What is exact of a chunk's
-frames stays elsewhere: ids and opacities with the first frame and the births, who is retired in the log of later ones.
+``states_<index>.s4d`` starts with the frame of that index. A frame is in a chunk once the record of its state is
+complete; the note before it contains the frame's report. If a frame also has its own file, that file takes precedence.
+Exact data is stored elsewhere: ids and opacities with the first frame and the births, retirements in later logs.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from scas4d_core.storage.frame_arrays import EVENTS, Arrays, Stamp
 from scas4d_core.storage.npz import open_atomically
 
 REPORT = "report"
-"""Name of the report in a frame's note."""
+"""Key of the report in a frame's note."""
 READERS = 2
-"""Chunks that stay open in a process, each with a state: tracks read through one, views jump."""
+"""Number of chunks that stay open per process, each with a cached state: tracks read sequentially, views jump."""
 _CHUNK_FILE = re.compile(r"states_(\d{6,})\.s4d")
 
 
@@ -39,10 +39,14 @@ class Chunk:
     """A compact file of a history.
 
     Attributes:
-        path: of it. size, changed: bytes, and time of change in ns, when it was looked at.
-        times: seconds of its frames by index. stamps: of its frames: bytes of the file that they take, and −1 less
-            the checksum of the state, which no file of a frame of its own has.
-        damage: why frames after those are not listed; None where nothing is wrong. foreign: it is of another format.
+        path: path of the file.
+        size, changed: size in bytes and modification time in ns when the file was last checked.
+        times: times of its frames in seconds, by index.
+        stamps: stamps of its frames: their bytes in the file, and −1 minus the checksum of the state. The negative
+            value
+            distinguishes them from stamps of frame files.
+        damage: description of damage after which no frames are listed, or None.
+        foreign: whether the file has another format.
     """
 
     path: Path
@@ -55,7 +59,7 @@ class Chunk:
 
     @property
     def first(self) -> int:
-        """Its first frame, as in its name."""
+        """Index of the first frame, from the file name."""
         return chunk_of(self.path.name) or 0
 
 
@@ -63,7 +67,7 @@ class Chunks:
     """Reads the chunks in a folder.
 
     Args:
-        directory: of the history.
+        directory: folder of the history.
 
     Attributes:
         known: chunks by the index of their first frame, as of the last ``refresh``.
@@ -77,7 +81,7 @@ class Chunks:
         weakref.finalize(self, _close_all, self._readers)
 
     def refresh(self) -> None:
-        """Picks up chunks that are new, grew or are gone; others stay unopened."""
+        """Updates the list of chunks; only new or changed chunks are opened."""
         firsts = sorted(first for name in os.listdir(self.directory) if (first := chunk_of(name)) is not None)
         known = {first: chunk for first in firsts if (chunk := self._load_chunk(first)) is not None}
         for first in self.known.keys() - known.keys():
@@ -85,7 +89,7 @@ class Chunks:
         self.known, self._firsts = known, list(known)
 
     def refresh_chunk(self, first: int) -> None:
-        """Picks up the chunk that begins with a frame, which is new or grew."""
+        """Updates the chunk that starts with a frame, after it was created or extended."""
         if (chunk := self._load_chunk(first)) is not None:
             self.known[first] = chunk
             if first not in self._firsts:
@@ -95,7 +99,7 @@ class Chunks:
         path = self.directory / chunk_file(first)
         try:
             status = path.stat()
-        except FileNotFoundError:  # deleted meanwhile
+        except FileNotFoundError:  # deleted in the meantime
             return None
         known = self.known.get(first)
         if known is not None and (known.size, known.changed) == (status.st_size, status.st_mtime_ns):
@@ -109,42 +113,43 @@ class Chunks:
         return (index for first in self._firsts for index in self.known[first].times)
 
     def of(self, index: int) -> Chunk | None:
-        """The chunk that holds a frame, as of the last look; None where there is none."""
+        """Returns the chunk that contains a frame, as of the last refresh, or None."""
         place = bisect_right(self._firsts, index) - 1
         chunk = self.known[self._firsts[place]] if place >= 0 else None
         return chunk if chunk is not None and index in chunk.times else None
 
     def stamp(self, index: int) -> Stamp | None:
-        """The stamp of a frame; None where no chunk has it."""
+        """Returns the stamp of a frame, or None if no chunk contains it."""
         return None if (chunk := self.of(index)) is None else chunk.stamps[index]
 
     def time(self, index: int) -> float | None:
-        """Seconds of a frame; None where no chunk has it."""
+        """Returns the time of a frame in seconds, or None if no chunk contains it."""
         return None if (chunk := self.of(index)) is None else chunk.times[index]
 
     def stamps(self) -> dict[int, Stamp]:
-        """The stamps of all frames, rising."""
+        """Returns the stamps of all frames, in increasing order."""
         return {index: stamp for first in self._firsts for index, stamp in self.known[first].stamps.items()}
 
     @property
     def damaged(self) -> list[str]:
-        """A sentence for each chunk that is damaged so that frames of it are not listed."""
+        """One sentence per chunk with frames that cannot be listed because of damage."""
         return [chunk.damage for chunk in self.known.values() if chunk.damage is not None]
 
     @property
     def foreign(self) -> list[str]:
-        """A sentence for each chunk of another format."""
+        """One sentence per chunk of another format."""
         return [str(chunk.damage) for chunk in self.known.values() if chunk.foreign]
 
     def read(self, index: int, names: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
-        """Arrays of a frame, as its own file would have them; ``report`` is its note.
+        """Reads arrays of a frame as if from its own file; ``report`` is read from its note.
 
         Raises:
-            FileNotFoundError: no chunk has it. FileError: it cannot be read.
+            FileNotFoundError: no chunk contains the frame.
+            FileError: the frame cannot be read.
         """
         try:
             return self._read(index, names, optional)
-        except FileNotFoundError:  # new since the last look, or deleted
+        except FileNotFoundError:  # the frame is new, or was deleted
             self.refresh()
             return self._read(index, names, optional)
 
@@ -175,10 +180,11 @@ class Chunks:
         return arrays
 
     def reader(self, index: int) -> CompactReader:
-        """An open reader of the chunk that holds a frame; it is this object's own.
+        """Returns an open reader of the chunk that contains a frame; it is owned by this object.
 
         Raises:
-            FileNotFoundError: no chunk has it. FileError: it cannot be opened.
+            FileNotFoundError: no chunk contains the frame.
+            FileError: the chunk cannot be opened.
         """
         if (chunk := self.of(index)) is None:
             raise FileNotFoundError(f"frame {index} is in no chunk")
@@ -199,7 +205,7 @@ class Chunks:
             known[1].close()
 
     def fault(self, index: int) -> str | None:
-        """Reads all that a frame in a chunk needs, from the disk; returns its fault, None where it is whole."""
+        """Reads everything that a frame in a chunk needs from disk; returns the problem, or None if it is intact."""
         if (chunk := self.of(index)) is None:
             return f"frame {index} is gone"
         self._close(chunk.path)
@@ -210,11 +216,11 @@ class Chunks:
         return None
 
     def remove(self, first: int) -> None:
-        """Deletes the chunk that begins with a frame."""
+        """Deletes the chunk that starts with a frame."""
         (self.directory / chunk_file(first)).unlink(missing_ok=True)
 
     def truncate(self, index: int) -> None:
-        """Takes a frame, and those after it, out of the chunk that holds it, which has no index then."""
+        """Removes a frame and all later ones from the chunk that contains it; the chunk then has no index."""
         if (chunk := self.of(index)) is None:
             return
         self._close(chunk.path)
@@ -224,7 +230,7 @@ class Chunks:
             with CompactReader(chunk.path) as reader:
                 end = reader.end_before(index)
             beside = chunk.path.with_name(f".{chunk.path.name}.part")
-            # A new file in its place: the old one may have other links (server/storage/fencing.py).
+            # Replace the file instead of truncating it, since it may have hard links (server/storage/fencing.py).
             with chunk.path.open("rb") as old, open_atomically(chunk.path, beside) as file:
                 file.write(old.read(end))
         self.refresh()
@@ -236,24 +242,27 @@ def _close_all(readers: OrderedDict[Path, tuple[Chunk, CompactReader]]) -> None:
 
 
 def make_note(report: Mapping[str, Any], log: Int, before: int) -> dict[str, Any]:
-    """The note on a frame: its report, and the events of its log.
+    """Returns the note on a frame: its report, and its events.
 
     Args:
-        log: [E, 4] up to it. before: the frame before it in its chunk; −1 for the first, which has all of the log, so
-            that no other chunk is needed for it.
+        report: the frame's report.
+        log: [E, 4] event log up to the frame.
+        before: previous frame in the chunk, or −1. The first frame's note contains the whole log, so that no other
+            chunk is
+            needed to read it.
     """
     own = log[log[:, 0] > before]
     return {REPORT: dict(report), **({EVENTS: own.tolist()} if len(own) else {})}
 
 
 def _log(reader: CompactReader, index: int) -> Int:
-    """The log up to a frame."""
+    """Returns the event log up to a frame."""
     rows = [row for frame in reader.frames if frame <= index for row in reader.note(frame).get(EVENTS, ())]
     return np.array(rows, np.int64).reshape(-1, 4)
 
 
 def chunk_file(first: int) -> str:
-    """Name of the chunk that begins with a frame.
+    """Returns the name of the chunk that starts with a frame.
 
     >>> chunk_of(chunk_file(121))
     121
@@ -262,13 +271,13 @@ def chunk_file(first: int) -> str:
 
 
 def chunk_of(name: str) -> int | None:
-    """Index of the first frame in a chunk of this name; None for other files."""
+    """Returns the index of the first frame for the name of a chunk; None for other files."""
     match = _CHUNK_FILE.fullmatch(name)
     return int(match[1]) if match else None
 
 
 def _listed(path: Path, status: os.stat_result) -> Chunk:
-    """Looks at a chunk; one that cannot be opened has no frames."""
+    """Lists the frames of a chunk; a chunk that cannot be opened has none."""
     size, changed = status.st_size, status.st_mtime_ns
     try:
         with CompactReader(path) as reader:
@@ -283,7 +292,7 @@ def _listed(path: Path, status: os.stat_result) -> Chunk:
 
 @contextmanager
 def _disk_errors(path: Path) -> Iterator[None]:
-    """Takes what the disk cannot read for damage."""
+    """Converts disk read errors to ``FileError``, as for damage."""
     try:
         yield
     except FileNotFoundError:

@@ -1,8 +1,8 @@
-"""Compaction: older states go from files of their own to chunks, frame by frame. Numpy, zstandard.
+"""Compaction: moves older states from their own files to chunks, frame by frame. Needs numpy and zstandard.
 
-The first frame and the newest stay exact: updates, replays and a restart need their bits. A frame is appended to a
-chunk and synced, with its report as the note, and then its own file goes: whatever ends the process meanwhile, each
-frame is read, and what a chunk holds is the same bytes. A past view changes once at most.
+The first and the newest frames stay exact, because updates, replays and restarts need their bits. A frame is appended
+to a chunk with its report as the note, the chunk is synced, and then the frame's own file is deleted. Therefore every
+frame stays readable whenever the process ends. A past view changes at most once.
 """
 
 from __future__ import annotations
@@ -20,20 +20,21 @@ from scas4d_core.storage.history import NEWEST_KEPT, History
 from scas4d_core.storage.npz import sync_folder
 
 CHUNK_FRAMES = 120
-"""Frames of a chunk: its first state takes as much as five to ten of the others, and retention deletes it whole."""
+"""Frames per chunk. Its first state is as large as five to ten others, and retention deletes a chunk as a whole."""
 
 NOT_ENCODED = (ValueError, ArithmeticError, MemoryError)
-"""Errors of states that cannot be read or encoded: those of histories and of compact files are ValueErrors."""
+"""Exceptions for states that cannot be read or encoded; errors of histories and compact files are ValueErrors."""
 
 log = logging.getLogger("scas4d.storage")
 
 
 class Compaction:
-    """Moves the oldest exact states of a history to chunks. For the process that appends to it.
+    """Moves the oldest exact states of a history to chunks, in the process that appends to it.
 
     Args:
-        history: in a directory. head: returns what holds for all states, bounds included; asked when a chunk begins.
-        exact: the newest states that stay as they are, ``NEWEST_KEPT`` at least.
+        history: history in a directory.
+        head: returns the file header with the error bounds; called when a chunk is created or resumed.
+        exact: number of newest states that stay exact, at least ``NEWEST_KEPT``.
 
     >>> from tempfile import TemporaryDirectory
     >>> import numpy as np
@@ -57,35 +58,35 @@ class Compaction:
         self._history, self._files, self._head = history, history.files, head
         self._writer: CompactWriter | None = None
         self._first = -1
-        """First frame of the chunk that is written."""
+        """First frame of the chunk being written."""
         self._passed = max(history.files.chunks, default=-1)
-        """The last frame that is in a chunk, or that cannot be."""
+        """Last frame that is in a chunk or could not be moved."""
         self._queue: deque[int] = deque()
-        """Frames to move, the oldest first."""
+        """Frames to move, oldest first."""
         self._complete()
 
     @property
     def due(self) -> int:
-        """Number of states to be moved, as far as is known: at least one where any is."""
+        """Lower bound on the number of states to move; at least one if any is due."""
         if not self._queue:
             self._queue.extend(self._history.older_than_newest(self.exact, self._passed))
         return len(self._queue)
 
     def step(self) -> int | None:
-        """Moves one state; returns its frame, or None where none is due.
+        """Moves one state; returns its frame, or None if none is due.
 
         Raises:
-            OSError: the disk is full, or fails; nothing is lost, and the next step tries again.
+            OSError: the disk is full or failing. Nothing is lost, and the next step retries.
         """
         while self.due:
             index = self._queue[0]
             try:
-                if index in self._history:  # retention may have deleted it
+                if index in self._history:  # otherwise, retention has deleted it
                     self._move(index)
             except OSError:
                 self._release_writer()
                 raise
-            except NOT_ENCODED as error:  # damaged, or it cannot be encoded: it stays as it is
+            except NOT_ENCODED as error:  # a damaged or unencodable state keeps its file
                 log.warning("frame %d is not compacted: %s", index, error)
                 self._release_writer()
             else:
@@ -95,11 +96,11 @@ class Compaction:
         return None
 
     def close(self) -> None:
-        """Leaves the chunk that is being written as it is; another ``Compaction`` goes on with it."""
+        """Closes the current chunk without completing it; another ``Compaction`` can resume it."""
         self._release_writer()
 
     def _complete(self) -> None:
-        """Deletes files of frames that are in a chunk, whole and on disk: a stop left them beside it."""
+        """Deletes files of frames that are also intact in a chunk on disk, which an interruption left behind."""
         first = next(iter(self._history.indices), -1)
         names = map(frame_of, os.listdir(self._files.directory))
         own = [index for index in names if index is not None and index != first and index in self._files.chunks]
@@ -112,7 +113,7 @@ class Compaction:
 
     def _move(self, index: int) -> None:
         history, files = self._history, self._files
-        if self._writer is not None and self._first not in files.chunks.known:  # retention has deleted it
+        if self._writer is not None and self._first not in files.chunks.known:  # deleted by retention
             self._release_writer()
         state, time = history.gaussians(index), history.time(index)
         report, log = history.report(index), history.log_at(index)
@@ -121,7 +122,7 @@ class Compaction:
             self._finish(writer)
             writer = self._begin_chunk(index)
         self._writer = writer
-        if writer.last_frame < index:  # else the disk did not confirm it the last time
+        if writer.last_frame < index:  # otherwise, only the last sync failed
             try:
                 writer.add(index, time, state, note=make_note(report, log, writer.last_frame))
             except FileError:
@@ -129,7 +130,7 @@ class Compaction:
                     self._release_writer()
                     writer.path.unlink(missing_ok=True)
                     raise
-                self._finish(writer)  # other Gaussians than before: a chunk of its own may hold it
+                self._finish(writer)  # the Gaussians changed, so a new chunk may fit
                 writer = self._writer = self._begin_chunk(index)
                 writer.add(index, time, state, note=make_note(report, log, -1))
         writer.sync()
@@ -143,7 +144,7 @@ class Compaction:
         return writer.last_frame == index or (writer.frames < CHUNK_FRAMES and writer.last_frame < index)
 
     def _resume_chunk(self) -> CompactWriter | None:
-        """The newest chunk, to go on with, where it has not ended and was begun with the same bounds."""
+        """Returns a writer that resumes the newest chunk, or None if it is complete or has another header."""
         known = self._files.chunks.known
         if not known:
             return None
@@ -160,13 +161,13 @@ class Compaction:
     def _begin_chunk(self, index: int) -> CompactWriter:
         self._first = index
         path: Path = self._files.directory / chunk_file(index)
-        path.unlink(missing_ok=True)  # one without a whole state: a stop came between its beginning and its end
+        path.unlink(missing_ok=True)  # an interruption left a chunk without a complete state
         writer = CompactWriter(path, self._head())
         sync_folder(path.parent)
         return writer
 
     def _finish(self, writer: CompactWriter | None) -> None:
-        """Ends a chunk with its index."""
+        """Completes a chunk with its index."""
         if writer is not None:
             writer.close()
             _confirm(writer.path)
@@ -174,14 +175,14 @@ class Compaction:
         self._writer = None
 
     def _release_writer(self) -> None:
-        """Lets go of the chunk that is being written; a half-written record is cut off when it is gone on with."""
+        """Closes the current chunk; resuming it truncates an incomplete record."""
         if self._writer is not None:
             self._writer.abandon()
         self._writer = None
 
 
 def _confirm(path: Path) -> None:
-    """Has the disk confirm a file, and that it is in its folder."""
+    """Syncs a file and its folder entry to disk."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
     sync_folder(path.parent)

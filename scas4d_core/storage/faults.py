@@ -1,29 +1,31 @@
-"""Errors of a history: what cannot be extended or read, what is damaged, and what is of another format."""
+"""Errors of a history: frames that cannot be appended or read, damaged files, and unsupported formats."""
 
 from __future__ import annotations
 
 
 class HistoryError(ValueError):
-    """A history that cannot be extended or read; the message names the frame or file, the fault and the remedy."""
+    """Raised if a history cannot be extended or read; the message names the frame or file, problem and remedy."""
 
 
 class OtherFormatError(HistoryError):
-    """Files of another format than this scas4d reads; they stay as they are."""
+    """Raised for files of an unsupported format; they are left unchanged."""
 
 
 class UnreadableFrameError(HistoryError):
-    """A frame that is not in the history, or whose file is damaged."""
+    """Raised if a frame is not in the history, or its file is damaged."""
 
 
 class DamagedFrameError(UnreadableFrameError):
-    """A frame whose file is damaged, in contrast to one that was deleted."""
+    """Raised if a frame's file is damaged, as opposed to deleted."""
 
 
 def other_format(what: str, written: int | None, read: int) -> OtherFormatError:
-    """The refusal of files of another format.
+    """Returns the error for files of an unsupported format.
 
     Args:
-        what: is of that format. written: it, None where the files name none. read: the format that is read.
+        what: description of the files.
+        written: their format, or None if they name none.
+        read: the supported format.
 
     >>> str(other_format("states, a folder,", 3, 1))[:54]
     'states, a folder, has format 3; this scas4d reads form'

@@ -1,4 +1,4 @@
-"""The arrays of a committed frame's file: its state, what effects left of it, its log, time and report. Numpy only."""
+"""The arrays of a committed frame's file: state, effects data, event log, time and report. Needs only numpy."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from scas4d_core.storage.npz import member
 
 Arrays = dict[str, NDArray[Any]]
 Stamp = tuple[int, int]
-"""Bytes and time of change of a file, in ns: they reveal a rewritten file. Of frames in chunks: ``Chunk``."""
+"""Size and modification time (ns) of a file, which reveal a rewritten file. For frames in chunks, see ``Chunk``."""
 EVENTS = "events"
-"""Array of a frame's file: the log of births, retirements and revivals up to it; only where there are any."""
+"""Name of the array with the log of births, retirements and revivals up to the frame; absent if there are none."""
 EFFECTS = "effects"
-"""Array of a frame's file: what effects left of it for a cold start, the bytes of an npz; only where there is any."""
+"""Name of the array with the effects' data for a cold start, the bytes of an npz; absent if there is none."""
 EffectArrays = Mapping[str, Mapping[str, NDArray[Any]]]
-"""Arrays of effects, by effect and name."""
+"""Arrays of effects, by effect and array name."""
 
 
 def pack_effects(effects: EffectArrays) -> NDArray[np.uint8] | None:
-    """Arrays of effects as one array of bytes; None of none.
+    """Packs the arrays of effects into one array of bytes, or returns None if there are none.
 
     >>> unpack_effects(pack_effects({"shadows": {"c.0": np.arange(3)}}))
     {'shadows': {'c.0': array([0, 1, 2])}}
@@ -38,7 +38,7 @@ def pack_effects(effects: EffectArrays) -> NDArray[np.uint8] | None:
 
 
 def unpack_effects(given: NDArray[np.uint8] | None) -> dict[str, Arrays]:
-    """The arrays of effects, by effect and name, that ``pack_effects`` packed."""
+    """Inverts ``pack_effects``; returns the arrays by effect and name."""
     effects: dict[str, Arrays] = {}
     if given is not None:
         with np.load(BytesIO(given.tobytes()), allow_pickle=False) as file:
@@ -51,10 +51,14 @@ def unpack_effects(given: NDArray[np.uint8] | None) -> dict[str, Arrays]:
 def frame_file_arrays(
     frame: Mapping[str, NDArray[Any]], time: float, report: bytes, log: Int, left: NDArray[np.uint8] | None
 ) -> dict[str, Any]:
-    """The arrays of a frame's file.
+    """Returns the arrays of a frame's file.
 
     Args:
-        log: up to it. left: what effects left of it, packed.
+        frame: arrays of the state.
+        time: time in seconds.
+        report: encoded report.
+        log: event log up to the frame.
+        left: packed arrays of effects, or None.
     """
     if len(log):
         frame = {**frame, EVENTS: log}

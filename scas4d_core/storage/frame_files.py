@@ -1,11 +1,13 @@
-"""The folder of a history: names of its files, and reading, writing and mending them. Numpy only.
+"""The folder of a history: names of its files, and reading, writing and repairing them. Needs only numpy.
 
-``fixed.npz``, written once, holds what all frames share; ``frame_<index>.npz`` a committed frame. Every file is written
-beside its place, synced and renamed: a file with its final name is whole, and the listing of the directory is the only
-index. ``fixed.npz`` and the first frame, which everything needs, have a copy: a reader that finds the original damaged
-or gone reads the copy. So has ``born_<index>.npz``, the Gaussians born in a frame, which all later frames need; it is
-written before that frame, and stays when the frame is deleted or taken back. Older frames may be in chunks
-(``chunks``); a file of a frame's own goes before its chunk.
+``fixed.npz``, written once, contains the data that all frames share; ``frame_<index>.npz`` contains a committed frame.
+Every file is written under a temporary name, synced and renamed. A file with its final name is therefore complete, and
+the directory listing is the only index. ``fixed.npz`` and the first frame, which everything needs, have copies that are
+read if the original is damaged or missing.
+
+``born_<index>.npz``, the Gaussians born in a frame, has a copy too, because all later frames need it. It is written
+before its frame, and is kept when the frame is deleted or truncated. Older frames may be in chunks (``chunks``); a
+frame's own file takes precedence over its chunk.
 """
 
 from __future__ import annotations
@@ -25,10 +27,10 @@ from scas4d_core.storage.frame_arrays import Arrays, Stamp
 from scas4d_core.storage.npz import read_npz, sync_folder, verify, write_npz
 
 FORMAT = 1
-"""Format of a folder of states and its checkpoints, in ``fixed.npz``; a folder of another format is refused."""
+"""Format of a folder of states and its checkpoints, stored in ``fixed.npz``; folders of other formats are rejected."""
 _FORMAT = "format"
 INDEX = "index"
-"""Array in the copy of the first frame: its index."""
+"""Name of the array, in the copy of the first frame, that contains its index."""
 
 FIXED_FILE, FIXED_COPY, FIRST_COPY = "fixed.npz", "fixed.copy.npz", "first.copy.npz"
 _CHECKPOINT_FILE = re.compile(r"checkpoint_(\d{6,})\.npz")
@@ -40,9 +42,10 @@ class FrameFiles:
     """Reads and writes the files of a history in one directory.
 
     Attributes:
-        chunks: the compact files that hold older frames.
-        faults: files that could not be read, by name with the reason; emptied when they are reported. A frame in a
-            chunk is named as if it had a file of its own.
+        chunks: compact files that contain older frames.
+        faults: files that could not be read, by name with the reason; cleared when reported. A frame in a chunk is
+            listed
+            under the name that its own file would have.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -56,15 +59,15 @@ class FrameFiles:
 
     @property
     def exists(self) -> bool:
-        """True where the directory holds a history, perhaps one that lost a file."""
+        """Whether the directory contains a history, possibly with missing files."""
         return self.fixed.exists() or self.fixed_copy.exists()
 
     def path(self, index: int) -> Path:
-        """Path of the file of a frame."""
+        """Returns the path of a frame's file."""
         return self.directory / frame_file(index)
 
     def list_stamps(self) -> dict[int, Stamp]:
-        """Stamps of the frames in the directory, rising; the first one is listed also where only its copy exists."""
+        """Returns the stamps of all frames in increasing order, including the first frame if only its copy exists."""
         stamps: dict[int, Stamp] = {}
         with os.scandir(self.directory) as entries:
             for entry in entries:
@@ -72,9 +75,9 @@ class FrameFiles:
                     continue
                 try:
                     stamps[index] = _stamp(entry.stat())
-                except FileNotFoundError:  # deleted, or compacted, meanwhile
+                except FileNotFoundError:  # deleted or compacted in the meantime
                     continue
-        self.chunks.refresh()  # after the files: a frame goes to a chunk before its own file goes
+        self.chunks.refresh()  # after listing files, since a frame is in a chunk before its file is deleted
         stamps = self.chunks.stamps() | stamps
         first = self._first()
         if stamps and first is not None and first[1] < min(stamps):
@@ -82,7 +85,7 @@ class FrameFiles:
         return dict(sorted(stamps.items()))
 
     def stamps_of(self, indices: Iterable[int]) -> dict[int, Stamp]:
-        """Stamps of the given frames that exist, without listing the directory."""
+        """Returns the stamps of those given frames that exist, without listing the directory."""
         stamps: dict[int, Stamp] = {}
         absent: list[int] = []
         for index in sorted(indices):
@@ -100,7 +103,7 @@ class FrameFiles:
         return dict(sorted(stamps.items()))
 
     def _first(self) -> tuple[Stamp, int] | None:
-        """Stamp and frame of the copy of the first frame, if there is one that can be read."""
+        """Returns stamp and frame index of the first frame's copy, or None if it cannot be read."""
         try:
             stamp = _stamp(self.first_copy.stat())
             if self._copied is None or self._copied[0] != stamp:
@@ -116,32 +119,37 @@ class FrameFiles:
         return _stamp(file.stat())
 
     def write_fixed(self, arrays: Arrays, index: int, first: Mapping[str, Any]) -> None:
-        """Writes the arrays that all frames share, and both copies; before the first frame, ``index``, is committed."""
+        """Writes the arrays that all frames share, and both copies, before the first frame ``index`` is committed."""
         write_npz(self.fixed, with_format(arrays))
         write_npz(self.fixed_copy, with_format(arrays))
         write_npz(self.first_copy, {**first, INDEX: np.int64(index)})
 
     def time(self, index: int, stamp: Stamp | None = None) -> float:
-        """Time of a frame, seconds.
+        """Returns the time of a frame in seconds.
 
         Args:
-            stamp: of the frame, where it is known: the times of a chunk's frames need no reading.
+            index: the frame.
+            stamp: stamp of the frame, if known; it avoids reading the file if the frame is in a chunk.
 
         Raises:
-            FileNotFoundError: it is not there. UnreadableFrameError: it is damaged.
+            FileNotFoundError: the frame does not exist.
+            UnreadableFrameError: its file is damaged.
         """
         if stamp is not None and stamp[1] < 0 and (known := self.chunks.time(index)) is not None:
             return known
         return float(self.read(index, ("time",))["time"])
 
     def read(self, index: int, names: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
-        """Named arrays of a frame; of the first frame from its copy, where only that can be read, or from its chunk.
+        """Reads the named arrays of a frame from its file, else from its chunk or, for the first frame, from the copy.
 
         Args:
-            optional: arrays that are read as well where there are any.
+            index: the frame.
+            names: names of the arrays.
+            optional: further arrays to read if present.
 
         Raises:
-            FileNotFoundError: it is not there. UnreadableFrameError: it is damaged.
+            FileNotFoundError: the frame does not exist.
+            UnreadableFrameError: its file is damaged.
         """
         try:
             return _read(self.path(index), names, optional)
@@ -151,7 +159,7 @@ class FrameFiles:
                 if isinstance(error, FileNotFoundError):
                     return self._from_chunk(index, names, optional)
                 self.faults[self.path(index).name] = str(error)
-                if index in self.chunks:  # it was made again, or not deleted: the other is better than none
+                if index in self.chunks:  # the file was rewritten or not yet deleted; fall back to the chunk
                     return self.chunks.read(index, names, optional)
                 raise
             arrays = _read(self.first_copy, names, optional)
@@ -166,48 +174,48 @@ class FrameFiles:
             raise UnreadableFrameError(str(error)) from error
 
     def fault(self, index: int) -> str | None:
-        """Reads all that there is of a frame; returns its fault, None where it is whole."""
+        """Verifies everything stored for a frame; returns the problem, or None if it is intact."""
         if not self.path(index).exists() and index in self.chunks:
             return self.chunks.fault(index)
         return fault_of(self.path(index))
 
     def require_format(self) -> None:
-        """Looks at the format of the folder, where a file that names it can be read.
+        """Checks the format of the folder, if a file that states it can be read.
 
         Raises:
-            OtherFormatError: it is another than ``FORMAT``.
+            OtherFormatError: the format is not ``FORMAT``.
         """
         try:
             known = self._either(self.fixed, self.fixed_copy, (), (_FORMAT,))
-        except UnreadableFrameError:  # reading the states says so
+        except UnreadableFrameError:  # reported later, when the states are read
             return
         written = int(known[_FORMAT]) if _FORMAT in known else None
         if written != FORMAT:
             raise other_format(f"{self.directory.name}, a folder of states,", written, FORMAT)
 
     def read_fixed(self, names: Sequence[str]) -> Arrays:
-        """Named arrays of those that all frames share.
+        """Reads named arrays that all frames share.
 
         Raises:
-            UnreadableFrameError: it is damaged or gone, and its copy too.
+            UnreadableFrameError: the file and its copy are damaged or missing.
         """
         return self._either(self.fixed, self.fixed_copy, names)
 
     def write_born(self, index: int, arrays: Mapping[str, Any]) -> None:
-        """Writes what is known of the Gaussians born in a frame, and the copy; before the frame is committed."""
+        """Writes the arrays of Gaussians born in a frame, and a copy, before the frame is committed."""
         write_npz(self.directory / born_file(index), arrays)
         write_npz(self.directory / born_file(index, copy=True), arrays)
 
     def read_born(self, index: int, names: Sequence[str] | None = None) -> Arrays:
-        """Arrays of the Gaussians born in a frame, all or the named.
+        """Reads the arrays of Gaussians born in a frame, all or the named ones.
 
         Raises:
-            UnreadableFrameError: it is damaged or gone, and its copy too.
+            UnreadableFrameError: the file and its copy are damaged or missing.
         """
         return self._either(self.directory / born_file(index), self.directory / born_file(index, copy=True), names)
 
     def births(self) -> list[int]:
-        """Frames with a file of the born, committed or not, rising."""
+        """Returns the frames that have a birth file, committed or not, in increasing order."""
         return sorted({index for name in os.listdir(self.directory) if (index := born_of(name)) is not None})
 
     def _either(self, path: Path, copy: Path, names: Sequence[str] | None, optional: Sequence[str] = ()) -> Arrays:
@@ -222,14 +230,16 @@ class FrameFiles:
                 raise UnreadableFrameError(reason) from error
 
     def repair_copies(self, first: int, fixed: Arrays, born: Mapping[int, Arrays]) -> dict[str, str]:
-        """Writes ``fixed.npz``, the born, the first frame and their copies anew where they are damaged or gone.
+        """Rewrites ``fixed.npz``, birth files, the first frame and their copies if they are damaged or missing.
 
         Args:
-            first: index of the first committed frame. fixed: the arrays that all frames share, as they were read.
-            born: those of the births, by frame.
+            first: index of the first committed frame.
+            fixed: the arrays that all frames share, as read.
+            born: arrays of the births, by frame.
 
         Returns:
-            The fault of each file that was written, by name. A file without a whole copy is left.
+            The problem of each rewritten file, by name. If a file and its copy are both damaged, they are left
+            unchanged.
         """
         mended: dict[str, str] = {}
         needed = dict.fromkeys((self.fixed, self.fixed_copy), with_format(fixed))
@@ -252,12 +262,12 @@ class FrameFiles:
         return mended
 
     def remove(self, index: int) -> None:
-        """Deletes a frame, if it is there; out of a chunk, with those after it."""
+        """Deletes a frame if it exists; if it is in a chunk, all later frames of the chunk are deleted too."""
         self.path(index).unlink(missing_ok=True)
         self.chunks.truncate(index)
 
     def is_compacted(self, index: int) -> bool:
-        """True for a frame that is in a chunk, and has no file of its own."""
+        """Returns whether a frame is in a chunk and has no file of its own."""
         if self.path(index).exists():
             return False
         if index not in self.chunks:
@@ -265,15 +275,16 @@ class FrameFiles:
         return index in self.chunks
 
     def chunk_of(self, index: int) -> list[int]:
-        """The frames of the chunk that a frame is in, the frame alone where it is in none."""
+        """Returns all frames of the chunk that contains a frame, or just the frame if no chunk does."""
         chunk = self.chunks.of(index)
         return [index] if chunk is None else list(chunk.times)
 
     def remove_oldest(self, deleted: Collection[int], left: Container[int]) -> None:
-        """Deletes frames, and chunks that hold none of those that are left.
+        """Deletes frames, and chunks that contain no remaining frame.
 
         Args:
-            left: the frames of the history without the deleted.
+            deleted: frames to delete.
+            left: the remaining frames of the history.
         """
         firsts: set[int] = set()
         for index in deleted:
@@ -286,50 +297,50 @@ class FrameFiles:
             self.chunks.refresh()
 
     def sync(self) -> None:
-        """Syncs the directory: deleted files stay deleted after a power cut."""
+        """Syncs the directory so that deletions survive a power failure."""
         sync_folder(self.directory)
 
 
 def with_format(fixed: Arrays) -> Arrays:
-    """The arrays of ``fixed.npz``: those that all frames share, and the format of the folder."""
+    """Returns the arrays of ``fixed.npz``: those that all frames share, and the format of the folder."""
     return {**fixed, _FORMAT: np.asarray(FORMAT, np.int64)}
 
 
 def frame_file(index: int) -> str:
-    """Name of the file of a frame."""
+    """Returns the name of a frame's file."""
     return f"frame_{index:06d}.npz"
 
 
 def frame_of(name: str) -> int | None:
-    """Index of the frame in a file of this name; None for other files."""
+    """Returns the frame index for a frame's file name; None for other files."""
     match = _FRAME_FILE.fullmatch(name)
     return int(match[1]) if match else None
 
 
 def born_file(index: int, copy: bool = False) -> str:
-    """Name of the file of the Gaussians born in a frame, or of its copy."""
+    """Returns the name of the birth file of a frame, or of its copy."""
     return f"born_{index:06d}{'.copy' if copy else ''}.npz"
 
 
 def born_of(name: str) -> int | None:
-    """Index of the frame whose born are in a file of this name, or in its copy; None for other files."""
+    """Returns the frame index for the name of a birth file or its copy; None for other files."""
     match = _BORN_FILE.fullmatch(name)
     return int(match[1]) if match else None
 
 
 def checkpoint_file(index: int) -> str:
-    """Name of the file of a frame's checkpoint."""
+    """Returns the name of a frame's checkpoint file."""
     return f"checkpoint_{index:06d}.npz"
 
 
 def checkpoint_of(name: str) -> int | None:
-    """Index of the frame whose checkpoint has this name; None for other files."""
+    """Returns the frame index for the name of a checkpoint file; None for other files."""
     match = _CHECKPOINT_FILE.fullmatch(name)
     return int(match[1]) if match else None
 
 
 def fault_of(file: Path) -> str | None:
-    """Reads all of a file; returns its fault, None where it is whole."""
+    """Verifies a whole file; returns the problem, or None if it is intact."""
     try:
         verify(file)
     except (FileNotFoundError, ValueError) as error:

@@ -1,4 +1,4 @@
-"""Reads which frames of a scene are committed, when, with which report, and after which births. Numpy only."""
+"""Reads the committed frames of a scene with their times, reports and event logs. Needs only numpy."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from scas4d_core.storage.frame_arrays import EFFECTS, EVENTS, Arrays, Stamp, unp
 from scas4d_core.storage.frame_files import FrameFiles, frame_file
 
 FRAMES_KEPT = 4
-"""Frames of a history on disk that stay in memory: the newest, and the last ones read."""
+"""Number of frames of an on-disk history that are cached in memory: the newest, and the last ones read."""
 
 
 class FramesReader:
-    """The committed frames, in the memory of this process or in a directory that another process writes.
+    """The committed frames, in this process's memory or in a directory that another process writes.
 
     Attributes:
-        damaged: frames whose file cannot be read, with the reason; they are not among ``indices``.
+        damaged: frames whose file cannot be read, with the reason; they are not in ``indices``.
     """
 
     def __init__(self, directory: Path | None = None) -> None:
@@ -38,30 +38,30 @@ class FramesReader:
         self._times: dict[int, float] = {}
         self._stamps: dict[int, Stamp] = {}
         self._texts: dict[int, bytes] = {}
-        """Reports of the frames that are in memory."""
+        """Reports of frames in memory."""
         self._scratch_reports: dict[int, Mapping[str, NDArray[np.uint8]]] = {}
-        """Those of frames without a file that are not (``History.move_to_scratch``)."""
+        """Reports of frames moved to a scratch file (``History.move_to_scratch``)."""
         self._packed: dict[int, NDArray[np.uint8]] = {}
-        """What effects left of the frames that were written here and are in memory, packed."""
+        """Packed effects data of frames that were written by this process and are in memory."""
         self._frames: OrderedDict[int, Mapping[str, NDArray[Any]]] = OrderedDict()
         self._births: dict[int, Arrays] = {}
-        """What is known of the born, by frame; those of frames that were taken back stay."""
+        """Arrays of births, by frame, including truncated frames."""
         self._log: tuple[int, Int] = (-1, NO_EVENTS)
-        """The newest frame and its log."""
+        """Newest frame and its event log."""
         self._grown: tuple[list[tuple[int, int, int]], Arrays] = ([], {})
-        """Births, and the fixed arrays of all Gaussians after them."""
+        """Births, and fixed arrays of all Gaussians up to them."""
 
     @classmethod
     def load(cls, directory: Path | str, only: Iterable[int] | None = None) -> Self:
-        """Opens the history in a directory. A frame that cannot be read is left out and named in ``damaged``.
+        """Opens the history in a directory. Unreadable frames are listed in ``damaged`` instead of ``indices``.
 
         Args:
-            directory: of the history.
-            only: the frames that are read, where these are known; else every file of the directory is looked at.
+            directory: directory of the history.
+            only: frames to read, if known; None checks every file in the directory.
 
         Raises:
-            HistoryError: no history there, or the file that all frames need is damaged. OtherFormatError: the folder,
-                or a compact file in it, is of another format.
+            HistoryError: there is no history, or the file that all frames need is damaged.
+            OtherFormatError: the folder, or a compact file in it, has another format.
         """
         files = FrameFiles(Path(directory))
         if not files.exists:
@@ -77,13 +77,13 @@ class FramesReader:
         return history
 
     def refresh(self, only: Iterable[int] | None = None) -> tuple[list[int], list[int]]:
-        """Picks up what the process that writes this directory has committed and deleted; known frames stay unopened.
+        """Reads the changes made by the process that writes this directory, without reopening known frames.
 
         Args:
-            only: the frames that may have changed, where these are known: listing the states of a day takes a while.
+            only: frames that may have changed, if known; listing all states of a long scene is slow.
 
         Returns:
-            The indices that are new (or written anew), and those that are gone.
+            The indices that are new or rewritten, and those that were deleted.
         """
         if self._files is None:
             return [], []
@@ -100,7 +100,7 @@ class FramesReader:
         for index in changed:
             try:
                 self._times[index] = self._files.time(index, listed[index])
-            except FileNotFoundError:  # deleted since it was listed
+            except FileNotFoundError:  # deleted after it was listed
                 continue
             except ValueError as error:
                 self.damaged[index] = str(error)
@@ -115,29 +115,29 @@ class FramesReader:
         return added, gone
 
     def older_than_newest(self, newest: int, after: int) -> list[int]:
-        """The frames after one that are older than so many newest, rising, without the first of all."""
+        """Returns the frames after ``after``, in increasing order, without the first and the ``newest`` last ones."""
         first = next(iter(self._times), -1)
         frames = takewhile(lambda index: index > max(after, first), islice(reversed(self._times), newest, None))
         return list(frames)[::-1]
 
     @property
     def damaged_chunks(self) -> list[str]:
-        """A sentence for each compact file that is damaged so that frames of it are not among ``indices``."""
+        """One sentence per damaged compact file with frames missing from ``indices``."""
         return [] if self._files is None else self._files.chunks.damaged
 
     def is_compacted(self, index: int) -> bool:
-        """True for a committed frame that is in a chunk by now."""
+        """Returns whether a committed frame is stored in a chunk."""
         return index in self._times and self._files is not None and self._files.is_compacted(index)
 
     def mark_compacted(self, index: int) -> None:
-        """Notes that the state of a frame went to a chunk, from which it is read from now on."""
+        """Records that the state of a frame was moved to a chunk, from which it is read from now on."""
         if self._files is not None and index in self._times and (stamp := self._files.chunks.stamp(index)) is not None:
             self._stamps[index] = stamp
             for kept in (self._frames, self._texts, self._packed):
                 kept.pop(index, None)
 
     def pop_faults(self) -> dict[str, str]:
-        """Files found damaged or gone since the last call, by name with the reason."""
+        """Returns files found damaged or missing since the last call, by name with the reason."""
         if self._files is None:
             return {}
         faults, self._files.faults = self._files.faults, {}
@@ -145,7 +145,7 @@ class FramesReader:
 
     @property
     def directory(self) -> Path | None:
-        """Directory of the states; None in memory."""
+        """Directory of the states; None for a history in memory."""
         return None if self._files is None else self._files.directory
 
     def __len__(self) -> int:
@@ -156,26 +156,26 @@ class FramesReader:
 
     @property
     def indices(self) -> list[int]:
-        """The committed frame numbers, rising."""
+        """Indices of the committed frames, in increasing order."""
         return list(self._times)
 
     @property
     def times(self) -> NDArray[np.float64]:
-        """[T] float64 seconds, in the order of ``indices``."""
+        """[T] float64 times in seconds, in the order of ``indices``."""
         return np.array(list(self._times.values()), dtype=np.float64)
 
     @property
     def files(self) -> FrameFiles | None:
-        """The files on disk, to mend them (``scas4d_core.recompute``); None in memory."""
+        """Files on disk, for repairing them (``scas4d_core.recompute``); None for a history in memory."""
         return self._files
 
     def time(self, index: int) -> float:
-        """Seconds of one committed frame."""
+        """Returns the time of a committed frame in seconds."""
         self._require(index)
         return self._times[index]
 
     def report(self, index: int) -> dict[str, Any]:
-        """The report that was committed with the state of a frame; empty where there was none.
+        """Returns the report committed with a frame; empty if there was none.
 
         Raises:
             HistoryError: the frame was not committed, or its file is damaged.
@@ -195,61 +195,61 @@ class FramesReader:
 
     @property
     def first_report(self) -> dict[str, Any]:
-        """The report of the first frame; empty where there is none that can be read."""
+        """Report of the first frame; empty if there is none or it cannot be read."""
         with suppress(HistoryError):
             return self.report(next(iter(self._times))) if self._times else {}
         return {}
 
     @property
     def background(self) -> tuple[float, float, float]:
-        """RGB in 0…1 behind everything, which frame 0 has found; black where its report has none.
+        """Background colour, RGB in 0…1, as estimated in frame 0; black if its report has none.
 
         Raises:
-            HistoryError: its file is damaged, and the copy as well.
+            HistoryError: the file of frame 0 and its copy are damaged.
         """
         if self._background is None and self._times:
             given = self.report(next(iter(self._times))).get("background")
-            if given is None:  # its report was lost
+            if given is None:  # the report was lost
                 return 0.0, 0.0, 0.0
             red, green, blue = given
             self._background = (red, green, blue)
         return self._background or (0.0, 0.0, 0.0)
 
     def effects(self, index: int) -> dict[str, Arrays]:
-        """What effects left of a committed frame for a cold start, by effect; nothing where it cannot be read."""
+        """Returns the effects' data of a committed frame for a cold start, by effect; empty if it cannot be read."""
         return unpack_effects(self._left(index))
 
     def _left(self, index: int) -> NDArray[np.uint8] | None:
-        """The same, packed; None: nothing."""
+        """Returns the effects' data in packed form; None if there is none."""
         self._require(index)
         left = self._packed.get(index)
         if left is None and self._files is not None:
-            with suppress(FileNotFoundError, UnreadableFrameError):  # the state may be whole all the same
+            with suppress(FileNotFoundError, UnreadableFrameError):  # the state may still be intact
                 left = self._files.read(index, (), (EFFECTS,)).get(EFFECTS)
         return left
 
     def _events(self) -> Int:
-        """[E, 4] the log of the newest frame that can be read."""
+        """Returns the event log [E, 4] of the newest readable frame."""
         while (newest := self._newest()) >= 0:
             known, log = self._log
-            if known > newest or (known >= 0 and self._files is None):  # frames were taken back since
+            if known > newest or (known >= 0 and self._files is None):  # frames were truncated since
                 log = log[log[:, 0] <= newest]
             elif known < newest:
                 try:
                     log = self._from_file(newest, (), (EVENTS,)).get(EVENTS, NO_EVENTS)
                 except UnreadableFrameError:
-                    continue  # it is forgotten, and the one before has all but its own
+                    continue  # drop this frame; the previous log lacks only its events
             self._log = (newest, log)
             return log
         return NO_EVENTS
 
     def log_at(self, index: int) -> Int:
-        """The log as it was after a frame."""
+        """Returns the event log up to and including a frame."""
         log = self._events()
         return log[log[:, 0] <= index] if len(log) else log
 
     def _fixed_after(self, births: list[tuple[int, int, int]]) -> Arrays:
-        """``FIXED`` of all Gaussians after so many births."""
+        """Returns the ``FIXED`` arrays of all Gaussians after the given births."""
         if not births:
             return self._fixed
         known, arrays = self._grown
@@ -261,7 +261,7 @@ class FramesReader:
         return {name: array[:count] for name, array in arrays.items()}
 
     def _born(self, birth: tuple[int, int, int]) -> Arrays:
-        """All that is kept of a birth: frame, first id, last id."""
+        """Returns the stored arrays of a birth, given as (frame, first id, last id)."""
         index, first, last = birth
         known = self._births.get(index)
         if self._files is not None and (known is None or known["ids"][0] != first):
@@ -282,7 +282,7 @@ class FramesReader:
         raise UnreadableFrameError(f"frame {index} is not in the history; committed frames: {held}")
 
     def _newest(self) -> int:
-        """Index of the last frame, -1 without one; ``indices`` copies all of them."""
+        """Returns the index of the last frame, or -1 if there is none; unlike ``indices``, this copies nothing."""
         return next(reversed(self._times), -1)
 
     def _from_file(self, index: int, names: Sequence[str], optional: Sequence[str] = ()) -> Arrays:
@@ -290,7 +290,7 @@ class FramesReader:
         try:
             return self._files.read(index, names, optional)
         except FileNotFoundError:
-            self._forget(index)  # deleted, by the process that appends or by another
+            self._forget(index)  # deleted by the appending process or by another
             self._files.faults[self._files.path(index).name] = f"{self._files.path(index).name} is gone"
             self._require(index)
             raise
@@ -298,7 +298,7 @@ class FramesReader:
             stamp = self._stamps.get(index)
             self._forget(index)
             self.damaged[index] = str(error)
-            if stamp is not None:  # until another file is there
+            if stamp is not None:  # do not retry until the file changes
                 self._stamps[index] = stamp
             raise DamagedFrameError(str(error)) from error
 

@@ -1,9 +1,9 @@
-"""Keeps the committed states of a scene, Θ_0 … Θ_t, in memory or in a directory. Numpy only.
+"""Stores the committed states of a scene, Θ_0 … Θ_t, in memory or in a directory. Needs only numpy.
 
-On disk (``frame_files``) a history is one file with opacities and ids, written once, one file for each committed
-frame, which holds its state, its time and its report, and one for each frame in which Gaussians were born; the rename
-of a frame's file to its final name is the commit. One process appends and deletes, through a ``History``; others read,
-and pick up its changes with ``refresh``.
+On disk (``frame_files``), a history has one file with opacities and ids, written once, and one file per committed
+frame with its state, time and report. Each frame with newborn Gaussians has another file. Renaming a frame's file to
+its final name is the commit. One process appends and deletes through a ``History``; other processes read, and see its
+changes after ``refresh``.
 """
 
 from __future__ import annotations
@@ -36,25 +36,28 @@ __all__ = [
 ]  # fmt: skip
 
 NEWEST_KEPT = 2
-"""Newest states that retention never deletes: should the last be damaged, the scene is resumed from the one before."""
+"""Number of newest states that retention never deletes.
+
+If the last is damaged, the scene resumes from the one before.
+"""
 
 
 class History(HistoryReader):
-    """The committed states of one scene, in the order of their indices; for the process that appends.
+    """The committed states of one scene in frame order, for the process that appends to them.
 
     Args:
-        directory: made when missing; without it states are in memory, and older ones in a scratch file
-            (``move_to_scratch``). One that holds states is opened with ``History.load`` or ``History.open``.
+        directory: folder of the states, created if missing; None keeps states in memory, and older ones in a scratch
+            file (``move_to_scratch``). Use ``History.load`` or ``History.open`` if the folder has states already.
 
     Attributes:
-        record_seconds: seconds that the last ``append`` spent on the report: encoding it, and its share of writing, by
-            bytes.
+        record_seconds: seconds that the last ``append`` spent on the report: encoding it, and a share of the write time
+            in proportion to its size.
 
     Raises:
-        HistoryError: ``directory`` already holds states.
+        HistoryError: ``directory`` already contains states.
 
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
-    >>> history = History()  # in memory; History("states") keeps them in a folder
+    >>> history = History()  # in memory; History("states") uses a folder
     >>> history.append(0, 0.0, state, report={"loss": [0.5]})
     >>> history.append(1, 0.1, state.replace(means=state.means + np.float32([0, 0, 1])))
     >>> history.indices, history.times
@@ -64,7 +67,7 @@ class History(HistoryReader):
            [0., 0., 3.]], dtype=float32)
     >>> history.append(1, 0.2, state)
     Traceback (most recent call last):
-    scas4d_core.storage.faults.HistoryError: frame 1 comes after frame 1; append frames in rising order
+    scas4d_core.storage.faults.HistoryError: frame 1 comes after frame 1; append frames in ascending order
     """
 
     def __init__(self, directory: Path | str | None = None) -> None:
@@ -78,10 +81,10 @@ class History(HistoryReader):
 
     @classmethod
     def open(cls, directory: Path | str) -> History:
-        """Opens the history in a directory, or begins one where there is none.
+        """Opens the history in a directory, or creates one if there is none.
 
         Raises:
-            HistoryError: as ``load``.
+            HistoryError: as for ``load``.
         """
         folder = Path(directory)
         folder.mkdir(parents=True, exist_ok=True)
@@ -90,11 +93,11 @@ class History(HistoryReader):
         return history
 
     def save(self, directory: Path | str) -> None:
-        """Writes a copy of this history into another directory, one frame at a time."""
+        """Writes a copy of this history to another directory, one frame at a time."""
         self.copy_frames(self.indices, directory)
 
     def copy_frames(self, indices: Iterable[int], directory: Path | str | None = None) -> History:
-        """A copy of some committed frames, in memory or in another directory; ids, births and lives are the same."""
+        """Copies some committed frames to memory or another directory; ids, births and lifetimes are preserved."""
         copy = History(directory)
         for index in sorted(set(indices)):
             arrays, log = self.gaussians(index).arrays(), self.log_at(index)
@@ -115,24 +118,24 @@ class History(HistoryReader):
         roots: Gaussians | None = None,
         effects: EffectArrays = MappingProxyType({}),
     ) -> None:
-        """Commits the state of one frame with its report; when this returns both are on disk (if there is a directory).
+        """Commits the state of one frame with its report. When this returns, both are on disk if there is a directory.
 
         Args:
-            index: frame number, above every index before it.
+            index: frame number, greater than all previous ones.
             time: seconds.
-            gaussians: the state; same ids and opacities as in the frame before. Rows after those are born in this one:
-                they have no ids yet, and get theirs here. The arrays are copied.
-            report: made of JSON values (finite numbers, strings, lists, mappings).
-            parents: [B] rows of the parents of the born; None: none has one.
-            roots: of all Gaussians (``births.extend_roots``); None: the born have theirs where they are.
+            gaussians: the state, with the same ids and opacities as the previous frame. Additional rows are newborn
+                Gaussians without ids, which are assigned here. The arrays are copied.
+            report: report of JSON values (finite numbers, strings, lists, mappings).
+            parents: [B] rows of the parents of newborn Gaussians; None if no newborn has one.
+            roots: roots of all Gaussians (``births.extend_roots``); None uses newborn Gaussians as their own roots.
             effects: arrays that a cold start needs, by effect.
 
         Raises:
-            HistoryError: index not above the last, fewer Gaussians, other ids or opacities, or a report that is no
-                JSON.
+            HistoryError: the index is not above the last, Gaussians are missing, ids or opacities differ, or the report
+                is not valid JSON.
         """
         if index <= self._newest():
-            raise HistoryError(f"frame {index} comes after frame {self._newest()}; append frames in rising order")
+            raise HistoryError(f"frame {index} comes after frame {self._newest()}; append frames in ascending order")
         began = perf_counter()
         try:
             text = json.dumps(dict(report or {}), allow_nan=False)
@@ -174,10 +177,11 @@ class History(HistoryReader):
         self._write(index, time, frame, text, log, births, self._fixed or fixed, pack_effects(effects))
 
     def _birth(self, index: int, born: Gaussians, parents: Int | None, roots: Gaussians | None) -> Arrays:
-        """All that is kept of a birth.
+        """Returns the stored arrays of a birth.
 
-        A birth that a frame had before it was taken back, and has again, is the same one, with the same ids. Any other
-        gets ids that no Gaussian ever had, not even one of a frame that was taken back.
+        If a truncated frame is committed again with the same birth, the birth keeps its ids. Any other birth gets ids
+        that no
+        Gaussian ever had, not even one of a truncated frame.
         """
         count = len(born)
         origin = born if roots is None else roots.rows(np.arange(len(roots) - count, len(roots)))
@@ -201,11 +205,17 @@ class History(HistoryReader):
         self, index: int, time: float, frame: Arrays, text: str, log: Int, births: Mapping[int, Arrays], fixed: Arrays,
         left: NDArray[np.uint8] | None,
     ) -> None:  # fmt: skip
-        """Commits a frame that fits those before.
+        """Commits a frame that has been validated.
 
         Args:
-            log: up to it. births: those that may not have been written yet, by frame. fixed: of the first frame.
-            left: by effects, packed.
+            index: frame number.
+            time: time in seconds.
+            frame: arrays of the state.
+            text: report as JSON.
+            log: event log up to the frame.
+            births: births, by frame, that may not have been written yet.
+            fixed: fixed arrays of the first frame.
+            left: packed arrays of effects.
         """
         if self._files is not None:
             encoded = text.encode()
@@ -234,20 +244,21 @@ class History(HistoryReader):
             self.move_to_scratch(None, IN_MEMORY)
 
     def retain(self, *, last: int | None = None, size_bytes: int | None = None) -> list[int]:
-        """Deletes the oldest states until the rules hold. Without a rule all stay.
+        """Deletes the oldest states until the limits hold. Without a limit, all states are kept.
 
-        The first frame stays, because every update needs it, and so do the newest ``NEWEST_KEPT``, from which an
-        interrupted scene is resumed, whatever the rule. The frames of a chunk go together, once ``last`` spares none.
+        The first frame is always kept because every update needs it. The ``NEWEST_KEPT`` newest are kept because an
+        interrupted
+        scene resumes from them. Frames of a chunk are deleted together, once ``last`` includes none of them.
 
         Args:
-            last: states to keep besides the first.
-            size_bytes: of all frames' files together.
+            last: number of states to keep in addition to the first.
+            size_bytes: maximum total size of all frames' files.
 
         Returns:
-            The indices deleted, rising.
+            The deleted indices, in increasing order.
 
         Raises:
-            HistoryError: a rule below 1.
+            HistoryError: a limit is below 1.
         """
         for name, rule in (("last", last), ("size_bytes", size_bytes)):
             if rule is not None and rule < 1:
@@ -263,30 +274,31 @@ class History(HistoryReader):
         return deleted
 
     def move_to_scratch(self, folder: Path | None, keep_newest: int = 1) -> None:
-        """Moves states from memory to a scratch file, but for the first and the newest; their bits stay the same.
+        """Moves states from memory to a scratch file, except the first and the newest; their bits are unchanged.
 
         Args:
-            folder: on the disk of the file, which goes with this history; None: the system's for temporary files.
-                Without room states stay in memory.
-            keep_newest: so many stay.
+            folder: folder on the disk for the file, which is deleted with this history; None uses the system's
+                temporary
+                folder. If there is no space, states stay in memory.
+            keep_newest: number of newest states that stay in memory.
         """
         self._scratch = self._scratch or ScratchFile(folder)
         for index in reversed(self.indices[1:-keep_newest] if self._files is None else ()):
             if (moved := self._scratch.store(self._frames[index])) is self._frames[index]:
-                break  # it is there already, and so are all before it; or there is no room
+                break  # this state and all earlier ones are moved already, or the disk is full
             self._frames[index] = moved
             self._scratch_reports[index] = self._scratch.store(
                 {"report": np.frombuffer(self._texts.pop(index), np.uint8)}
             )
 
     def truncate(self, after: int) -> list[int]:
-        """Takes back every commit after frame ``after``.
+        """Removes all commits after frame ``after``.
 
         Returns:
-            The indices taken back, damaged ones among them, rising.
+            The removed indices, including damaged frames, in increasing order.
         """
         known = sorted(index for index in {*self._times, *self.damaged} if index > after)
-        for index in reversed(known):  # the newest first: a cut that is itself cut short leaves a history without gaps
+        for index in reversed(known):  # newest first, so that an interruption leaves no gaps
             if self._files is not None:
                 self._files.remove(index)
             self._forget(index)
@@ -296,17 +308,17 @@ class History(HistoryReader):
         return known
 
     def repair_fixed(self) -> dict[str, str]:
-        """Writes the files that every frame needs, and their copies, anew where they are damaged.
+        """Rewrites damaged files that every frame needs, and their copies.
 
         Returns:
-            The fault of each file that was written, by name.
+            The problem of each rewritten file, by file name.
         """
         if self._files is None or not self._times or not self._fixed:
             return {}
         first = next(iter(self._times))
         births = {}
         for birth in births_in(self._events()):
-            with suppress(DamagedFrameError):  # neither in memory nor whole in one of its files
+            with suppress(DamagedFrameError):  # neither in memory nor intact on disk
                 births[birth[0]] = self._born(birth)
         mended = self._files.repair_copies(first, self._fixed, births)
         if self._files.path(first).name in mended:
@@ -314,10 +326,10 @@ class History(HistoryReader):
         return mended
 
     def rewrite(self, index: int) -> bool:
-        """Writes the file of a committed frame anew, the same bits.
+        """Rewrites the file of a committed frame with identical content.
 
         Returns:
-            False where the frame is not in memory.
+            False if the frame is not in memory.
         """
         frame, text = self._frames.get(index), self._texts.get(index)
         if self._files is None or frame is None or text is None or index not in self._times:
@@ -331,10 +343,12 @@ class History(HistoryReader):
         self, index: int, time: float, arrays: Mapping[str, Any], report: Mapping[str, Any],
         effects: EffectArrays = MappingProxyType({}),
     ) -> None:  # fmt: skip
-        """Writes the state of a frame anew whose file is damaged or gone.
+        """Rewrites the state of a frame whose file is damaged or missing.
 
         Args:
-            index: of a frame before the newest. time: seconds. arrays: ``PER_FRAME``, and ``WHOLES`` if there are any.
+            index: frame before the newest one.
+            time: time in seconds.
+            arrays: arrays of ``PER_FRAME``, and of ``WHOLES`` if any.
             report, effects: as for ``append``.
 
         Raises:
@@ -343,7 +357,7 @@ class History(HistoryReader):
         assert self._files is not None
         log = self.log_at(index)
         if index >= self._newest() or len(arrays["means"]) != len(self._fixed_after(births_in(log))["ids"]):
-            raise HistoryError(f"frame {index} cannot take the place of one that was committed")
+            raise HistoryError(f"frame {index} cannot replace a committed frame")
         frame = {name: np.asarray(arrays[name]) for name in (*PER_FRAME, *WHOLES) if name in arrays}
         text = json.dumps(dict(report), allow_nan=False).encode()
         self._forget(index)

@@ -1,4 +1,4 @@
-"""Reads the committed states of a scene: Θ_0 … Θ_t, and which Gaussians there were when. Numpy only."""
+"""Reads the committed states of a scene, Θ_0 … Θ_t, and the presence of Gaussians over time. Needs only numpy."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ from scas4d_core.storage.faults import DamagedFrameError, HistoryError, Unreadab
 from scas4d_core.storage.frames_reader import FramesReader
 
 ROOT = "root."
-"""Before the names of the arrays of a birth that say where the born would have been in the first frame (``roots``)."""
+"""Prefix of a birth's arrays that place newborn Gaussians in the first frame (``roots``)."""
 ROOTS = ("means", "factors", "rotations")
-"""Arrays of ``Gaussians`` that the roots of the born have of their own."""
+"""Arrays of ``Gaussians`` that have separate values in the roots."""
 
 
 class HistoryReader(FramesReader):
-    """Reads committed states, from the memory of this process or from a directory that another process writes.
+    """Reads committed states from this process's memory, or from a directory that another process writes.
 
     Attributes:
-        damaged: frames whose file cannot be read, with the reason; they are not among ``indices``.
+        damaged: frames whose file cannot be read, with the reason; they are not in ``indices``.
     """
 
     @property
     def newest(self) -> Gaussians:
-        """Θ of the newest frame; see ``gaussians``."""
+        """State Θ of the newest frame; see ``gaussians``."""
         return self.gaussians(self.indices[-1])
 
     def gaussians(self, index: int) -> Gaussians:
-        """The state of one committed frame; the arrays are the history's own and must not be written to.
+        """Returns the state of a committed frame. The arrays belong to the history and must not be modified.
 
         Raises:
             HistoryError: the frame was not committed, or its file is damaged.
@@ -65,17 +65,17 @@ class HistoryReader(FramesReader):
 
     @property
     def first(self) -> Gaussians:
-        """The state of the first frame; it raises as ``gaussians`` does."""
+        """State of the first frame; raises like ``gaussians``."""
         return self.gaussians(self.indices[0])
 
     def roots(self, index: int | None = None) -> Gaussians:
-        """The first frame, with the Gaussians born since where they would have been in it (``births.extend_roots``).
+        """Returns the first frame, extended by later-born Gaussians at their positions in it (``births.extend_roots``).
 
         Args:
-            index: of a frame: those born by then, and retired as then; None: the newest.
+            index: frame up to which births and retirements are included; None for the newest.
 
         Raises:
-            HistoryError: the first frame cannot be read, or what is kept of a birth.
+            HistoryError: the first frame or a birth cannot be read.
         """
         log = self._events() if index is None else self.log_at(index)
         if not len(log):
@@ -89,9 +89,11 @@ class HistoryReader(FramesReader):
         return roots.replace(ids=fixed["ids"], retired=retired_after(log, fixed["ids"]))
 
     def complete_state(self, index: int, state: Gaussians) -> Gaussians:
-        """A state that was made again for a frame, with what was born in it, as it was then, and what came back in it.
+        """Completes a recomputed state of a frame with the Gaussians that were born or revived in it.
 
-        Where that came back is not kept apart: it is shown as in the next frame that can be read.
+        Newborn Gaussians are read from their birth file. Revived ones are not stored separately, so they are taken from
+        the
+        next readable frame.
         """
         log = self.log_at(index)
         for birth in births_in(log):
@@ -113,31 +115,31 @@ class HistoryReader(FramesReader):
 
     @property
     def ids(self) -> Int:
-        """[count] ids of all Gaussians that there have been, by row."""
+        """[count] ids of all Gaussians so far, by row."""
         ids: Int = self._fixed_after(births_in(self._events())).get("ids", np.zeros(0, np.int64))
         return ids
 
     @property
     def count(self) -> int:
-        """Gaussians that there have been."""
+        """Number of all Gaussians so far."""
         return len(self.ids)
 
     @property
     def born_at(self) -> Int:
-        """[count] frame in which each Gaussian, by row, was born; the first one, for those that it began with."""
+        """[count] birth frame of each Gaussian, by row; the first frame for initial Gaussians."""
         first = np.full(len(self._fixed.get("ids", ())), next(iter(self._times), -1), np.int64)
         later = [np.full(last - begin + 1, index, np.int64) for index, begin, last in births_in(self._events())]
         return np.concatenate([first, *later])
 
     @property
     def parents(self) -> Int:
-        """[count] row of the parent that each Gaussian, by row, joined at its birth; −1 for one without."""
+        """[count] row of the parent that each Gaussian joined at birth, by row; −1 if it has none."""
         none = np.full(len(self._fixed.get("ids", ())), NO_PARENT, np.int64)
         return np.concatenate([none, *(self._born(birth)["parents"] for birth in births_in(self._events()))])
 
     @property
     def highest_id(self) -> int:
-        """The highest id that any Gaussian has or had, also in frames that were taken back; −1 without one."""
+        """Highest id that any Gaussian ever had, including truncated frames; −1 if there is none."""
         known = [self.ids, *(arrays["ids"] for arrays in self._births.values())]
         if (files := self._files) is not None:
             for index in set(files.births()) - self._births.keys():
@@ -146,11 +148,11 @@ class HistoryReader(FramesReader):
         return max((int(ids.max()) for ids in known if len(ids)), default=-1)
 
     def rows_of(self, ids: ArrayLike) -> Int:
-        """[Q] rows of ids; −1 for an id that no Gaussian has."""
+        """Returns the row of each id, [Q], or −1 if no Gaussian has the id."""
         return rows_among(self.ids, np.asarray(ids, np.int64).reshape(-1))
 
     def present(self, index: int) -> NDArray[np.bool_]:
-        """[count] bool, by row: the Gaussians that are there in a committed frame, born before or in it, not retired.
+        """Returns which Gaussians [count], by row, are present in a committed frame: already born and not retired.
 
         Raises:
             HistoryError: the frame was not committed.
@@ -162,10 +164,10 @@ class HistoryReader(FramesReader):
         return there
 
     def known_rows(self, ids: ArrayLike) -> Int:
-        """[Q] rows of ids.
+        """Returns the row of each id, [Q].
 
         Raises:
-            InputError: an id that no Gaussian has.
+            InputError: no Gaussian has one of the ids.
         """
         wanted, rows = np.asarray(ids, np.int64).reshape(-1), self.rows_of(ids)
         unknown = wanted[rows < 0]
@@ -177,10 +179,10 @@ class HistoryReader(FramesReader):
         return rows
 
     def lives(self, ids: ArrayLike) -> list[Life]:
-        """The frames in which Gaussians were born, retired and revived, by id.
+        """Returns the lifetimes of Gaussians, given by id: frames of birth, retirement and revival.
 
         Raises:
-            InputError: an id that no Gaussian has.
+            InputError: no Gaussian has one of the ids.
         """
         wanted = self.ids[self.known_rows(ids)].tolist()
         return lives_of(self._events(), wanted, next(iter(self._times), -1))
@@ -188,15 +190,16 @@ class HistoryReader(FramesReader):
     def stacked(
         self, name: str, indices: Sequence[int] | None = None, rows: NDArray[np.intp] | None = None
     ) -> NDArray[Any]:
-        """One array of several frames, [T, N, ...], in the order of ``indices`` (default: every frame).
+        """Returns one array for several frames, [T, N, ...], in the order of ``indices`` (default: all frames).
 
-        Where a Gaussian is not born yet it is NaN; where one is retired, as it was when it was there last. Only that
-        array is read from the files: a long history needs no more memory than the answer.
+        Values are NaN before a Gaussian's birth, and keep the last value while it is retired. Only this array is read
+        from the
+        files, so memory use is limited to the result.
 
         Args:
             name: one of ``PER_FRAME``.
             indices: committed frames; may repeat.
-            rows: Gaussians by row, any shape; the answer is then [T, *rows.shape, ...].
+            rows: rows of Gaussians, of any shape; the result is then [T, *rows.shape, ...].
 
         Raises:
             HistoryError: ``name`` is not in ``PER_FRAME``, or a frame was not committed.
@@ -224,7 +227,7 @@ class HistoryReader(FramesReader):
 
 
 def _taken(array: NDArray[Any], rows: NDArray[np.intp]) -> NDArray[Any]:
-    """Rows of an array, any shape; NaN for those that it does not have."""
+    """Returns rows of an array, in any shape; NaN for rows beyond its end."""
     if not rows.size or int(rows.max()) < len(array):
         return array[rows]
     taken = np.full((*rows.shape, *array.shape[1:]), np.nan, array.dtype)

@@ -1,8 +1,8 @@
-"""Writes npz files atomically, with a checksum for each array, and reads them without trusting them. Numpy only.
+"""Writes npz files atomically with a checksum per array, and reads them with verification. Needs only numpy.
 
-The comment of the zip holds a BLAKE2b of 128 bits for every array, over its type, shape and values. The zip's own
-CRC-32 is not enough: a flipped bit in the header of an array can make numpy read fewer bytes than there are, and then
-the CRC is never compared. A file without these checksums is refused.
+The zip comment contains a 128-bit BLAKE2b of every array, over dtype, shape and values. The zip's own CRC-32 does not
+suffice: a flipped bit in an array's header can make numpy read too few bytes, and then the CRC is never checked. Files
+without these checksums are rejected.
 """
 
 from __future__ import annotations
@@ -28,16 +28,18 @@ DAMAGE = (
     OSError, ValueError, KeyError, EOFError, IndexError, TypeError, SyntaxError, TokenError, RuntimeError, MemoryError,
     OverflowError, AttributeError, Warning, struct.error, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
-"""Exceptions that reading a cut or overwritten zip of arrays can raise. An overwritten header is read before the
-checksum of its array, and may ask for an impossible array."""
+"""Exceptions that reading a truncated or overwritten zip of arrays can raise.
+
+An overwritten header is parsed before its array's checksum is checked, and may request an impossible array.
+"""
 DIGEST = 16
-"""Bytes of a checksum."""
+"""Size of a checksum in bytes."""
 PIECE = 1 << 20
-"""Bytes that ``iter_verified`` reads at a time."""
+"""Number of bytes that ``iter_verified`` reads at a time."""
 
 
 def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
-    """Writes an npz atomically, whole at ``path`` or not at all: temporary file, sync, rename, sync of the folder.
+    """Writes an npz atomically: temporary file, sync, rename, sync of the folder.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -51,7 +53,7 @@ def write_npz(path: Path, arrays: Mapping[str, Any]) -> None:
 
 @contextmanager
 def open_atomically(path: Path, beside: Path) -> Iterator[BinaryIO]:
-    """Opens a file ``beside`` to write to; in the end it is whole and on disk at ``path``, or not there at all."""
+    """Opens the temporary file ``beside``; on success, syncs it and renames it to ``path``, else deletes it."""
     try:
         with beside.open("wb") as file:
             yield file
@@ -65,7 +67,7 @@ def open_atomically(path: Path, beside: Path) -> Iterator[BinaryIO]:
 
 
 def _save(file: BinaryIO, arrays: Mapping[str, Any]) -> None:
-    """Writes the zip as ``np.savez`` does, and the checksums as its comment."""
+    """Writes the zip like ``np.savez``, with the checksums as its comment."""
     checksums = {}
     with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
         for name, given in arrays.items():
@@ -77,7 +79,7 @@ def _save(file: BinaryIO, arrays: Mapping[str, Any]) -> None:
 
 
 def _comment(checksums: Mapping[str, str]) -> bytes:
-    """The checksums as a zip's comment; shortened where there are so many that they would not fit in it."""
+    """Serializes the checksums as the zip's comment, shortened if there are too many to fit."""
     for length in (2 * DIGEST, 8, 4):
         short = {name: digest[:length] for name, digest in checksums.items()}
         comment = json.dumps({"blake2b": short}, separators=(",", ":")).encode()
@@ -93,7 +95,7 @@ def _digest(array: NDArray[Any]) -> str:
 
 
 def _checksum_matches(kept: str, found: str) -> bool:
-    """True where a stored checksum, whole or shortened, matches the one of the array that was read."""
+    """Returns whether a stored checksum, possibly shortened, matches that of the array read."""
     return len(kept) >= 4 and found.startswith(kept)
 
 
@@ -102,19 +104,19 @@ def _start_checksum(dtype: np.dtype[Any], shape: tuple[int, ...]) -> hashlib.bla
 
 
 def _checksums(archive: zipfile.ZipFile) -> dict[str, str]:
-    """Checksums by array."""
+    """Returns the stored checksums by array name."""
     if not archive.comment:
         raise ValueError("it has no checksums")
     kept: dict[str, str] = json.loads(archive.comment)["blake2b"]
     names = {name.removesuffix(".npy") for name in archive.namelist()}
     if names != kept.keys():
-        raise ValueError("its arrays are not those that were written")
+        raise ValueError("its arrays are not the written ones")
     return kept
 
 
 def sync_folder(folder: Path) -> None:
-    """Syncs a folder: renames and deletions in it survive a power cut."""
-    if os.name != "posix":  # elsewhere a directory cannot be opened to be synced
+    """Syncs a folder so that renames and deletions in it survive a power failure."""
+    if os.name != "posix":  # other systems cannot open a directory for syncing
         return
     handle = os.open(folder, os.O_RDONLY)
     try:
@@ -124,19 +126,22 @@ def sync_folder(folder: Path) -> None:
 
 
 def member(name: str) -> str:
-    """The file of an array in an npz; by its own name numpy finds another where that ends in ".npy"."""
+    """Returns the file name of an array in an npz; a plain name that ends in ".npy" would be ambiguous in numpy."""
     return f"{name}.npy"
 
 
 def read_npz(path: Path, names: Sequence[str] | None = None, optional: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
-    """Reads named arrays of an npz, or all, and compares each with its checksum; nothing is unpickled.
+    """Reads the named arrays of an npz, or all, and verifies their checksums; nothing is unpickled.
 
     Args:
-        optional: arrays that are read as well where the file was written with them.
+        path: path of the file.
+        names: names of the arrays; None for all.
+        optional: further arrays to read if the file has them.
 
     Raises:
-        FileNotFoundError: it is not there.
-        ValueError: it is damaged, or lacks a name; says which file, without its folder, and why.
+        FileNotFoundError: the file does not exist.
+        ValueError: the file is damaged or lacks a name; the message gives the file name, without its folder, and the
+            reason.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:
@@ -148,7 +153,7 @@ def read_npz(path: Path, names: Sequence[str] | None = None, optional: Sequence[
     ValueError: a.npz is damaged, or no npz file (...)
     """
     try:
-        # Opened here, because numpy leaves a damaged file open.
+        # Opened here because numpy does not close damaged files.
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             checksums = _checksums(file.zip)
             wanted = file.files if names is None else [*names, *(name for name in optional if name in file.files)]
@@ -164,11 +169,11 @@ def read_npz(path: Path, names: Sequence[str] | None = None, optional: Sequence[
 
 
 def iter_verified(path: Path) -> Iterator[int]:
-    """Reads all of an npz piece by piece and yields the bytes of each; a damaged file raises on the way.
+    """Verifies a whole npz piece by piece, and yields the size of each piece; raises if the file is damaged.
 
     Raises:
-        FileNotFoundError: it is not there.
-        ValueError: as ``read_npz``.
+        FileNotFoundError: the file does not exist.
+        ValueError: as for ``read_npz``.
     """
     try:
         with path.open("rb") as opened, zipfile.ZipFile(opened) as archive:
@@ -186,17 +191,17 @@ def iter_verified(path: Path) -> Iterator[int]:
 
 
 def verify(path: Path) -> None:
-    """Reads all of an npz at once; raises as ``iter_verified``."""
+    """Verifies a whole npz; raises like ``iter_verified``."""
     for _ in iter_verified(path):
         pass
 
 
 def _streamed(file: IO[bytes]) -> Generator[int, None, str]:
-    """Reads one array, whose CRC is compared at its end; returns its checksum."""
+    """Reads one array, yields the size of each piece, and returns the array's checksum; verifies the CRC at the end."""
     version = np.lib.format.read_magic(file)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     shape, fortran, dtype = readers[version](file)
-    if fortran:  # the checksum is over the other order
+    if fortran:  # the checksum is over C order
         values = file.read()
         yield len(values)
         return _digest(np.frombuffer(values, dtype).reshape(shape, order="F"))
@@ -212,6 +217,6 @@ def _damage(path: Path, error: BaseException) -> ValueError:
 
 
 def clear_parts(folder: Path) -> None:
-    """Removes temporary files of interrupted ``write_npz`` calls; only for the one process that writes the folder."""
+    """Removes temporary files of interrupted ``write_npz`` calls; only the folder's writer may call this."""
     for part in folder.glob(".*.npz.*.part"):
         part.unlink(missing_ok=True)

@@ -1,11 +1,11 @@
-"""Chooses the states that retention deletes: the oldest, those of a chunk together."""
+"""Selects the states that retention deletes: the oldest ones, where states of a chunk are deleted together."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 
 GoWith = Callable[[int], list[int]]
-"""The frames that a frame can only be deleted with, itself among them; some may be deleted already."""
+"""Returns the frames that can only be deleted together with a frame, including itself; some may be deleted already."""
 
 
 def surplus(
@@ -16,12 +16,16 @@ def surplus(
     size_bytes: int | None,
     go_with: GoWith | None = None,
 ) -> list[int]:
-    """The states to delete, rising. The first and the newest stay whatever the rule.
+    """Returns the states to delete, in increasing order. The first and the newest ones are always kept.
 
     Args:
-        indices: of all states, rising. size_of: bytes that each takes. newest: so many of the newest stay.
-        last: states to keep besides the first; a chunk goes when it has none of them. None: all.
-        size_bytes: of all together; a chunk goes when they are more. None: any. go_with: None: each goes alone.
+        indices: indices of all states, in increasing order.
+        size_of: returns the size of a state in bytes.
+        newest: number of newest states that are always kept.
+        last: number of states to keep in addition to the first; None for all. A chunk is deleted once it has none of
+            them.
+        size_bytes: maximum total size in bytes, enforced by deleting whole chunks; None for no limit.
+        go_with: returns the states deleted together with one; None deletes each separately.
 
     >>> ten = lambda index: 10
     >>> surplus(range(8), ten, 2, None, 61)
@@ -43,7 +47,7 @@ def surplus(
 
 
 def _groups(candidates: Sequence[int], go_with: GoWith | None) -> Iterator[list[int]]:
-    """Frames that go together, the oldest first."""
+    """Yields frames that are deleted together, the oldest first."""
     known, taken = set(candidates) if go_with is not None else set(), set[int]()
     for index in candidates:
         if index not in taken:

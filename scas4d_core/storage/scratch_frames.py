@@ -1,4 +1,4 @@
-"""Frames of a history in memory whose arrays are in a scratch file instead: read anew whenever they are asked for."""
+"""Moves frames of an in-memory history to a scratch file, from which they are read on every access."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 ROUNDED = 512
-"""Bytes of which a place takes a multiple."""
+"""Block sizes are multiples of this number of bytes."""
 IN_MEMORY = 16
-"""Newest states of a history without a directory that stay in memory; older ones go to a scratch file."""
+"""Number of newest states that a history without a directory keeps in memory; older ones go to a scratch file."""
 
 
 class ScratchFile:
-    """A file without a name: nothing of it is left however the process ends. It is neither synced nor checked.
+    """An unnamed temporary file, deleted however the process ends. It is neither synced nor checksummed.
 
     Args:
-        within: a folder on the disk that it takes room of; the file is made once it is needed. None: that of the system
-            for temporary files.
+        within: a folder on the disk to use; None uses the system's temporary folder. The file is created on first use.
     """
 
     def __init__(self, within: Path | None) -> None:
@@ -32,12 +31,12 @@ class ScratchFile:
         self._file: IO[bytes] | None = None
         self._end = 0
         self._free: dict[int, list[int]] = {}
-        """Places that are free again, by their size."""
+        """Free blocks, by size."""
         self._full = False
         self._one_at_a_time = Lock()
 
     def store(self, frame: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
-        """The arrays of a frame, in the file; as they were once there is no room, which is asked for once."""
+        """Moves the arrays of a frame to the file; returns them unchanged once the disk is full."""
         if isinstance(frame, ScratchFrame) or self._full:
             return frame
         try:
@@ -47,10 +46,10 @@ class ScratchFile:
             return frame
 
     def put(self, array: NDArray[Any]) -> int:
-        """Adds an array, and says where it begins.
+        """Adds an array and returns its offset.
 
         Raises:
-            OSError: no room.
+            OSError: there is no space.
         """
         with self._one_at_a_time:
             if self._file is None:
@@ -66,12 +65,12 @@ class ScratchFile:
     def _write(self, data: bytes, begins: int) -> None:
         assert self._file is not None
         left = memoryview(data)
-        while left:  # a disk that fills up takes a part, and refuses the next
+        while left:  # a nearly full disk may write only a part
             count = os.pwrite(self._file.fileno(), left, begins)
             left, begins = left[count:], begins + count
 
     def get(self, begins: int, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-        """The array that begins there."""
+        """Reads the array at an offset."""
         assert self._file is not None
         array = np.empty(shape, dtype)
         left, at = array.reshape(-1).view(np.uint8).data, begins
@@ -83,21 +82,23 @@ class ScratchFile:
         return array
 
     def free(self, places: Mapping[str, tuple[int, int]]) -> None:
-        """Has places, each where it begins and its bytes, used again. Without the lock: a collection may call this."""
+        """Releases blocks, given as (offset, bytes), for reuse; lock-free, because garbage collection may call this."""
         for begins, size in places.values():
             self._free.setdefault(_size_class(size), []).append(begins)
 
 
 def _size_class(size: int) -> int:
-    """Bytes that are taken for an array: places of about one size take the place of one another."""
+    """Returns the block size for an array; blocks of equal size can replace each other."""
     return -(-size // ROUNDED) * ROUNDED
 
 
 class ScratchFrame(Mapping[str, NDArray[Any]]):
-    """The arrays of one frame, in a scratch file.
+    """The arrays of one frame, stored in a scratch file.
 
     Args:
-        file: that holds them. begins: by name. frame: the arrays, for their types and shapes.
+        file: file that contains the arrays.
+        begins: offsets by name.
+        frame: the arrays, for their dtypes and shapes.
 
     >>> from tempfile import TemporaryDirectory
     >>> with TemporaryDirectory() as folder:

@@ -86,7 +86,7 @@ class Membership:
         while True:
             await asyncio.sleep(CHECK_S)
             if await self._is_lost():
-                log.error("the Ray node of this machine is lost, and all processes of scenes with it; joining again")
+                log.error("the Ray node of this machine and all processes of its scenes are lost; joining again")
                 await _exit_on_failure(on_loss())
                 while not await self._is_done(self._rejoin_or_exit):
                     await asyncio.sleep(CHECK_S)
@@ -106,7 +106,7 @@ class Membership:
         try:
             leaving.result(LEAVE_S)
         except TimeoutError:
-            log.error("Ray did not let the service leave within %g s; it ends as it is", LEAVE_S)
+            log.error("the service could not leave the Ray cluster within %g s; exiting anyway", LEAVE_S)
             os._exit(1)
 
     async def _is_lost(self) -> bool:
@@ -128,7 +128,7 @@ class Membership:
             return False
         if self._silent:
             self._silent = False
-            log.info("the head of the Ray cluster answers again")
+            log.info("the head of the Ray cluster responds again")
         return bool(answer.result())
 
     async def _rejoin_or_exit(self) -> None:

@@ -107,7 +107,7 @@ class RayPlacement(Placement):
             try:
                 process.mark_lost()
             except Exception:  # an error in one scene must not stop the other scenes or the service
-                log.exception("a process that is lost with its cluster")
+                log.exception("a process was lost with its cluster")
         await self._detach(processes, LOSE_S)
 
     async def _detach(self, processes: Sequence[RayProcess], seconds: float) -> None:
@@ -117,7 +117,7 @@ class RayPlacement(Placement):
         for process in processes:
             await process.detach()
         if not await self._calls.wait(seconds):
-            log.warning("Ray has not answered within %g s; the service leaves the cluster nevertheless", seconds)
+            log.warning("Ray has not answered within %g s; the service leaves the cluster anyway", seconds)
         gc.collect()  # a collection while the service leaves would release Ray objects in reference cycles
 
     async def _on_return(self) -> None:

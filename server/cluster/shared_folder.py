@@ -52,7 +52,7 @@ def check_folder(data: Path) -> None:
             if fault is not None:
                 raise RuntimeError(f"{name} {fault}; mount the data folder {data} there, at the same path")
             if not wait_for_content(data / f"{PROBE_NAME}-{word}-{id[:8]}", word):
-                raise RuntimeError(f"what {name} writes to {data} does not appear here; is it the same folder?")
+                raise RuntimeError(f"files that {name} writes to {data} do not appear here; is it the same folder?")
     finally:
         for path in data.glob(f"{PROBE_NAME}-{word}*"):  # includes files of nodes that failed midway
             path.unlink(missing_ok=True)

@@ -76,16 +76,16 @@ def problem(refusal: Refusal, limit: float = 0) -> Problem:
         case Refusal.PEER_CONNECTIONS | Refusal.CLIENT_REQUESTS:
             return Problem(
                 429,
-                f"the address has {limit:g} connections or requests open already",
+                f"the address already has {limit:g} open connections or requests",
                 field="client",
                 value=f"more than {limit:g}",
-                remedy="close some, or raise SCAS4D_MAX_CONNECTIONS_PER_PEER",
+                remedy="close some of them, or raise SCAS4D_MAX_CONNECTIONS_PER_PEER",
                 headers=retry,
             )
         case Refusal.CONNECTIONS:
             return Problem(
                 503,
-                f"the service has {limit:g} connections open, all of them at work",
+                f"the service already has {limit:g} open connections, all of them busy",
                 field="client",
                 value=f"more than {limit:g}",
                 remedy="try again later, or raise SCAS4D_MAX_CONNECTIONS",

@@ -57,7 +57,7 @@ def main(spec: None, connection: Connection[Any, Any]) -> None:
         except (EOFError, OSError):
             raise
         except Exception as error:
-            log.exception("the kernels could not be warmed up")
+            log.exception("the kernels could not be compiled")
             connection.send(WarmUpResult(f"{type(error).__name__}: {message_of(error)}"))
         connection.recv()  # returns on a request to exit or when the service is gone; the report has been read by then
     os._exit(0)
@@ -68,7 +68,7 @@ class Readiness:
 
     Attributes:
         after: seconds from the start until the service was ready; None if it is not ready yet.
-        fault: reason why the kernels could not be warmed up, or None. The service continues without the warm-up, and
+        fault: reason why the kernels could not be compiled, or None. The service continues without the warm-up, and
             its first frame reports the error.
         compiled: progress of the compilation of the kernels for a first frame; None if it is not known.
         stopping: whether the service is shutting down.
@@ -83,7 +83,7 @@ class Readiness:
         self._logged_at = self._began
         self._process: ProcessHandle | None = None
         if settings.warm_up:
-            log.info("warming up the kernels; the first time they are compiled, which takes half a minute")
+            log.info("loading the kernels; the first start compiles them, which takes half a minute")
             self._process = placement.start(main, None, self._on_message, self._on_end)
         else:
             self.after = 0.0
@@ -96,12 +96,12 @@ class Readiness:
         """
         waited = time.monotonic() - self._began
         if self.stopping:
-            raise Problem(503, "the service ends", remedy="wait until it is started again", seconds=waited)
+            raise Problem(503, "the service ends", remedy="wait until it is restarted", seconds=waited)
         if self.fault is not None:
             raise Problem(
                 503,
-                f"the kernels could not be warmed up: {self.fault}",
-                remedy="the service's log has the traceback; SCAS4D_WARM_UP=false starts without",
+                f"the kernels could not be compiled: {self.fault}",
+                remedy="the service's log has the traceback; SCAS4D_WARM_UP=false skips this",
                 seconds=waited,
             )
         if self.after is None:
@@ -110,7 +110,7 @@ class Readiness:
             so_far = "" if now is None else f": {now.done} of {now.total}"
             raise Problem(
                 503,
-                f"kernels are being warmed up, for {waited:.1f} s so far; the first time they are compiled{so_far}",
+                f"kernels are being loaded, for {waited:.1f} s so far; the first start compiles them{so_far}",
                 remedy="ask again",
                 headers={"Retry-After": "1"},
                 seconds=waited,
@@ -144,4 +144,4 @@ class Readiness:
         self._process = None
         if self.after is None and self.fault is None:
             self.fault = str(how)
-            log.error("the kernels could not be warmed up: %s", self.fault)
+            log.error("the kernels could not be compiled: %s", self.fault)

@@ -82,9 +82,9 @@ class AuthMiddleware:
         if self._token is None and not all(map(is_loopback, ends)):
             raise Problem(
                 403,
-                "the service can be reached from other machines and has no token",
+                "the service is reachable from other machines and has no token",
                 field="SCAS4D_TOKEN",
-                remedy="set a token and start it anew, or listen at 127.0.0.1",
+                remedy="set a token and restart it, or listen at 127.0.0.1",
             )
 
     def _refuse_token_in_url(self, scope: Scope) -> None:
@@ -93,7 +93,7 @@ class AuthMiddleware:
             if name.lower() in IN_URL:
                 raise Problem(
                     400,
-                    "a secret in an address ends up in logs and histories",
+                    "a secret in a URL ends up in logs and browser histories",
                     field=name,
                     remedy="send the token as `Authorization: Bearer`, a ticket as WebSocket subprotocol; if this "
                     "was the real one, replace it",
@@ -140,9 +140,9 @@ class AuthMiddleware:
             if permission is None:
                 raise Problem(
                     401,
-                    "the ticket is used, too old, or was never issued",
+                    "the ticket was used before, has expired, or was never issued",
                     field="Sec-WebSocket-Protocol",
-                    remedy="fetch another with POST /v1/tickets and use it at once",
+                    remedy="request another one with POST /v1/tickets and use it at once",
                     headers={"WWW-Authenticate": 'Bearer realm="scas4d"'},
                 )
         else:

@@ -58,7 +58,7 @@ def check_origin(scope: Scope, allowed_hosts: Sequence[str], allowed_origins: Se
 def _foreign_problem(field: str, value: str) -> Problem:
     return Problem(
         403,
-        "pages of other sites may not use the service",
+        "pages of other sites must not use the service",
         field=field,
         value=value,
         remedy="use the service's own page, or add the site to SCAS4D_ALLOWED_ORIGINS",
@@ -70,7 +70,7 @@ def _host(headers: Headers) -> str:
     if len(hosts) != 1 or split_authority(hosts[0]) is None:
         raise Problem(
             400,
-            "a request has one Host header, host or host:port",
+            "a request needs one Host header, host or host:port",
             field="Host",
             value=", ".join(hosts),
             remedy="send the address that you connect to",

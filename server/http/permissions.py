@@ -47,7 +47,7 @@ def check(permission: Permission, scope: Scope) -> None:
         if path != own and not path.startswith((own + "/", "/v1/tickets")) and path != "/v1/scenes":
             raise Problem(
                 404,
-                "this link shows one scene, and no other address",
+                "this link gives access to one scene only",
                 field="path",
                 value=path,
                 remedy=f"ask for {own}, or send the token of the service",
@@ -55,7 +55,7 @@ def check(permission: Permission, scope: Scope) -> None:
     if not (permission.write or reading):
         raise Problem(
             403,
-            "this token may only read",
+            "this token is read-only",
             field="Authorization",
             remedy="send the token that the service was started with, SCAS4D_TOKEN",
         )

@@ -115,7 +115,7 @@ def _json_problem(error: Mapping[str, Any], loc: tuple[Any, ...], prefix: str, t
         f"the {field} is not valid JSON: {str(reason)[:1].lower()}{str(reason)[1:]}{place}",
         field=field,
         value=value or MISSING,
-        remedy="send well-formed JSON: names and text in double quotes, no comma behind the last one, no comments",
+        remedy="send well-formed JSON: names and text in double quotes, no trailing comma, no comments",
     )
 
 

@@ -121,10 +121,10 @@ class Ingest:
         if self._sockets >= MAX_SOCKETS:
             raise Problem(
                 429,
-                f"{count_noun(self._sockets, 'WebSocket')} send frames to this scene already",
+                f"{count_noun(self._sockets, 'WebSocket')} already send frames to this scene",
                 field="id",
                 value=self.ledger.scene,
-                remedy="close another one, or send over HTTP",
+                remedy="close one of them, or send over HTTP",
                 headers={"Retry-After": "5"},
             )
         self._sockets += 1
@@ -273,7 +273,7 @@ class Ingest:
         expected = self.ledger.next_frame
         return Problem(
             409,
-            f"frame {index} would leave a gap: frame t is found from frame t−1",
+            f"frame {index} would leave a gap: frame t is reconstructed from frame t−1",
             field="n",
             value=index,
             remedy=f"send frame {expected} first, or declare it missing: POST …/frames/{expected}/missing",
@@ -286,7 +286,7 @@ class Ingest:
         if not (math.isfinite(seconds) and (before is None or seconds > before)):
             raise Problem(
                 422,
-                f"the time of frame {index} is not after that of the frame before it",
+                f"the time of frame {index} is not later than that of the previous frame",
                 field="time",
                 value=seconds,
                 remedy="give finite seconds" if before is None else f"give seconds above {before:g}",
@@ -311,7 +311,7 @@ class Ingest:
             remedy = f"send the same frame again in {count_noun(math.ceil(seconds), 'second')}"
         return Problem(
             429,
-            f"{count_noun(ledger.unfinished, 'frame')} of at most {self.rules.queue_frames} wait already"
+            f"{count_noun(ledger.unfinished, 'frame')} of at most {self.rules.queue_frames} are waiting"
             + (" and the scene is paused" if ledger.paused else ""),
             field="n",
             value=index,
@@ -352,7 +352,7 @@ class Ingest:
             f"frame {index} is {known}",
             field="n",
             value=index,
-            remedy=f"send the next frame, {self.ledger.next_frame}; an acknowledged frame does not change",
+            remedy=f"send the next frame, {self.ledger.next_frame}; an acknowledged frame cannot be changed",
             expected=self.ledger.next_frame,
             identity=entry.identity,
         )

@@ -39,7 +39,11 @@ async def receive_form(ingest: Ingest, index: int, request: Request) -> FrameRec
                 given[name] = value
             else:
                 raise Problem(
-                    422, f"{name!r} is no file", field=name, value=value, remedy="send it with a file name in its part"
+                    422,
+                    f"{name!r} is not a file",
+                    field=name,
+                    value=value,
+                    remedy="send it as a form field with a file name",
                 )
         # Checked before `FrameFile` is built, because its validation would raise for an invalid camera name.
         for name in given:
@@ -164,7 +168,7 @@ def _check_one_camera(head: FrameHead, camera: str | None) -> str:
             f"the files are of {count_noun(len(names), 'camera')}: {', '.join(names)}",
             field="head.files",
             value=", ".join(names),
-            remedy="send the files of one camera" + ("" if camera is None else f", {camera!r}, as the address says"),
+            remedy="send the files of one camera" + ("" if camera is None else f", {camera!r}, as in the URL"),
         )
     return names[0]
 

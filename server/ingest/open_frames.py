@@ -73,7 +73,7 @@ class OpenFrames:
                     f"camera {camera!r} gives frame {index} another time than the previous cameras",
                     field="time",
                     value=head.time,
-                    remedy=f"give {frame.time!r}, or none: the first time given is the frame's",
+                    remedy=f"give {frame.time!r}, or none; the first time given applies to the frame",
                 )
 
     async def accept(self, head: FrameHead, camera: str, received: ReceivedFiles) -> CameraReceipt:
@@ -99,13 +99,13 @@ class OpenFrames:
                     f"camera {camera!r} has sent other content for frame {index}",
                     field=camera,
                     value=index,
-                    remedy="send the next frame; an acknowledged frame does not change",
+                    remedy="send the next frame; an acknowledged frame cannot be changed",
                 )
             if not all(kind in before for kind in kinds):
                 if index < ledger.next_frame:
                     raise Problem(
                         409,
-                        f"frame {index} was closed without this of camera {camera!r}",
+                        f"frame {index} was closed without this file of camera {camera!r}",
                         field=camera,
                         value=index,
                         remedy=f"send frame {ledger.next_frame}",
@@ -219,7 +219,7 @@ class OpenFrames:
                     f"{count_noun(len(frame.cameras), 'camera')} of the required {least} sent a picture",
                     field="n",
                     value=index,
-                    remedy="send those of more cameras, or declare the frame missing",
+                    remedy="send pictures of more cameras, or declare the frame missing",
                     received=frame.cameras,
                 )
             if not self.ingest.has_room():

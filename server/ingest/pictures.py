@@ -1,7 +1,7 @@
 """Validation of a frame's image files without decoding pixels: names, sizes and file structure.
 
-The checks walk through the segments of a JPEG up to its end marker, through the chunks of a PNG including their
-checksums, and through the RIFF chunks of a WebP.
+The checks cover the segments of a JPEG up to its end marker, the chunks and checksums of a PNG, and the RIFF chunks of
+a WebP.
 """
 
 from __future__ import annotations
@@ -137,10 +137,10 @@ def check_picture(rig: Rig, file: FrameFile, data: memoryview) -> None:
     if header.exif and (orientation := _orientation(data)) != 1:
         raise Problem(
             422,
-            f"{field}: EXIF orientation {orientation} would turn the picture",
+            f"{field}: EXIF orientation {orientation} would rotate the picture",
             field=field,
             value=orientation,
-            remedy="store the pixels the way the camera was calibrated and drop the tag",
+            remedy="store the pixels as calibrated and remove the tag",
         )
 
 
@@ -205,7 +205,7 @@ def image_header(data: bytes | memoryview) -> ImageHeader:
 def _truncated(kind: str, size: int) -> StructureError:
     return StructureError(
         f"a {kind} that ends early, after {size} bytes",
-        "it was cut short on its way here: send it again from its source",
+        "it was truncated on the way: send it again from its source",
     )
 
 
@@ -276,18 +276,16 @@ def _png(data: memoryview) -> ImageHeader:
         if zlib.crc32(data[at + 4 : end - 4]) != struct.unpack(">I", data[end - 4 : end])[0]:
             raise StructureError(
                 f"a PNG whose {kind!r} chunk at byte {at} fails its checksum",
-                "it was damaged on its way: send it again",
+                "it was damaged on the way: send it again",
             )
         if header is None:
             if kind != b"IHDR" or length != 13:
                 raise StructureError(
-                    "a PNG that does not begin with its header", "the file is damaged: send it again from its source"
+                    "a PNG that does not start with its header", "the file is damaged: send it again from its source"
                 )
             header = ImageHeader("png", *struct.unpack(">II", data[at + 8 : at + 16]))
             if data[at + 16] == 16:
-                raise StructureError(
-                    "a PNG of 16 bits a channel", "send 8 bits: you choose how they are scaled", "16 bits"
-                )
+                raise StructureError("a PNG of 16 bits a channel", "convert the picture to 8 bits", "16 bits")
         if kind == b"acTL":
             raise StructureError("an animated PNG", "send one picture per file", "animated")
         pixels |= kind == b"IDAT"

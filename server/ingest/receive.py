@@ -134,7 +134,7 @@ class FrameReceiver:
                 await asyncio.shield(self._at_work)
             except FileNotFoundError:  # the folder no longer exists
                 remedy = "GET /v1/scenes lists the scenes"
-                raise Problem(404, "the scene was deleted meanwhile", field="id", remedy=remedy) from None
+                raise Problem(404, "the scene was deleted in the meantime", field="id", remedy=remedy) from None
             self._at_work = None
 
     def _return_buffers(self) -> None:
@@ -176,7 +176,7 @@ async def read_framed(
                 receiving = begin(head)
             if len(view) > receiving.missing:
                 over = len(view) - receiving.missing
-                raise FramingError(f"goes on for {over} bytes and more behind its files", "send none there")
+                raise FramingError(f"goes on for {over} or more bytes after its files", "send none there")
             await receiving.take(view)
         if head is None or receiving is None:
             raise FramingError(f"ends after {len(start)} bytes, within its head", "send the whole frame")
@@ -208,7 +208,7 @@ def framing_problem(error: FramingError) -> Problem:
 def _check_length(head: FrameHead, start: int, total: int | None) -> None:
     expected = start + sum(file.size for file in head.files)
     if total is not None and total != expected:
-        raise FramingError(f"has {total} bytes where its head says {expected}", "send what the head says")
+        raise FramingError(f"has {total} bytes where its head says {expected}", "send what the head describes")
 
 
 def in_batches(files: Sequence[FrameFile]) -> list[list[FrameFile]]:
@@ -313,7 +313,7 @@ def check_index(head: FrameHead, index: int | None) -> None:
     if index is not None and head.index != index:
         raise Problem(
             422,
-            f"the head says frame {head.index}, the address frame {index}",
+            f"the head names frame {head.index}, the URL frame {index}",
             field="head.index",
             value=head.index,
             remedy="send both alike",

@@ -98,7 +98,7 @@ class Peers:
             seen = {address: when for address, when in self._seen.items() if now - when < REMEMBERED_S}
             self._seen = seen | dict.fromkeys((*before, *self._addresses), now)  # previous ones were present until now
         except Exception:  # the head does not respond, or its response is unexpected
-            log.exception("peers cannot be listed; those before are asked")
+            log.exception("peers cannot be listed; using the previous list")
         finally:
             self._asked, self._listing = time.monotonic(), None
 

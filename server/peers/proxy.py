@@ -136,7 +136,7 @@ class _Body:
         while True:
             message = await self._receive()
             if message["type"] == "http.disconnect":
-                raise httpx.RequestError("the client has hung up")
+                raise httpx.RequestError("the client closed the connection")
             yield message.get("body", b"")
             if not message.get("more_body"):
                 break

@@ -129,7 +129,7 @@ async def _refuse_handshake(refused: InvalidStatus, scope: Scope, receive: Recei
         problem = Problem(
             answer.status_code,
             "the service that has the scene refuses the connection",
-            remedy="ask GET /v1/scenes/ID of the scene why",
+            remedy="GET /v1/scenes/ID of the scene has the reason",
         )
         await problems.refuse(problem, scope, receive, send)
         return

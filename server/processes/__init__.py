@@ -1,1 +1,1 @@
-"""The processes of a scene: worker, readers, replayer, exporter; their start, and queries to the readers."""
+"""Processes of a scene (worker, readers, replayer, exporter), their placement, and queries to the readers."""

@@ -1,4 +1,4 @@
-"""Committed frames of a scene as a compact 4D file."""
+"""Export of a scene's committed frames to a compact 4D file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from server.processes.part_labels import resize_labels
 
 
 def compact_head(spec: SceneSpec, history: History) -> FileHeader:
-    """Returns what holds for all states of a scene: its world, the rig in use, its background and its rate."""
+    """Returns the file header shared by all states of a scene: world frame, effective rig, background, frame rate."""
     return FileHeader(
         spec.rig.world_frame(spec.settings.scene.metres_per_unit),
         background=history.background,
@@ -30,19 +30,22 @@ def compact_head(spec: SceneSpec, history: History) -> FileHeader:
 def write_compact(
     file: Path, history: History, asked: Sequence[int], head: FileHeader, labels: NDArray[Any] | None
 ) -> int:
-    """Writes committed frames, each read when it is its turn; those that retention has deleted since are left out.
+    """Writes committed frames to a compact file, reading one state at a time.
 
-    What the scene keeps in a compact file already is copied with its bits; a file that begins so may have frames before
-    those requested, which depend on them, and it ends with that compact file.
+    Frames that retention has deleted in the meantime are skipped. If the scene already stores the first frame in a
+    compact file, its records are copied bit for bit. The output may then also contain earlier frames, on which the
+    requested ones depend, and it ends at the end of the stored file.
 
     Args:
-        file: replaced where it is there. asked: frames, rising. labels: [N] part of each Gaussian, or None.
+        file: path of the output; an existing file is replaced.
+        asked: requested frame indices in ascending order.
+        labels: part label of each Gaussian [N], or None.
 
     Returns:
         The last frame in the file.
 
     Raises:
-        HistoryError: none of the frames is there any more, or one cannot be read.
+        HistoryError: none of the frames exists any longer, or one cannot be read.
     """
     file.unlink(missing_ok=True)
     frames = [index for index in asked if index in history] or list(asked[:1])
@@ -61,13 +64,16 @@ def write_compact(
 
 
 def _copied(file: Path, history: History, frames: Sequence[int]) -> int | None:
-    """Copies frames out of the compact file that holds the first of them; returns the last, None where none does."""
+    """Copies frames from the stored compact file that holds the first; returns the last copied, None if no such file.
+
+    A damaged or missing compact file also yields None.
+    """
     if history.files is None or not history.is_compacted(frames[0]):
         return None
     try:
         with file.open("wb") as copy:
             return history.files.chunks.reader(frames[0]).copy_records(frames[0], frames[-1], copy)[-1]
-    except (FileError, FileNotFoundError):  # reading the states says what is wrong, and reports it
+    except (FileError, FileNotFoundError):  # reading the states one by one then detects and reports the damage
         file.unlink(missing_ok=True)
         return None
 

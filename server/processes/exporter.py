@@ -1,4 +1,4 @@
-"""The export process: writes committed frames in the format of another tool, at a low priority."""
+"""Export process, which writes committed frames in a third-party format at low priority."""
 
 from __future__ import annotations
 
@@ -21,24 +21,24 @@ from server.processes.placement import enter_background, finish_background, use_
 from server.storage.disk import free_bytes, no_room
 
 NICE = 15
-"""Added to its niceness: of a core that it shares with a scene's worker it gets about a tenth."""
+"""Niceness increment of the process: it gets about a tenth of a core that it shares with a scene's worker."""
 RESERVE_BYTES = 500_000_000
-"""Room on the disk that exports leave to the frames of the scenes: about a thousand of them."""
+"""Free disk space in bytes that exports leave for the frames of scenes, about a thousand frames."""
 
 log = logging.getLogger("scas4d.exporter")
 
 
 class ShortOfRoomError(RuntimeError):
-    """The export would take the room that scenes need."""
+    """Error raised when an export would use disk space reserved for scenes."""
 
 
 def main(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
-    """Runs one export; the service ends the process when it is not wanted any more."""
+    """Runs one export; the service terminates the process if the export is cancelled."""
     enter_background(NICE)
     fault: str | None = None
     try:
         _export(spec, connection)
-    except Exception as error:  # whatever the core raises, the service goes on and says so
+    except Exception as error:  # any failure in the core must be reported, and the service must keep running
         known = isinstance(error, InputError | HistoryError | ShortOfRoomError) or no_room(error)
         log.warning("scene %s: an export failed: %s", spec.scene.folder.name, error, exc_info=not known)
         fault = explain(error)
@@ -46,13 +46,13 @@ def main(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
 
 
 def explain(error: Exception) -> str:
-    """Explains to a person why an export failed, without paths of this machine.
+    """Returns a user-facing explanation of why an export failed, without local file paths.
 
     >>> explain(InputError("parts: no Gaussian belongs to one", "ask for the parts"))
     'parts: no Gaussian belongs to one; ask for the parts'
     """
     if isinstance(error, ShortOfRoomError) or no_room(error):
-        return f"the disk has no room ({message_of(error)}); export fewer frames, or a smaller format"
+        return f"the disk is full ({message_of(error)}); export fewer frames, or a smaller format"
     if isinstance(error, DamagedFrameError):
         return f"{message_of(error)}; export again later: it is mended if it can be"
     if isinstance(error, HistoryError):
@@ -66,7 +66,7 @@ def explain(error: Exception) -> str:
 
 
 def size_of(folder: Path) -> int:
-    """Returns the bytes of the files below a folder."""
+    """Returns the total size in bytes of all files under a folder."""
     total = 0
     for path in folder.rglob("*"):
         with contextlib.suppress(FileNotFoundError):
@@ -75,7 +75,7 @@ def size_of(folder: Path) -> int:
 
 
 def _export(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
-    from scas4d_core.exports import export_sequence, format_of  # in this process only: the others stay light
+    from scas4d_core.exports import export_sequence, format_of  # imported lazily: only this process needs it
     from scas4d_core.exports.formats import WITH_PARTS
 
     history: History | None = None
@@ -84,14 +84,16 @@ def _export(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
     folder = spec.file.parent
     try:
         if wanted.needs_parts or spec.format in WITH_PARTS:
-            from server.processes.reader_process import QueryReader  # it loads what encodes pictures
+            from server.processes.reader_process import QueryReader  # imported lazily: it loads the image encoders
 
             renderer = QueryReader(spec.scene)
             history = renderer.history
             if history.newest.moving.any():
                 labels = renderer.labels(None)
             elif wanted.needs_parts:
-                raise InputError("nothing moves in this scene, so it has no parts", "export it in another format")
+                raise InputError(
+                    "this scene has no moving Gaussians, so it has no parts", "export it in another format"
+                )
         else:
             history = History.load(spec.scene.folder.states, only=(spec.first, *spec.frames))
             use_one_thread()
@@ -99,9 +101,11 @@ def _export(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
 
         def progress(_: int, done: int) -> None:
             connection.send(ExportProgressed(done, size_of(folder)))
-            twice = size_of(folder) if spec.format == "usd" else 0  # at its end it is written once more
+            twice = size_of(folder) if spec.format == "usd" else 0  # USD is written a second time at the end
             if (free := free_bytes(folder) - twice) < RESERVE_BYTES:
-                raise ShortOfRoomError(f"{free / 1e6:.0f} MB are free, {RESERVE_BYTES / 1e6:.0f} MB are left to frames")
+                raise ShortOfRoomError(
+                    f"{free / 1e6:.0f} MB are free, {RESERVE_BYTES / 1e6:.0f} MB are reserved for frames"
+                )
 
         export_sequence(
             _states(history, spec.frames),
@@ -121,6 +125,6 @@ def _export(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
 
 
 def _states(history: History, frames: tuple[int, ...]) -> Iterator[tuple[int, float, Gaussians]]:
-    """Each frame is read when it is its turn."""
+    """Yields index, time and Gaussians of each frame, reading one state at a time."""
     for index in frames:
         yield index, history.time(index), history.gaussians(index)

@@ -1,4 +1,4 @@
-"""A worker waits here until the kernels that its next frame needs are compiled, and says so."""
+"""Compilation of the kernels that a worker's next frame needs, with progress reports."""
 
 from __future__ import annotations
 
@@ -11,31 +11,33 @@ from scas4d_core.settings import Settings
 from server.messages import Progressed
 
 STAGE = "compiling kernels"
-"""The stage of a frame's progress, while its worker waits for them."""
+"""Stage name that is reported while a worker waits for kernel compilation."""
 
 log = logging.getLogger("scas4d.worker")
 
 
 def wait_for_first(settings: Settings, points: bool, connection: Connection[Any, Any]) -> float:
-    """Waits for the kernels of a first frame; those of updates are compiled after them, while it is fitted.
+    """Waits until the kernels of the first frame are compiled and returns the seconds waited.
+
+    The kernels of updates are compiled afterwards, while the first frame is being fitted.
 
     Args:
-        points: whether the scene was given points to start from. connection: is sent the progress.
-
-    Returns:
-        Seconds waited.
+        settings: settings of the scene.
+        points: whether the scene was given an initial point cloud.
+        connection: pipe to which progress is sent.
     """
-    from scas4d_core import warm_up  # in this process only: the service stays light
+    from scas4d_core import warm_up  # imported lazily: the service process does not need the core
 
     first, updates = warm_up.first_frame_groups(points=points), warm_up.update_groups(settings.update.covariance)
     return _waited(first, connection, then=updates)
 
 
 def wait_for_updates(settings: Settings, connection: Connection[Any, Any] | None) -> float:
-    """Waits for the kernels of updates and of the views in them; returns the seconds waited.
+    """Waits until the kernels of updates and of rendering are compiled and returns the seconds waited.
 
     Args:
-        connection: is sent the progress; None: nothing is.
+        settings: settings of the scene.
+        connection: pipe to which progress is sent, or None to send none.
     """
     from scas4d_core import warm_up
 

@@ -1,6 +1,6 @@
-"""Part labels of a scene by number of parts, kept beside the states so that a part keeps its label.
+"""Part labels of a scene for each number of parts, stored next to the states so that labels stay stable.
 
-They are a derived thing: a lost or damaged file means that labels are numbered anew, by size.
+The labels are derived data: if a file is lost or damaged, parts are renumbered by size.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ log = logging.getLogger("scas4d.renderer")
 
 
 def resize_labels(labels: NDArray[Any], count: int) -> NDArray[Any]:
-    """Returns labels for so many Gaussians: those born since have none, and rows only ever come at the end."""
+    """Returns labels resized to `count` Gaussians; new Gaussians are always appended and get the label -1."""
     return np.concatenate([labels, np.full(max(0, count - len(labels)), -1, labels.dtype)])[:count]
 
 
 @dataclass(frozen=True, eq=False)
 class StoredLabels:
-    """Labels [N] and the newest frame that they were found from."""
+    """Labels [N] and the newest frame from which they were computed."""
 
     labels: NDArray[np.int64]
     frame: int
 
 
 class PartLabels:
-    """The labels of one scene by count; None is the count that is chosen.
+    """Part labels of one scene for each number of parts; None means the automatically chosen number.
 
     Args:
-        folder: where they are kept; made when needed.
+        folder: folder of the label files; created on demand.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -49,10 +49,10 @@ class PartLabels:
         self._known: dict[int | None, StoredLabels] = {}
 
     def of(self, reader: CommittedScene, history: History, count: int | None) -> NDArray[np.int64]:
-        """Returns [N] labels from all committed states; they are computed once for each newest frame.
+        """Returns labels [N] from all committed states; they are recomputed only when a new frame is committed.
 
         Raises:
-            ValueError: as ``CommittedScene.parts``.
+            ValueError: see ``CommittedScene.parts``.
         """
         newest = history.indices[-1]
         known = self._known.get(count) or self._read(count)
@@ -88,7 +88,7 @@ class PartLabels:
             with beside.open("wb") as opened:
                 np.savez(opened, **arrays)
             beside.replace(file)
-        except OSError as error:  # a full disk costs the numbering after a restart, not the answer
+        except OSError as error:  # a full disk must not fail the query; only the numbering after a restart is lost
             log.warning("%s cannot be written (%s): after a restart parts get new numbers", file, error)
             with contextlib.suppress(OSError):
                 beside.unlink()

@@ -1,4 +1,4 @@
-"""Starts the processes of the scenes, carries their messages and notices their end.
+"""Placement of scene processes: starting them, exchanging messages with them and detecting their exit.
 
 Processes are spawned, never forked: the service has threads, and Numba and CUDA do not survive a fork.
 """
@@ -22,23 +22,30 @@ from client.wire import Cluster
 from server.messages import Stop
 
 Entry = Callable[..., None]
-"""Called in the process as entry(spec, connection); `connection` has recv and send of a multiprocessing Connection."""
+"""Entry point of a process, called as entry(spec, connection).
+
+`connection` has the `recv` and `send` methods of a multiprocessing Connection.
+"""
 
 STOP_SECONDS = 5.0
-"""Grace for a process to end by itself when a scene or the service stops; an unfinished frame is taken up again."""
+"""Seconds that a process gets to exit on its own when a scene or the service stops.
+
+An unfinished frame is processed again after the restart.
+"""
 PARENT_CHECK_S = 0.5
-"""A process notices so late that the service has ended."""
+"""Interval in seconds at which a process checks that the service is still running."""
 
 _context = multiprocessing.get_context("spawn")
 
 
 class ProcessExit(str):
-    """A sentence that says why a process ended.
+    """Reason for the exit of a process, as a sentence.
 
     Attributes:
-        exit_code: as in multiprocessing: −N for signal N; None if unknown.
-        lost: its machine is gone or unreachable. out_of_memory: the kernel killed processes of its control group for
-            lack of memory; None: look at the control group of this machine.
+        exit_code: exit code as in multiprocessing: −N for signal N; None if unknown.
+        lost: whether the machine of the process is gone or unreachable.
+        out_of_memory: whether the kernel's OOM killer ended processes in its control group. None means unknown: check
+            the control group of this machine.
     """
 
     exit_code: int | None
@@ -48,16 +55,16 @@ class ProcessExit(str):
     def __new__(
         cls, exit_code: int | None, why: str = "", *, lost: bool = False, out_of_memory: bool | None = None
     ) -> ProcessExit:
-        """Makes the sentence for an exit code, or takes another."""
+        """Creates the sentence from the exit code, or uses `why` if given."""
         self = super().__new__(cls, why or f"its process ended by itself (exit code {exit_code})")
         self.exit_code, self.lost, self.out_of_memory = exit_code, lost, out_of_memory
         return self
 
 
 def end_with_parent() -> None:
-    """Ends this process soon after the one that started it: for processes that may be busy for long."""
+    """Exits this process soon after its parent has exited; for processes that may be busy for a long time."""
     starter = multiprocessing.parent_process()
-    parent = os.getppid() if starter is None else starter.pid  # it may have ended by now
+    parent = os.getppid() if starter is None else starter.pid  # the parent may have exited already
 
     def watch() -> None:
         while os.getppid() == parent:
@@ -68,18 +75,21 @@ def end_with_parent() -> None:
 
 
 def enter_background(nice: int) -> None:
-    """Begins a process that does one thing beside the updates: less eager than they are, and gone with its parent.
+    """Prepares a background process: lowers its priority below the updates and ties its lifetime to its parent.
 
     Args:
-        nice: added to its niceness.
+        nice: niceness increment.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the service says when to stop
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the service decides when to stop
     os.nice(nice)
     end_with_parent()
 
 
 def finish_background(connection: Connection[Any, Any], ended: Any) -> NoReturn:
-    """Ends it: sends its last message, and waits to be asked to stop. An end of its own would be taken for a fault."""
+    """Sends the last message of a background process, waits for the request to stop, then exits.
+
+    An unrequested exit would be treated as a crash.
+    """
     with contextlib.suppress(EOFError, OSError):  # the service is gone
         connection.send(ended)
         logging.shutdown()
@@ -88,30 +98,30 @@ def finish_background(connection: Connection[Any, Any], ended: Any) -> NoReturn:
 
 
 def use_one_thread() -> None:
-    """Keeps this process to one thread of Numba, OpenMP and BLAS: the other cores belong to the updates."""
+    """Limits Numba, OpenMP and BLAS to one thread in this process, to leave the other cores to the updates."""
     import numba
     from threadpoolctl import threadpool_limits
 
     numba.set_num_threads(1)
-    threadpool_limits(1)  # scikit-learn's threads spin while they wait: 16 s for a part query on busy cores
+    threadpool_limits(1)  # scikit-learn's threads busy-wait: a part query took 16 s on busy cores
 
 
 class ProcessHandle(Protocol):
-    """A running process of a scene, wherever it is."""
+    """Handle of a running scene process on any machine."""
 
     @property
     def pid(self) -> int | None:
-        """The process id on its machine; None while it is not known."""
+        """Process id on its machine; None while unknown."""
 
     def send(self, message: Any) -> None:
-        """Posts a message and returns at once; messages to a process that has ended are dropped."""
+        """Sends a message without blocking; messages to a process that has exited are dropped."""
 
     async def stop(self, seconds: float = STOP_SECONDS) -> None:
-        """Asks the process to end, waits for `seconds`, then kills it."""
+        """Asks the process to exit, waits up to `seconds`, then kills it."""
 
 
 class LocalProcess:
-    """A running process on this machine. Two threads move its messages, and the event loop never waits on a pipe."""
+    """Running process on this machine; two threads transfer its messages, so the event loop never blocks on a pipe."""
 
     def __init__(
         self,
@@ -125,11 +135,11 @@ class LocalProcess:
         self._on_message = on_message
         self._on_end = on_end
         self._stopping = False
-        self._reaping = threading.Lock()  # two threads that wait for one process confuse multiprocessing
+        self._reaping = threading.Lock()  # multiprocessing does not support two threads joining one process
         self._outbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._connection, theirs = _context.Pipe()
         self._process = _context.Process(target=_run, args=(prepare, entry, spec, theirs), daemon=True)
-        # Starting takes some 20 ms and blocks; it is done on the event loop, once a scene.
+        # Starting blocks the event loop for about 20 ms, which is acceptable because it is rare.
         self._process.start()
         theirs.close()
         self._threads = [
@@ -141,7 +151,7 @@ class LocalProcess:
 
     @property
     def pid(self) -> int | None:
-        """The process id of the operating system."""
+        """Process id assigned by the operating system."""
         return self._process.pid
 
     def send(self, message: Any) -> None:
@@ -168,7 +178,7 @@ class LocalProcess:
 
     def _write(self, connection: Connection[Any, Any]) -> None:
         while (message := self._outbox.get()) is not None:
-            with contextlib.suppress(OSError):  # it has ended: the reading thread says so
+            with contextlib.suppress(OSError):  # the process has exited, which the reading thread reports
                 connection.send(message)
 
     def _read(self, connection: Connection[Any, Any]) -> None:
@@ -183,7 +193,7 @@ class LocalProcess:
         with self._reaping:
             self._process.join()
             code = self._process.exitcode
-        self._outbox.put(None)  # stop may never be called: the other thread ends with the process
+        self._outbox.put(None)  # stop may never be called, so the writing thread must end here
         self._call(self._on_end, ProcessExit(code))
 
     def _call(self, function: Callable[[Any], None], argument: Any) -> None:
@@ -198,16 +208,17 @@ def _run(prepare: Callable[[], None] | None, entry: Entry, spec: Any, connection
 
 
 class Placement:
-    """Runs every process of every scene on this machine.
+    """Placement that runs every process of every scene on this machine.
 
     Args:
-        prepare: called first in every process, before its entry imports the core; it has to pickle. The service sets up
-            its logs with it, and tests put a fake in place of the core.
+        prepare: picklable function called first in every process, before its entry point imports the core. The service
+            configures logging with it; tests use it to replace the core with a fake.
 
     Attributes:
-        fenced: workers get epochs (`server.storage.fencing`): one may go on after it was taken for dead.
-        has_peers: other services may have scenes of the same cluster.
-        has_labels: it runs processes on nodes that have labels, of which a scene may ask for some.
+        fenced: whether workers get epochs (`server.storage.fencing`), because one may keep running after it was
+            declared dead.
+        has_peers: whether other services may own scenes of the same cluster.
+        has_labels: whether processes run on nodes with labels, which a scene may require.
     """
 
     fenced = False
@@ -223,26 +234,26 @@ class Placement:
         """Starts a process.
 
         Args:
-            entry: the module-level function that runs there.
-            spec: its first argument; it has to pickle.
+            entry: module-level function that runs in the process.
+            spec: first argument of `entry`; it must be picklable.
             on_message: called on the event loop with every message that the process sends.
-            on_end: called on the event loop once, with the reason, when the process ended without being asked to.
+            on_end: called once on the event loop with the reason, if the process exits without being asked to.
         """
         return LocalProcess(entry, spec, on_message, on_end, self.prepare)
 
     async def cluster(self) -> Cluster | None:
-        """The machines on which processes run; None: this one alone."""
+        """Returns the machines on which processes run, or None if there is only this one."""
         return None
 
     async def announce(self, host: str, port: int) -> None:
-        """Announces to other services of the cluster where this one listens."""
+        """Announces the address of this service to the other services of the cluster."""
 
     async def peers(self) -> Sequence[str]:
-        """Addresses of the other services of the cluster, as `http://10.0.0.2:8000`."""
+        """Returns the addresses of the other services of the cluster, such as `http://10.0.0.2:8000`."""
         return ()
 
     async def open(self) -> None:
-        """Makes ready to start processes; called once, before any."""
+        """Acquires the resources for starting processes; called once, before the first start."""
 
     async def close(self) -> None:
-        """Gives back what `open` took, when all processes have ended."""
+        """Releases the resources acquired by `open`; called after all processes have exited."""

@@ -1,4 +1,4 @@
-"""Queries to the readers of a scene, and their answers."""
+"""Queries to the reader processes of a scene, and their answers."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from scas4d_core.cameras import Camera
 
 @dataclass(frozen=True, eq=False)
 class RenderQuery:
-    """A view of a committed frame.
+    """Query for a rendered view of a committed frame.
 
-    `background` None is the one that frame 0 has found. `parts` is their number where they are asked for and it is
-    given; `labels` [N] are then the parts themselves.
+    A `background` of None selects the one estimated in frame 0. `parts` is the requested number of parts, or None for
+    the automatic choice. `labels` [N] holds the part labels if the view shows parts.
     """
 
     kind: ClassVar[str] = "render"
@@ -32,9 +32,10 @@ class RenderQuery:
 
 @dataclass(frozen=True, eq=False)
 class TracksQuery:
-    """Trajectories over `frames` of ids, of pixels [Q, 2] of a camera, or of points [Q, 3], the latter two at `at`.
+    """Query for trajectories over `frames`.
 
-    `project` are the cameras into which the trajectories are projected, with visibility.
+    The tracked points are given as Gaussian ids, as pixels [Q, 2] of `camera`, or as 3D points [Q, 3]. Pixels and
+    points refer to the frame `at`. `project` lists cameras into which the trajectories are projected, with visibility.
     """
 
     kind: ClassVar[str] = "tracks"
@@ -50,7 +51,7 @@ class TracksQuery:
 
 @dataclass(frozen=True)
 class PartsQuery:
-    """Labels of all Gaussians."""
+    """Query for the part labels of all Gaussians, answered as JSON."""
 
     kind: ClassVar[str] = "parts"
     count: int | None
@@ -58,7 +59,7 @@ class PartsQuery:
 
 @dataclass(frozen=True)
 class LabelsQuery:
-    """Labels of all Gaussians as little-endian int16, in the order of the states."""
+    """Query for the part labels of all Gaussians as little-endian int16, in the order of the states."""
 
     kind: ClassVar[str] = "labels"
     count: int | None
@@ -66,7 +67,7 @@ class LabelsQuery:
 
 @dataclass(frozen=True)
 class GaussiansQuery:
-    """Lives of Gaussians by id."""
+    """Query for the lifetimes of Gaussians with the given ids."""
 
     kind: ClassVar[str] = "gaussians"
     ids: tuple[int, ...]
@@ -74,7 +75,7 @@ class GaussiansQuery:
 
 @dataclass(frozen=True)
 class PlyQuery:
-    """A committed frame as a 3DGS .ply."""
+    """Query for a committed frame as a 3DGS .ply file."""
 
     kind: ClassVar[str] = "ply"
     frame: int
@@ -82,7 +83,7 @@ class PlyQuery:
 
 @dataclass(frozen=True)
 class CompactQuery:
-    """Committed frames as a compact 4D file, with the parts of all Gaussians where they are asked for."""
+    """Query for committed frames as a compact 4D file, optionally with the part labels of all Gaussians."""
 
     kind: ClassVar[str] = "compact"
     frames: tuple[int, ...]
@@ -93,7 +94,7 @@ Query = RenderQuery | TracksQuery | PartsQuery | LabelsQuery | GaussiansQuery | 
 
 
 def refused_field(query: Query) -> tuple[str, object]:
-    """Returns field and value of the part of a query that only the reader can check."""
+    """Returns name and value of the query field that only the reader can validate."""
     if isinstance(query, TracksQuery | GaussiansQuery) and query.ids is not None:
         return "ids", list(query.ids)
     if isinstance(query, TracksQuery):
@@ -107,9 +108,10 @@ def refused_field(query: Query) -> tuple[str, object]:
 
 @dataclass(frozen=True)
 class NumberedQuery:
-    """A query with a number to find its answer by.
+    """Query with a number that identifies its answer.
 
-    `stale` are frames that were committed, deleted or taken back since the query before; None: any may have been.
+    `stale` lists the frames that were committed, deleted or rolled back since the previous query. None means that any
+    frame may have changed.
     """
 
     number: int
@@ -119,7 +121,7 @@ class NumberedQuery:
 
 @dataclass(frozen=True)
 class Answer:
-    """The body of an HTTP answer, encoded."""
+    """Encoded body of an HTTP response, with its media type and headers."""
 
     number: int
     body: bytes
@@ -129,7 +131,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class QueryRefused:
-    """The query cannot be answered. `status` is that of the HTTP answer; `remedy` may be empty."""
+    """Refusal of a query that cannot be answered; `status` is the HTTP status code, and `remedy` may be empty."""
 
     number: int
     fault: str

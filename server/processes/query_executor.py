@@ -1,6 +1,6 @@
-"""A reader process and the queue of queries before it.
+"""Reader process with a queue of queries.
 
-A process that ends by itself is started again, each time after a longer pause.
+A process that exits unexpectedly is restarted with exponential backoff.
 """
 
 from __future__ import annotations
@@ -19,21 +19,27 @@ from server.processes.placement import Entry, Placement, ProcessExit, ProcessHan
 from server.processes.queries import Answer, NumberedQuery, Query, QueryRefused
 
 FIRST_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
-"""Pause before a process that ended by itself is started again; it doubles with each end without an answer."""
+"""Initial and maximum delay before an unexpectedly exited process is restarted.
+
+The delay doubles with each exit until a query is answered.
+"""
 MOST_WAITING = 64
-"""Queries before a process; more get 503. Beyond a second or two of views, waiting only makes it worse."""
+"""Maximum number of queued queries; further ones are refused with 503.
+
+The queue holds one to two seconds of views. A longer one would only add latency.
+"""
 ANSWER_SECONDS = 120.0
-"""A query that takes longer gets 503: the longest that is let in takes about half of it."""
+"""Seconds after which a query fails with 503; the longest accepted query takes about half of that."""
 
 OnDamage = Callable[[Mapping[str, str]], None]
-"""Called with files of the states' folder that cannot be read, by name with the reason."""
+"""Callback for unreadable files of the states folder: a mapping from file name to reason."""
 
 log = logging.getLogger("scas4d.server")
 
 
 @dataclass(eq=False)
 class _WaitingQuery:
-    """A query, the future of its answer, and whether it was once lost with the machine of a reader."""
+    """Queued query with the future of its answer; `lost` is set once a reader's machine was lost while answering it."""
 
     number: int
     query: Query
@@ -46,15 +52,18 @@ class _WaitingQuery:
 
 
 class QueryExecutor:
-    """A reader process and the queue before it. The process has one query at a time; cancelled ones are never started.
+    """Reader process and its queue; the process handles one query at a time, and cancelled queries are never started.
 
     Args:
-        entry: what runs in the process.
-        grace: seconds, see above. damaged: called with the files that the process found damaged.
+        entry: entry point of the process.
+        spec: description of the scene.
+        placement: starts the process.
+        grace: seconds for which the process may continue with a cancelled query before it is stopped.
+        damaged: called with the files that the process found damaged.
 
     Attributes:
-        process: or None, before the first query and while it rests.
-        stale: frames that were committed, deleted or taken back since the last query; None: any may have been.
+        process: handle of the process; None before the first query and while the process is not running.
+        stale: frames that were committed, deleted or rolled back since the last query; None if any may have changed.
     """
 
     def __init__(
@@ -84,11 +93,11 @@ class QueryExecutor:
 
     @property
     def busy(self) -> bool:
-        """True while a query waits or is being answered, or a process that was given up ends."""
+        """True while a query is queued or being answered, or while an abandoned process is stopping."""
         return bool(self._waiting or self._at_work or self._ending)
 
     def start(self) -> None:
-        """Starts the process now, not with the first query."""
+        """Starts the process immediately instead of with the first query."""
         if self.process is None and self._pause is None and not self._closed:
             self._start()
 
@@ -96,15 +105,15 @@ class QueryExecutor:
         """Queues a query and returns its answer.
 
         Raises:
-            Problem: 503, too many wait, or no answer within the time that the service allows.
+            Problem: 503 if the queue is full or the answer takes longer than `ANSWER_SECONDS`.
         """
         if len(self._waiting) >= MOST_WAITING:
             raise Problem(
                 503,
-                f"{count_noun(len(self._waiting), 'question')} of this scene waiting for an answer already",
+                f"{count_noun(len(self._waiting), 'question')} of this scene are already waiting",
                 field="id",
                 value=self._spec.folder.name,
-                remedy="ask less often, or subscribe (WS …/stream): it sends the newest only",
+                remedy="ask less often, or subscribe (WS …/stream): it sends only the newest answer",
                 headers={"Retry-After": "1"},
             )
         if self._closed:
@@ -121,17 +130,17 @@ class QueryExecutor:
                 f"no answer within {ANSWER_SECONDS:g} s",
                 field="id",
                 value=self._spec.folder.name,
-                remedy="ask for less at once, or again later",
+                remedy="ask for less at once, or try again later",
                 headers={"Retry-After": "5"},
             ) from None
         finally:
             if turn in self._waiting:
                 self._waiting.remove(turn)
-            if turn is self._at_work:  # the asker has gone
+            if turn is self._at_work:  # the caller was cancelled or timed out
                 asyncio.get_running_loop().call_later(self._grace, self._give_up, turn)
 
     async def stop(self, seconds: float) -> None:
-        """Ends the process within `seconds`, at once if it is busy; queries that wait, and later ones, are refused."""
+        """Stops the process within `seconds`, or immediately if it is busy; refuses queued and later queries."""
         self._closed = True
         if self._pause is not None:
             self._pause.cancel()
@@ -150,7 +159,7 @@ class QueryExecutor:
         self.process = self._placement.start(self._entry, self._spec, self._on_answer, ended)
 
     def _next(self) -> None:
-        """Gives the process the next query, if it is free."""
+        """Sends the next query to the process if it is idle."""
         if self._at_work is not None or self._pause is not None or self._closed or not self._waiting:
             return
         if self.process is None:
@@ -165,7 +174,7 @@ class QueryExecutor:
             self._damaged(message.files)
             return
         turn = self._at_work
-        if turn is None or turn.number != message.number:  # of a process that was given up
+        if turn is None or turn.number != message.number:  # answer of an abandoned process
             return
         self._failures = 0
         self._at_work = None
@@ -173,10 +182,12 @@ class QueryExecutor:
         self._next()
 
     def _give_up(self, turn: _WaitingQuery) -> None:
-        """Ends the process if it is still busy with a cancelled query."""
+        """Stops the process if it is still busy with a cancelled query."""
         if self._at_work is not turn or self.process is None:
             return
-        log.warning("scene %s: a %s query was cancelled; its reader restarts", self._spec.folder.name, turn.query.kind)
+        log.warning(
+            "scene %s: a %s query was cancelled; restarting its reader", self._spec.folder.name, turn.query.kind
+        )
         task = asyncio.ensure_future(self.process.stop(0))
         self._ending.add(task)
         task.add_done_callback(self._ending.discard)
@@ -192,7 +203,7 @@ class QueryExecutor:
         self._failures += 1
         log.error("scene %s: a reader is gone (%s); the next in %g s", self._spec.folder.name, reason, pause)
         if turn is not None and not turn.answer.done():
-            if reason.lost and not turn.lost:  # no fault of the query's: the next reader answers it
+            if reason.lost and not turn.lost:  # not caused by the query: the next reader answers it
                 turn.lost = True
                 self._waiting.appendleft(turn)
             else:

@@ -1,6 +1,6 @@
-"""The reader processes of a scene: one renders views, the other one answers tracks, parts and exports.
+"""Reader processes of a scene: one renders views, the other answers queries for tracks, parts and files.
 
-Neither waits for an update; ``server.processes.readers`` queues their queries.
+Neither waits for an update. ``server.processes.readers`` queues their queries.
 """
 
 from __future__ import annotations
@@ -52,27 +52,27 @@ if TYPE_CHECKING:
 
 BYTES = "application/octet-stream"
 QUALITY = 92
-"""Quality of JPEG and WebP, 1…100, if the query names none."""
+"""Default quality of JPEG and WebP, 1…100."""
 CHANNELS = {"colour": ("red", "green", "blue"), "depth": ("depth",), "alpha": ("alpha",), "parts": ("parts",)}
 
 BULK_NICE = 10
-"""Added to the niceness of the process for tracks, parts and exports: views and updates go ahead of them."""
+"""Niceness increment of the process for tracks, parts and files, so that views and updates have priority."""
 
 DAMAGED_AT_ONCE = 8
-"""States that may turn out damaged in one search for parts, which is then made without them."""
+"""Maximum number of damaged states that one part query can skip."""
 
 log = logging.getLogger("scas4d.renderer")
 
 
 def run_view_reader(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
-    """Runs the process for views until it is asked to stop, or until the service is gone."""
+    """Runs the view process until it is asked to stop or the service exits."""
     _serve(spec, connection)
 
 
 def run_bulk_reader(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
-    """Runs the process for queries that may take long."""
+    """Runs the process for queries that may take a long time, until it is asked to stop or the service exits."""
     os.nice(BULK_NICE)
-    for left in spec.folder.path.glob(f"{EXPORT}.*"):  # of one that was killed while it answered
+    for left in spec.folder.path.glob(f"{EXPORT}.*"):  # left by a process that was killed during a query
         left.unlink(missing_ok=True)
     _serve(spec, connection)
 
@@ -89,7 +89,7 @@ def _serve(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
             break
         if isinstance(message, NumberedQuery):
             answer = renderer.answer(message)
-            if faults := renderer.pop_faults():  # before a refused query is asked again
+            if faults := renderer.pop_faults():  # before the client can repeat a refused query
                 connection.send(DamageFound(faults))
             connection.send(answer)
     logging.shutdown()
@@ -97,7 +97,7 @@ def _serve(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
 
 
 class QueryReader:
-    """Answers queries about committed states, one after the other."""
+    """Reader that answers queries about committed states, one at a time."""
 
     def __init__(self, spec: SceneSpec) -> None:
         self.spec = spec
@@ -108,7 +108,7 @@ class QueryReader:
 
     @property
     def history(self) -> History:
-        """The committed states: opened once, then refreshed with the files that are new in their folder."""
+        """Committed states, opened once and then refreshed for the frames that changed."""
         if self._history is None:
             self._history = History.load(self.spec.folder.states)
         elif self._stale is None or self._stale:
@@ -118,7 +118,7 @@ class QueryReader:
 
     @property
     def reader(self) -> CommittedScene:
-        """The views, tracks and parts of all that is committed. The core is imported here, not in the service."""
+        """Source of views, tracks and parts of the committed states; the core is imported on first use."""
         history = self.history
         if self._reader is None:
             from scas4d_core.query.committed import CommittedScene
@@ -131,15 +131,15 @@ class QueryReader:
         return self._reader
 
     def labels(self, count: int | None) -> NDArray[np.int64]:
-        """Returns [N] part labels from all committed states."""
+        """Returns part labels [N], computed from all committed states."""
         return self._parts.of(self.reader, self.history, count)
 
     def pop_faults(self) -> dict[str, str]:
-        """Returns files that were found damaged or gone since the last call, by name with the reason."""
+        """Returns the files found damaged or missing since the last call: a mapping from name to reason."""
         return {} if self._history is None else self._history.pop_faults()
 
     def _note_missing(self, query: Query) -> None:
-        """Notes frames that the service takes for committed and that are missing; it knows if they were deleted."""
+        """Records frames that the service considers committed but that are missing; it knows which it deleted."""
         frames = query.frames if isinstance(query, TracksQuery | CompactQuery) else (getattr(query, "frame", None),)
         history = self._history
         if history is not None and history.files is not None:
@@ -149,7 +149,7 @@ class QueryReader:
                     history.files.faults.setdefault(frame_file(index), f"{frame_file(index)} is gone")
 
     def answer(self, ask: NumberedQuery) -> Answer | QueryRefused:
-        """Returns the encoded answer, or the reason for a refusal."""
+        """Returns the encoded answer, or a refusal with its reason."""
         asked = f"{ask.query.kind} query"
         self._stale = None if ask.stale is None or self._stale is None else self._stale | ask.stale
         for more in range(DAMAGED_AT_ONCE, -1, -1):
@@ -157,12 +157,12 @@ class QueryReader:
                 return self._answer(ask.number, ask.query)
             except DamagedFrameError as error:
                 log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
-                if more and isinstance(ask.query, PartsQuery | LabelsQuery):  # found from all others
+                if more and isinstance(ask.query, PartsQuery | LabelsQuery):  # computed from the remaining states
                     continue
                 return QueryRefused(
                     ask.number, message_of(error), "ask again later: it is mended if it can be", status=503
                 )
-            except UnreadableFrameError as error:  # deleted since the service checked
+            except UnreadableFrameError as error:  # deleted after the service checked
                 log.warning("scene %s, %s: %s", self.spec.folder.name, asked, error)
                 self._note_missing(ask.query)
                 return QueryRefused(ask.number, message_of(error), status=404)
@@ -214,7 +214,7 @@ class QueryReader:
                 )
 
     def _file(self, number: int, write: Callable[[Path], dict[str, str] | None]) -> Answer:
-        """Answers with the file that is written to a path, and the headers that this returns; removes it."""
+        """Returns an answer with the contents of a temporary file; `write` fills the file and may return headers."""
         file = self.spec.folder.export(secrets.token_hex(4))
         try:
             headers = write(file) or {}
@@ -224,9 +224,10 @@ class QueryReader:
 
 
 def float32(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, dict[str, str]]:
-    """Joins arrays [H, W] or [H, W, 3] in the last axis, as little-endian float32; returns them with their headers.
+    """Concatenates arrays [H, W] or [H, W, 3] along the last axis; returns little-endian float32 bytes and headers.
 
-    X-Shape is "H,W,C", X-Channels names the C channels, X-Dtype is "<f4". Rows from the top, C fastest.
+    X-Shape is "H,W,C", X-Channels names the C channels, and X-Dtype is "<f4". Rows run from the top, and channels vary
+    fastest.
     """
     names = [channel for kind in arrays for channel in CHANNELS[kind]]
     stack = np.concatenate([array[..., None] if array.ndim == 2 else array for array in arrays.values()], axis=-1)
@@ -238,12 +239,15 @@ def float32(arrays: Mapping[str, NDArray[Any]]) -> tuple[bytes, dict[str, str]]:
 def encode_view(
     view: View, kinds: Sequence[str], format: str, quality: int | None = None
 ) -> tuple[bytes, str, dict[str, str]]:
-    """Encodes a view: returns body, media type and headers. The route has checked that a picture holds one kind.
+    """Encodes a view and returns body, media type and headers.
+
+    The image formats encode only the first of `kinds`; the route has checked that there is exactly one.
 
     Args:
-        view: the rendered arrays. kinds: those to encode.
+        view: rendered arrays.
+        kinds: names of the arrays to encode.
         format: png, jpeg, webp, npz or float32.
-        quality: 1…100, of JPEG and WebP.
+        quality: quality of JPEG and WebP, 1…100; None for the default.
     """
     arrays: dict[str, Any] = {kind: getattr(view, kind) for kind in kinds}
     if format == "npz":
@@ -253,7 +257,7 @@ def encode_view(
         return body, BYTES, headers
     pixels, headers = _pixels(kinds[0], arrays[kinds[0]])
     media_type = f"image/{format}"
-    if kinds[0] == "parts":  # imageio writes no palettes
+    if kinds[0] == "parts":  # imageio cannot write palettes
         picture, file = Image.fromarray(pixels), io.BytesIO()
         picture.putpalette(_PART_COLOURS)
         picture.save(file, "PNG", compress_level=1)
@@ -262,13 +266,13 @@ def encode_view(
     if format == "jpeg":
         options = {"quality": quality or QUALITY, "subsampling": 0}
     elif format == "webp":
-        # A live view: fast rather than small (method 0 takes a third of the time of the default).
+        # Live views need speed, not small files: method 0 takes a third of the default's time.
         options = {"quality": quality or QUALITY, "method": 0}
     return imageio.imwrite("<bytes>", pixels, extension=f".{format}", plugin="pillow", **options), media_type, headers
 
 
 def part_colours() -> list[int]:
-    """Returns a palette, 256 × RGB: 0 is black, then the colour of each label."""
+    """Returns a palette of 256 RGB colours: black for index 0, then the colour of each label."""
     return [0, 0, 0, *(channel for label in range(255) for channel in part_colour(label))]
 
 
@@ -276,7 +280,7 @@ _PART_COLOURS = part_colours()
 
 
 def _pixels(kind: str, array: NDArray[Any]) -> tuple[NDArray[np.uint8 | np.uint16], dict[str, str]]:
-    """Returns the pixels of a picture: depth in 16 bits; parts as labels, which a palette shows; else in 8 bits."""
+    """Returns the pixels and headers of an image: depth as 16 bits, parts as palette indices, else 8 bits."""
     if kind == "depth":
         met = np.isfinite(array)
         near, far = (float(array[met].min()), float(array[met].max())) if met.any() else (0.0, 0.0)

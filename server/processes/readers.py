@@ -1,8 +1,7 @@
-"""Answers queries about the committed states of a scene: its two reader processes and the queues before them.
+"""Queries about the committed states of a scene, answered by two reader processes with a queue each.
 
-Views have a process of their own: a long track query, or a search for parts, never stands before them. The other
-process starts with its first query, runs at a lower priority, and is ended when its query was cancelled: it holds
-nothing that is not on disk.
+Views have their own process, so a long track or part query never delays them. The other process starts with its first
+query and runs at lower priority. It is stopped if its query is cancelled, since all its data is on disk.
 """
 
 from __future__ import annotations
@@ -34,23 +33,25 @@ from server.processes.queries import (
 from server.processes.query_executor import OnDamage, QueryExecutor
 
 GRACE_VIEWS_S, GRACE_BULK_S = 10.0, 1.0
-"""A process may go on for so long with a cancelled query: a new process takes a second or two to start."""
+"""Seconds for which a process may continue with a cancelled query; starting a new process takes 1 to 2 s."""
 MOST_STALE = 10_000
-"""Frames that are noted one by one; for more, the states are listed anew."""
+"""Maximum number of changed frames that are tracked individually; beyond it, the states folder is listed again."""
 COUNTS_KEPT = 8
-"""Numbers of parts whose labels are kept."""
+"""Number of part counts whose labels are cached."""
 
 NOT_COMMITTED = "ask for a frame that the scene's status counts as committed"
 REMEDIES = {404: NOT_COMMITTED, 500: SERVICE_FAULT, 503: "ask again later"}
-"""Remedies by the status of an answer, where the process says none."""
+"""Default remedy per HTTP status, used if the process gives none."""
 
 
 @dataclass(frozen=True, eq=False)
 class CachedLabels:
-    """Part labels, computed from the frames up to one.
+    """Cached part labels [N].
 
     Attributes:
-        commits: commits that the reader knew of. frame: the last one read, as text.
+        commits: change counter of the readers when the labels were computed.
+        frame: index of the newest frame used, as text.
+        labels: part labels [N].
     """
 
     commits: int
@@ -59,10 +60,11 @@ class CachedLabels:
 
 
 class Readers:
-    """Answers queries about a scene's committed frames.
+    """Reader processes that answer queries about a scene's committed frames.
 
     Attributes:
-        views, bulk: the two processes.
+        views: queue and process for views.
+        bulk: queue and process for all other queries.
     """
 
     def __init__(self, spec: SceneSpec, placement: Placement, damaged: OnDamage) -> None:
@@ -76,25 +78,26 @@ class Readers:
 
     @property
     def busy(self) -> bool:
-        """True while a query is not answered, or labels are being found."""
+        """True while a query is pending or part labels are being computed."""
         return self.views.busy or self.bulk.busy or bool(self._finding)
 
     def start(self) -> None:
-        """Starts the process of views before anybody asks."""
+        """Starts the view process before the first query."""
         self.views.start()
 
     async def ask(self, query: Query) -> Answer:
         """Returns the answer to a query; cancelling this cancels the query.
 
         Raises:
-            Problem: 4xx, it cannot be answered; 503, it takes too long or too many wait; 500, a fault of the reader.
+            Problem: 4xx if the query cannot be answered, 503 if it takes too long or the queue is full, 500 if the
+                reader fails.
         """
         began, outcome = time.perf_counter(), "failed"
         try:
             answer, outcome = await self._answer(query), "answered"
             return answer
         except asyncio.CancelledError:
-            outcome = "cancelled"  # by who asked: no fault
+            outcome = "cancelled"  # by the caller: not a failure
             raise
         finally:
             counters.QUERY_SECONDS.labels(query.kind, outcome).observe(time.perf_counter() - began)
@@ -111,7 +114,7 @@ class Readers:
         return replace(answer, headers={**answer.headers, "X-Parts-Frame": labels.frame})
 
     def refresh(self, frames: tuple[int, ...] | None = None) -> None:
-        """Notes frames that were committed, deleted or taken back: these, or any of them for None."""
+        """Records that `frames` were committed, deleted or rolled back; None means any frame may have changed."""
         self._commits += 1
         for queue in (self.views, self.bulk):
             if frames is None or queue.stale is None or len(queue.stale) > MOST_STALE:
@@ -120,13 +123,13 @@ class Readers:
                 queue.stale.update(frames)
 
     async def stop(self, seconds: float = STOP_SECONDS) -> None:
-        """Ends the processes within `seconds`; queries that wait are refused."""
+        """Stops both processes within `seconds` and refuses queued queries."""
         for task in self._finding.values():
             task.cancel()
         await asyncio.gather(self.views.stop(seconds), self.bulk.stop(seconds))
 
     async def _tracks(self, query: TracksQuery) -> Answer:
-        """Answers a track query; a long one in pieces, so that others come in between."""
+        """Answers a track query, split into pieces if it is long so that other queries run in between."""
         pieces = track_answers.split_query(query)
         if len(pieces) * len(pieces[0]) == 1:
             return _check_answer(await self.bulk.ask(query), query)
@@ -134,10 +137,10 @@ class Readers:
         return Answer(0, *await asyncio.to_thread(track_answers.join_and_encode, answers, query, self._spec))
 
     async def _labels_of(self, count: int | None) -> CachedLabels:
-        """Returns the part labels for a view; only the first call waits, later ones get the labels found last.
+        """Returns the part labels for a view; only the first call waits, later calls get the latest available labels.
 
-        They are found from the whole history, which takes longer than a view. After a commit they are found anew while
-        views go on with those before.
+        Labels are computed from the whole history, which takes longer than rendering a view. After a commit they are
+        recomputed in the background while views use the previous ones.
         """
         known = self._labels.get(count)
         if known is not None and known.commits == self._commits:

@@ -1,4 +1,4 @@
-"""The replay process: updates a scene's last frames again, to measure other budgets, at a low priority."""
+"""Replay process, which repeats a scene's latest updates at low priority to measure other iteration budgets."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from server.processes.placement import enter_background, finish_background, use_
 from server.processes.worker import decode, read
 
 NICE = 15
-"""Added to its niceness: of a core that it shares with a scene's worker it gets about a tenth."""
+"""Niceness increment of the process: it gets about a tenth of a core that it shares with a scene's worker."""
 THREADS = 1
-"""A replay runs on so many: the others belong to the update."""
+"""Number of threads of a replay; the other cores are left to the worker."""
 
 log = logging.getLogger("scas4d.replayer")
 
 
 def main(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
-    """Runs one replay; the service ends the process when its answer is not wanted any more."""
+    """Runs one replay; the service terminates the process if its result is no longer needed."""
     enter_background(NICE)
     fault: str | None = None
     try:
         _replay(spec, connection)
-    except Exception as error:  # whatever the core raises, the service goes on and says so
+    except Exception as error:  # any failure in the core must be reported, and the service must keep running
         log.exception("scene %s: the replay failed", spec.scene.folder.name)
         fault = f"{type(error).__name__}: {message_of(error)}"
     finish_background(connection, ReplayEnded(fault))
@@ -35,7 +35,7 @@ def main(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
 
 def _replay(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
     scene = spec.scene
-    # Read once: while this goes on, the scene's retention may delete records and states.
+    # Read everything first, because the scene's retention may delete records and states during the replay.
     frames = [partial(decode, scene.rig, message, read(scene.folder.frames, message)) for message in spec.frames]
     history = History.load(scene.folder.states, only=(spec.first, spec.base))
     try:
@@ -44,7 +44,7 @@ def _replay(spec: ReplaySpec, connection: Connection[Any, Any]) -> None:
     finally:
         if faults := history.pop_faults():
             connection.send(DamageFound(faults))
-    from scas4d_core.replay import replay  # in this process only: the one that imports this module stays light
+    from scas4d_core.replay import replay  # imported lazily: the service process does not need the core
     from scas4d_core.warm_up import compile_in_processes
 
     compile_in_processes()

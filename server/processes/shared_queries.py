@@ -1,4 +1,4 @@
-"""Queries to a scene's readers on behalf of its subscribers: equal ones are asked once."""
+"""Deduplicated queries to a scene's readers on behalf of its stream subscribers."""
 
 from __future__ import annotations
 
@@ -13,31 +13,35 @@ import numpy as np
 from server.processes.queries import Answer, Query, RenderQuery
 
 QUERIES_AT_ONCE = 2
-"""Queries of a lane that a scene's reader has for subscribers: one at work and one that follows at once; the others are
-made up when their turn comes, for what is newest then."""
+"""Maximum number of subscriber queries that a scene's reader holds per lane: one running and one ready to follow.
+
+Other queries are built when their turn comes, so that they ask for the newest data.
+"""
 KEPT_ANSWERS = 64
+"""Maximum number of cached answers."""
 KEPT_BYTES = 32_000_000
+"""Maximum total size of cached answers in bytes."""
 
 AskReaders = Callable[[Query], Awaitable[Answer]]
 
 
 class SharedQuery(Protocol):
-    """A query and the key that is the same for all who would get the same answer."""
+    """Query with a key that is equal for all subscribers that would get the same answer."""
 
     @property
     def key(self) -> Hashable:
-        """Equal for equal queries."""
+        """Cache key, equal for equal queries."""
 
     @property
     def query(self) -> Query:
-        """The query to the readers."""
+        """Query to the readers."""
 
 
 Q = TypeVar("Q", bound=SharedQuery)
 
 
 def fingerprint(value: Any) -> Hashable:
-    """A value that is equal for equal queries: dataclasses by field, arrays by content."""
+    """Returns a hashable value that is equal for equal queries; compares dataclasses by field and arrays by content."""
     if is_dataclass(value) and not isinstance(value, type):
         return (type(value).__name__, *(fingerprint(getattr(value, field.name)) for field in fields(value)))
     if isinstance(value, np.ndarray):
@@ -51,15 +55,16 @@ def fingerprint(value: Any) -> Hashable:
 
 
 def lane(query: Query) -> str:
-    """Returns the lane of a query: trajectories and parts take longer than views and must not stand before them."""
+    """Returns the lane of a query; trajectories and parts take longer than views and must not delay them."""
     return "views" if isinstance(query, RenderQuery) and "parts" not in query.kinds else "bulk"
 
 
 class SharedQueries:
-    """Asks the reader, `QUERIES_AT_ONCE` of a lane at a time; keeps the last answers for those who come a moment later.
+    """Deduplicating front end of a scene's readers, with a small cache of recent answers.
 
-    A subscriber that waits for its turn makes up the query when the turn has come: a camera that was moved meanwhile is
-    asked for where it is now. Turns are given in the order of waiting, so no subscriber starves another one.
+    At most `QUERIES_AT_ONCE` queries per lane are in flight. A waiting subscriber builds its query only when its turn
+    comes, so a camera that moved in the meantime is rendered at its current pose. Turns are served in FIFO order, so no
+    subscriber starves another.
     """
 
     def __init__(self, ask: AskReaders) -> None:
@@ -69,13 +74,13 @@ class SharedQueries:
         self._kept: OrderedDict[Hashable, Answer] = OrderedDict()
         self._bytes = 0
         self.asked = 0
-        """Queries that reached the readers."""
+        """Number of queries sent to the readers."""
 
     async def answer(self, question: Callable[[], Q]) -> tuple[Q, Answer]:
-        """Returns the query and its answer; `question` makes up the query at the moment of asking.
+        """Returns the query and its answer; `question` builds the query just before it is sent.
 
         Raises:
-            Problem: what `question` or the scene raises.
+            Problem: raised by `question` or by the scene.
         """
         asked = question()
         while not self._known(asked.key):
@@ -84,7 +89,7 @@ class SharedQueries:
             begun = False
             try:
                 now = question()
-                # Another kind of query by now: it has its own turns to wait for.
+                # The query may have changed its lane while waiting; it must then wait for a turn in that lane.
                 if not self._known(now.key) and self._turns[lane(now.query)] is turns:
                     self._begin(now.key, now.query, turns)
                     begun = True
@@ -95,7 +100,7 @@ class SharedQueries:
         if asked.key in self._kept:
             self._kept.move_to_end(asked.key)
             return asked, self._kept[asked.key]
-        # Shielded: one who leaves does not take the answer away from the others.
+        # Shielded, so that cancelling one subscriber does not cancel the query for the others.
         return asked, await asyncio.shield(self._working[asked.key])
 
     def _known(self, key: Hashable) -> bool:

@@ -1,4 +1,4 @@
-"""Compacts the older states of a scene in its worker: one after each commit, more while no message waits."""
+"""Compaction of a scene's older states in its worker: one after each commit, more while the worker is idle."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from server.processes.compact_answers import compact_head
 from server.storage.disk import no_room
 
 BEHIND = 8
-"""States more than are to stay exact: from there on one is compacted before the next frame, though that waits."""
+"""Backlog of due states above which one is compacted before the next frame, even if that frame is waiting."""
 
 log = logging.getLogger("scas4d.worker")
 
 
 class StateCompactor:
-    """Keeps the newest states of a scene exact and the others compact.
+    """Compactor that keeps the newest states of a scene exact and converts older ones to the compact format.
 
     Args:
-        spec: of the scene; ``kept.exact_states`` None: all stay exact.
+        spec: description of the scene. If ``retention.exact_states`` is None, all states stay exact.
     """
 
     def __init__(self, spec: SceneSpec) -> None:
@@ -34,17 +34,18 @@ class StateCompactor:
         self._failed = False
 
     def set_rules(self, rules: IngestSettings) -> None:
-        """Goes by other rules from now on."""
+        """Applies new retention rules from now on."""
         self._rules = rules
         if self._compaction is not None:
             self._compaction.close()
         self._compaction = None
 
     def compact_while_idle(self, history: History, waits: Callable[[], bool]) -> None:
-        """Compacts states that are due until a message waits; a disk that takes nothing is tried at the next message.
+        """Compacts due states until a message arrives; if the disk is full, retries at the next message.
 
         Args:
-            history: of the scene. waits: returns whether a message waits.
+            history: states of the scene.
+            waits: returns whether a message is waiting.
         """
         exact = self._rules.exact_states
         if self._failed or exact is None:
@@ -55,7 +56,7 @@ class StateCompactor:
             while (due := self._compaction.due) and (due > BEHIND or not waits()):
                 if self._compaction.step() is None or waits():
                     return
-        except Exception as error:  # whatever it is, the scene goes on with exact states
+        except Exception as error:  # compaction is optional: the scene continues with exact states
             if no_room(error):
                 log.warning("scene %s: no state is compacted: %s", self._spec.folder.name, error)
                 return

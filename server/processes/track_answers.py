@@ -1,7 +1,7 @@
-"""Encodes trajectories, and cuts long track queries into short ones.
+"""Encoding of trajectories, and splitting of long track queries.
 
-A reader answers one query after the other. A long one is asked in pieces, so that others come in between, and the
-answers are joined. docs/tracks.md has the layout of the npz.
+A reader answers one query at a time. A long query is split into pieces so that others can run in between, and the
+answers are joined. docs/tracks.md describes the npz layout.
 """
 
 from __future__ import annotations
@@ -30,34 +30,37 @@ Arrays = dict[str, NDArray[Any]]
 NPZ = "application/vnd.numpy.npz"
 
 PIECE_QUERIES = 2048
-"""Points of one piece: some 0.3 s to find what carries them among 25,000 Gaussians."""
+"""Maximum number of points per piece; associating them with 25,000 Gaussians takes about 0.3 s."""
 PIECE_POINTS = 32_768
-"""Points times frames of one piece: some 2 s."""
+"""Maximum number of points times frames per piece, about 2 s of work."""
 PIECE_VIEWS = 64
-"""Depth pictures of one piece, one a frame and camera in which visibility is asked: some 1 s at 256×256."""
+"""Maximum number of depth maps per piece, about 1 s of work at 256×256.
+
+Visibility needs one depth map per frame and camera.
+"""
 
 
 def npz(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    """Writes arrays as npz, without pickle."""
+    """Returns arrays encoded as npz, without pickle."""
     file = io.BytesIO()
     np.savez(file, allow_pickle=False, **arrays)
     return file.getvalue()
 
 
 def metres_per_unit(spec: SceneSpec) -> float:
-    """Returns the metres in a unit of the scene's world."""
+    """Returns the length of one scene unit in metres."""
     return spec.rig.world_frame(spec.settings.scene.metres_per_unit).metres_per_unit
 
 
 def cameras_of(query: TracksQuery) -> list[Camera]:
-    """Returns the cameras with pixels and visibility: that of the query's pixels, then those asked for."""
+    """Returns the cameras for projection and visibility: the one of the query's pixels, then those requested."""
     own = [query.camera] if query.pixels is not None and query.camera is not None else []
     names = [camera.name for camera in own]
     return own + [camera for camera in query.project if camera.name not in names]
 
 
 def compute_tracks(reader: CommittedScene, history: History, query: TracksQuery) -> Arrays:
-    """Computes trajectories: ``tracks_world`` [T, Q, 3], ``confidence`` [T, Q] and more, as in docs/tracks.md."""
+    """Returns trajectories: ``tracks_world`` [T, Q, 3], ``confidence`` [T, Q] and more, as in docs/tracks.md."""
     frames = list(query.frames)
     if query.ids is not None:
         tracks = reader.tracks_of_ids(np.array(query.ids, dtype=np.int64), frames)
@@ -80,7 +83,7 @@ def compute_tracks(reader: CommittedScene, history: History, query: TracksQuery)
 
 
 def encode(found: Arrays, query: TracksQuery, metres_per_unit: float) -> tuple[bytes, str]:
-    """Returns body and media type of the answer, in the format that the query asks for."""
+    """Returns body and media type of the answer in the requested format."""
     cameras = cameras_of(query)
     pixels = {camera.name: camera.project(found["tracks_world"])[0] for camera in cameras}
     if query.format == "npz":
@@ -100,7 +103,7 @@ def encode(found: Arrays, query: TracksQuery, metres_per_unit: float) -> tuple[b
 
 
 def _layout(found: Arrays, query: TracksQuery, cameras: Sequence[Camera], metres_per_unit: float) -> Arrays:
-    """Returns the keys of TAPVid-3D in the first camera; without cameras the points alone, in the axes of the world."""
+    """Returns the TAPVid-3D keys for the first camera; without cameras, only the points in world axes and metres."""
     if not cameras:
         return {"tracks_XYZ": (found["tracks_world"] * metres_per_unit).astype(np.float32)}
     row = query.frames.index(query.at) if query.at in query.frames else -1
@@ -111,7 +114,7 @@ def _layout(found: Arrays, query: TracksQuery, cameras: Sequence[Camera], metres
 
 
 def split_query(query: TracksQuery) -> list[list[TracksQuery]]:
-    """Cuts a query by points, then by frames; a short one stays one piece. Every piece is answered as npz."""
+    """Splits a query by points, then by frames; a short query stays in one piece. All pieces are answered as npz."""
     queries = next(value for value in (query.ids, query.pixels, query.points) if value is not None)
     frames = min(PIECE_POINTS // min(len(queries), PIECE_QUERIES), PIECE_VIEWS // max(1, len(cameras_of(query))))
     return [
@@ -124,7 +127,7 @@ def split_query(query: TracksQuery) -> list[list[TracksQuery]]:
 
 
 def join_answers(answers: Sequence[Sequence[bytes]]) -> Arrays:
-    """Joins the answers of pieces: inner ones follow each other in time, outer ones hold more points."""
+    """Joins the answers of pieces: the inner sequences along time, the outer sequence along points."""
     rows = [_join_in_time([_read_npz(body) for body in row]) for row in answers]
     once = ("frames", "times")
     return {
@@ -136,7 +139,7 @@ def join_answers(answers: Sequence[Sequence[bytes]]) -> Arrays:
 
 
 def join_and_encode(answers: Sequence[Sequence[bytes]], query: TracksQuery, spec: SceneSpec) -> tuple[bytes, str]:
-    """Joins the answers of pieces; returns body and media type of the whole answer."""
+    """Joins the answers of pieces and returns body and media type of the whole answer."""
     return encode(join_answers(answers), query, metres_per_unit(spec))
 
 
@@ -147,7 +150,7 @@ def _join_in_time(found: Sequence[Arrays]) -> Arrays:
 
 
 def _read_npz(body: bytes) -> Arrays:
-    """Reads the arrays of ``compute_tracks`` from an answer as npz."""
+    """Returns the arrays of ``compute_tracks`` from an npz answer."""
     names = ("tracks_world", "confidence", "ids", "frames", "times")
     with np.load(io.BytesIO(body), allow_pickle=False) as file:
         return {name: file[name] for name in file.files if name in names or name.startswith("visibility.")}

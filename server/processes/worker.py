@@ -1,4 +1,4 @@
-"""The worker process owns a scene's `Reconstruction`: it resumes, decodes frames, updates, commits and reports."""
+"""Worker process, which owns a scene's `Reconstruction`: it decodes frames, runs updates, commits and reports."""
 
 from __future__ import annotations
 
@@ -51,16 +51,18 @@ if TYPE_CHECKING:
     from scas4d_core.reconstruction import Reconstruction
 
 PROGRESS_EVERY_S = 0.2
+"""Minimum interval in seconds between progress messages."""
 NICE = 5
-"""Added to the worker's niceness: requests and views go ahead of updates (docs/viewer.md has what that is worth)."""
+"""Niceness increment of the worker, so that requests and views have priority over updates (see docs/viewer.md)."""
 STALL_S, LONGEST_STALL_S = 1.0, 30.0
+"""Initial and maximum delay in seconds between attempts to commit a frame to a full disk."""
 
 log = logging.getLogger("scas4d.worker")
 
 
 def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
-    """Runs the process until it is asked to stop, or until the service is gone."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the service says when to stop
+    """Runs the worker process until it is asked to stop or the service exits."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the service decides when to stop
     os.nice(NICE)
     end_with_parent()
     lock = lock_states(spec.folder)
@@ -82,7 +84,7 @@ def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
             raise
     except _Stopped:
         pass
-    # Numerical libraries keep threads that can hang at exit, and all that matters is on disk.
+    # Threads of numerical libraries can hang at exit, and all relevant data is on disk.
     logging.shutdown()
     if lock is not None:
         lock.release()
@@ -90,11 +92,14 @@ def main(spec: SceneSpec, connection: Connection[Any, Any]) -> None:
 
 
 class _Stopped(Exception):
-    """The worker was asked to stop while it waited for room on the disk."""
+    """Signal that the worker was asked to stop while it waited for disk space."""
 
 
 class Worker:
-    """Updates one scene. Every frame ends as `FrameCommitted` or `FrameFailedInWorker`, or with the process."""
+    """Worker of one scene.
+
+    Every frame results in `FrameCommitted` or `FrameFailedInWorker`, unless the process exits.
+    """
 
     def __init__(self, spec: SceneSpec, connection: Connection[Any, Any]) -> None:
         self.spec = spec
@@ -111,13 +116,13 @@ class Worker:
         self._compacting = StateCompactor(spec)
 
     def resume(self) -> bool:
-        """Resumes from the committed states and reports them; returns False if that cannot be done."""
+        """Resumes from the committed states and reports them; returns False if that fails."""
         try:
             self.states = history = History.open(self.spec.folder.states)
             undone: tuple[int, ...] = ()
             faults: tuple[str, ...] = ()
             if history.indices:
-                from scas4d_core.reconstruction import Reconstruction  # in this process only: the service stays light
+                from scas4d_core.reconstruction import Reconstruction  # imported lazily: not needed by the service
 
                 wait_for_updates(self.spec.settings, None)
                 self._compiled = True
@@ -130,14 +135,14 @@ class Worker:
                 faults += tuple(repair_at_start(history))
             report = history.report(history.indices[-1]) if history.indices else {}
             self.connection.send(Ready(tuple(history.indices), dict(history.damaged), report, undone, faults))
-        except (HistoryError, ValueError) as error:  # what is damaged says so with a ValueError
+        except (HistoryError, ValueError) as error:  # damaged data raises ValueError
             log.exception("scene %s cannot be resumed", self.spec.folder.name)
             self.connection.send(ResumeFailed(f"{type(error).__name__}: {message_of(error)}"))
             return False
         return True
 
     def handle_frame(self, message: FrameReady) -> None:
-        """Reconstructs one frame; while the disk is full, tries again until there is room."""
+        """Reconstructs one frame; retries while the disk is full."""
         stall = STALL_S
         while True:
             try:
@@ -146,7 +151,7 @@ class Worker:
                 self.connection.send(done)
                 self._publish_seconds += time.perf_counter() - began
                 return
-            except Exception as error:  # whatever came of it, as zipfile closing what it could not write
+            except Exception as error:  # a full disk can surface as other errors, e.g. from zipfile on close
                 if not no_room(error):
                     raise
                 log.warning("scene %s, frame %d: %s", self.spec.folder.name, message.index, error)
@@ -155,13 +160,16 @@ class Worker:
             stall = min(2 * stall, LONGEST_STALL_S)
 
     def next(self) -> Any:
-        """Returns the next message; those that came while a frame waited for room go first. Compacts meanwhile."""
+        """Returns the next message and compacts states while idle.
+
+        Messages that arrived while a frame waited for disk space come first.
+        """
         if self.states is not None and len(self.states) > (self.spec.retention.exact_states or len(self.states)):
             self._compacting.compact_while_idle(self.states, lambda: bool(self._later) or self.connection.poll(0))
         return self._later.popleft() if self._later else self.connection.recv()
 
     def _await_room(self, seconds: float) -> None:
-        """Waits; only `Stop` ends this early, other messages are kept for later.
+        """Waits for `seconds`; only `Stop` ends the wait early, other messages are queued.
 
         Raises:
             _Stopped: the service asked the worker to stop.
@@ -174,7 +182,7 @@ class Worker:
             self._later.append(message)
 
     def finish(self, message: FrameReady) -> FrameCommitted | FrameFailedInWorker:
-        """Commits a frame, or returns the reason why it fails.
+        """Reconstructs and commits a frame, or returns the reason for its failure.
 
         Raises:
             OSError: the disk is full; nothing is committed.
@@ -190,30 +198,30 @@ class Worker:
             return self.reconstruct(frame, dropped, message.budget, began)
         except FrameDamage as error:
             return FrameFailedInWorker(message.index, f"its record in the frame log is damaged: {error}", dropped)
-        except Exception as error:  # whatever the core raises, the service goes on and says so
+        except Exception as error:  # any failure in the core must be reported, and the service must keep running
             if no_room(error):
                 raise
             log.exception("scene %s, frame %d", self.spec.folder.name, message.index)
-            # Without a first frame there is nothing to go on from.
+            # Without a first frame the scene cannot continue.
             first = self.reconstruction is None
             return FrameFailedInWorker(
                 message.index, f"{type(error).__name__}: {message_of(error)}", dropped, fatal=first
             )
 
     def set_retention(self, message: ChangeRetention) -> None:
-        """Keeps states by other rules, and reports which that deletes."""
+        """Applies new retention rules and reports the states that they delete."""
         self.spec = replace(self.spec, retention=message.rules)
         self._compacting.set_rules(message.rules)
         self.connection.send(StatesRetained(tuple(self.retain())))
 
     def repair(self, message: RepairFiles) -> None:
-        """Checks files that were found damaged, and reports the outcome of each."""
+        """Checks and repairs files that were found damaged, and reports the outcome of each."""
         assert self.states is not None
         for mended in repairs.repair_files(self.states, self.reconstruction, message):
             self.connection.send(mended)
 
     def recompute(self, message: RecomputeState) -> None:
-        """Computes a damaged state again from its pictures, and reports the outcome."""
+        """Recomputes a damaged state from its images and reports the outcome."""
         assert self.states is not None
         frame = message.frame
 
@@ -224,7 +232,14 @@ class Worker:
             self.connection.send(mended)
 
     def reconstruct(self, frame: Frame, dropped: dict[str, str], budget: Budget, began: float) -> FrameCommitted:
-        """Runs the first frame or an update, and commits. `began`: `perf_counter` before decoding."""
+        """Runs the first frame or an update and commits the result.
+
+        Args:
+            frame: decoded images and masks.
+            dropped: cameras that were left out, with the reason.
+            budget: limits of an update; not used for the first frame.
+            began: `time.perf_counter()` before decoding.
+        """
         assert self.states is not None
         if self.reconstruction is None:
             from scas4d_core.reconstruction import Reconstruction
@@ -242,7 +257,7 @@ class Worker:
             )
         else:
             if not self._compiled:
-                began += wait_for_updates(self.spec.settings, self.connection)  # no time of the frame's
+                began += wait_for_updates(self.spec.settings, self.connection)  # compile time does not count
                 self._compiled = True
             if budget != self._budget:
                 self.reconstruction.set_budget(**budget.model_dump())
@@ -260,21 +275,21 @@ class Worker:
         return FrameCommitted(frame.index, committed, tuple(self.retain()))
 
     def retain(self) -> list[int]:
-        """Deletes old states by the scene's rule and returns their indices; failures are tried again next time."""
+        """Deletes old states according to the scene's rules and returns their indices; failures are retried later."""
         assert self.states is not None
         rule = self.spec.retention.keep_states
         last, size = (None if value is None else max(1, value) for value in (rule.last, rule.bytes))
         return self.states.retain(last=last, size_bytes=size)
 
     def points(self) -> InitialPoints | None:
-        """Reads the initial cloud, if one was put before the first frame."""
+        """Returns the initial point cloud, or None if none was uploaded before the first frame."""
         if not self.spec.folder.points.exists():
             return None
         arrays = read_npz(self.spec.folder.points)
         return InitialPoints(arrays["positions"], arrays["colours"], arrays.get("foreground"))
 
     def progress(self, progress: Any) -> None:
-        """Sends progress a few times a second at most, and always at the end of a stage."""
+        """Sends progress at most every `PROGRESS_EVERY_S` seconds, and always at the end of a stage."""
         now = time.monotonic()
         if now - self._progress_at >= PROGRESS_EVERY_S or progress.done >= progress.total:
             self._progress_at = now
@@ -285,12 +300,12 @@ class Worker:
 Picture = NDArray[np.uint8]
 
 DECODERS = 8
-"""Cameras that are decoded at a time at most: each holds its picture twice meanwhile."""
+"""Maximum number of cameras decoded in parallel; each holds its image twice in memory during decoding."""
 
 
 @dataclass(frozen=True)
 class Encoded:
-    """The files of a frame by camera, as they were sent. faults: a sentence for each record that could not be read."""
+    """Encoded images and masks of a frame per camera; `faults` has a sentence for each unreadable record."""
 
     images: dict[str, memoryview]
     masks: dict[str, memoryview]
@@ -320,11 +335,11 @@ def read(folder: Path, message: FrameReady) -> Encoded:
 
 
 def decode(rig: Rig, message: FrameReady, encoded: Encoded) -> tuple[Frame, dict[str, str]]:
-    """Returns the frame, and the cameras left out of it with the reason; cameras are decoded side by side."""
+    """Returns the frame and the cameras that were left out, with the reason; cameras are decoded in parallel."""
     with ThreadPoolExecutor(max_workers=min(DECODERS, os.cpu_count() or 1)) as pool:
         decoded = list(pool.map(lambda camera: _pictures_of(camera, encoded), rig.cameras))
     images, masks, dropped = {}, {}, {}
-    # In the order of the rig, whatever the order in which they came: the same pictures give the same bits.
+    # In rig order regardless of arrival order, so that equal images give bit-identical results.
     for camera, pictures in zip(rig.cameras, decoded, strict=True):
         if isinstance(pictures, str):
             dropped[camera.name] = pictures
@@ -336,7 +351,7 @@ def decode(rig: Rig, message: FrameReady, encoded: Encoded) -> tuple[Frame, dict
 
 
 def _pictures_of(camera: Camera, encoded: Encoded) -> tuple[Picture, Picture | None] | str:
-    """Returns a camera's picture and its mask, if one was sent; or the reason to leave the camera out."""
+    """Returns a camera's image and optional mask, or the reason for leaving the camera out."""
     name, size = camera.name, (camera.width, camera.height)
     if name not in encoded.images:
         return "; ".join(encoded.faults) or f"camera {name!r} had sent nothing when the frame was closed"

@@ -1,1 +1,1 @@
-"""Checks requests for views and tracks, and turns them into queries to the readers of a scene."""
+"""Validation of view and track requests, and their conversion into queries to the readers of a scene."""

@@ -1,4 +1,4 @@
-"""Makes the query of a view, for requests over HTTP and for live views."""
+"""Conversion of view requests into render queries, for HTTP requests and live views."""
 
 from __future__ import annotations
 
@@ -8,17 +8,20 @@ from server.processes.queries import RenderQuery
 from server.scene.scene import Scene
 
 MOST_PIXELS = 8_000_000
-"""Pixels of one view: 4K, some seconds on one core. A larger one would keep others waiting."""
+"""Maximum number of pixels per view: 4K, which takes a few seconds on one core.
+
+Larger views would delay other queries too long.
+"""
 
 SEVERAL = (RenderFormat.NPZ, RenderFormat.FLOAT32)
 LOSSY = (RenderFormat.JPEG, RenderFormat.WEBP)
 
 
 def render_query(scene: Scene, request: RenderRequest) -> RenderQuery:
-    """Checks a request for a view and returns the query to the reader.
+    """Returns the reader query for a view request after validating it.
 
     Raises:
-        Problem: 404, 409 or 503, the frame cannot be read; 422, the request cannot be met.
+        Problem: 404, 409 or 503 if the frame cannot be read; 422 if the request is invalid.
     """
     camera = scene.camera(request.camera) if isinstance(request.camera, str) else request.camera.camera()
     if request.width is not None:
@@ -27,7 +30,7 @@ def render_query(scene: Scene, request: RenderRequest) -> RenderQuery:
     if pixels > MOST_PIXELS:
         raise Problem(
             422,
-            f"a view of {pixels} pixels",
+            f"the view has {pixels} pixels",
             field="camera" if request.width is None else "width",
             value=f"{camera.width}x{camera.height}",
             remedy=f"ask for at most {MOST_PIXELS} pixels",
@@ -39,15 +42,15 @@ def render_query(scene: Scene, request: RenderRequest) -> RenderQuery:
             f"{request.format} cannot contain {count_noun(len(kinds), 'kind')}",
             field="kinds",
             value=", ".join(kinds),
-            remedy="ask for one kind, or for npz or float32",
+            remedy="request one kind, or npz or float32",
         )
     if request.format in LOSSY and kinds[0] in ("depth", "parts"):
         raise Problem(
             422,
-            f"{request.format} would change {kinds[0]}",
+            f"{request.format} would distort {kinds[0]}",
             field="format",
             value=request.format.value,
-            remedy="ask for png, npz or float32",
+            remedy="request png, npz or float32",
         )
     own = scene.spec.settings.scene.background
     return RenderQuery(

@@ -1,4 +1,7 @@
-"""Makes the query of point tracks, for requests over HTTP and for live tracks; docs/tracks.md describes the answers."""
+"""Conversion of track requests into track queries, for HTTP requests and live tracks.
+
+docs/tracks.md describes the answers.
+"""
 
 from __future__ import annotations
 
@@ -16,21 +19,25 @@ from server.queries.render import MOST_PIXELS
 from server.scene.scene import Scene
 
 MOST_POINTS = 1_000_000
-"""Points times frames of one query: a minute of the reader, which takes it in pieces, and 30 MB as npz."""
+"""Maximum number of points times frames per query.
+
+The limit amounts to about one minute of reader time, split into pieces, and 30 MB as npz.
+"""
 MOST_JSON_POINTS = 100_000
-"""Points times frames of an answer as JSON, some 100 bytes each; npz takes more."""
+"""Maximum number of points times frames in a JSON answer, at about 100 bytes each; npz allows more."""
 MOST_VIEWS = 4096
-"""Cameras times frames of a query in which visibility is asked for: a depth picture each, about a minute in all."""
+"""Maximum number of cameras times frames for visibility: one depth map each, about one minute in total."""
 LARGEST_ID = 2**63 - 1
+"""Largest possible id of a Gaussian."""
 FARTHEST = 1e15
-"""Coordinates beyond overflow where they are squared and scaled, and what comes out is no number."""
+"""Maximum absolute coordinate; squaring and scaling larger values would overflow."""
 
 
 def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
-    """Checks a request for tracks and returns the query to the reader.
+    """Returns the reader query for a track request after validating it.
 
     Raises:
-        Problem: 404, 409 or 503, a frame cannot be read; 422, the request cannot be met.
+        Problem: 404, 409 or 503 if a frame cannot be read; 422 if the request is invalid.
     """
     kinds = {"ids": request.ids, "pixels": request.pixels, "points": request.points}
     asked = [(name, value) for name, value in kinds.items() if value is not None]
@@ -72,7 +79,7 @@ def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
     if request.pixels is not None and request.camera is None:
         raise Problem(
             422,
-            "pixels need a camera, and none is named",
+            "pixels need a camera",
             field="camera",
             value="nothing",
             remedy=f"name one of {', '.join(scene.rig.names)}",
@@ -80,7 +87,7 @@ def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
     if request.points is not None and max(abs(value) for row in request.points for value in row) > FARTHEST:
         raise Problem(
             422,
-            "a point too far away to compute with",
+            "a point is too far away",
             field="points",
             value=max((row for row in request.points), key=lambda row: max(map(abs, row))),
             remedy=f"give coordinates up to {FARTHEST:g}, in the rig's units",
@@ -109,7 +116,7 @@ def tracks_query(scene: Scene, request: TracksRequest) -> TracksQuery:
 
 
 def _check_pixels(query: TracksQuery) -> None:
-    """Refuses pixels outside the picture."""
+    """Raises `Problem` if a pixel lies outside the image."""
     if query.camera is None or query.pixels is None:
         return
     width, height = query.camera.width, query.camera.height
@@ -126,7 +133,7 @@ def _check_pixels(query: TracksQuery) -> None:
 
 
 def _check_camera_names(cameras: list[Camera]) -> tuple[Camera, ...]:
-    """Checks that cameras of one name are the same: answers go by the name."""
+    """Returns the distinct cameras; raises `Problem` if two different ones share a name, the key of the answers."""
     by_name: dict[str, Camera] = {}
     for camera in cameras:
         known = by_name.setdefault(camera.name, camera)
@@ -136,7 +143,7 @@ def _check_camera_names(cameras: list[Camera]) -> tuple[Camera, ...]:
                 f"two different cameras are named {camera.name!r}",
                 field="project",
                 value=camera.name,
-                remedy="name each differently: the answer goes by names",
+                remedy="give them different names; answers are keyed by name",
             )
     return tuple(by_name.values())
 
@@ -144,7 +151,7 @@ def _check_camera_names(cameras: list[Camera]) -> tuple[Camera, ...]:
 def _camera(scene: Scene, camera: CameraModel | str) -> Camera:
     if isinstance(camera, str):
         return scene.camera(camera)
-    # Visibility is found from a rendered depth: the limit of views holds.
+    # Visibility is computed from a rendered depth map, so the pixel limit of views applies.
     if camera.width * camera.height > MOST_PIXELS:
         size = f"{camera.width}x{camera.height}"
         raise Problem(
@@ -158,8 +165,8 @@ def _camera(scene: Scene, camera: CameraModel | str) -> Camera:
 
 
 def check_ids(ids: Iterable[int]) -> None:
-    """Refuses ids that no Gaussian can have."""
+    """Raises `Problem` if an id is outside the range of Gaussian ids."""
     for id in ids:
         if not 0 <= id <= LARGEST_ID:
             remedy = "take ids from an answer"
-            raise Problem(422, f"no Gaussian can have the id {id}", field="ids", value=id, remedy=remedy)
+            raise Problem(422, f"{id} is not a valid id", field="ids", value=id, remedy=remedy)

@@ -1,1 +1,1 @@
-"""HTTP routes, one file per resource."""
+"""HTTP and WebSocket routes, one module per resource."""

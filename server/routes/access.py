@@ -1,4 +1,4 @@
-"""Dependencies of the routes: the scenes, the settings, one scene, and its answer to a query."""
+"""Shared dependencies of the routes: scenes, exports, settings, query parameter checks and reader queries."""
 
 from __future__ import annotations
 
@@ -54,23 +54,23 @@ AllScenes = Annotated[Scenes, Depends(_scenes)]
 AllExports = Annotated[Exports, Depends(_exports)]
 TheSettings = Annotated[ServerSettings, Depends(_settings)]
 TheScene = Annotated[Scene, Depends(_scene)]
-"""For what needs its processes: it is woken, and gets a place."""
+"""Scene for routes that need its processes: the scene is woken up and takes a slot."""
 TheRecord = Annotated[Scene, Depends(_record)]
-"""For what is known without them: it is read back from its folder, whether there is a place or not."""
+"""Scene for routes that do not need its processes: it is loaded from its folder even if no slot is free."""
 FrameIndex = Annotated[int, Path(ge=0, le=1_000_000_000)]
 
 
 def known(route: APIRoute) -> list[str]:
-    """Returns the names of a route's query parameters, in its own order."""
+    """Returns the names of a route's query parameters in declaration order."""
     fields = get_flat_params(route.dependant)
     return list(dict.fromkeys(field.alias for field in fields if isinstance(field.field_info, params.Query)))
 
 
 def only_known(connection: HTTPConnection) -> None:
-    """Refuses query parameters that the route does not know: a misspelt one is noticed.
+    """Rejects unknown query parameters, so that misspelled names do not go unnoticed.
 
     Raises:
-        Problem: 422, names the parameter and those that there are.
+        Problem: 422, with the unknown parameter and the valid ones.
     """
     route = connection.scope.get("route")
     if not isinstance(route, APIRoute):  # a WebSocket
@@ -83,14 +83,16 @@ def only_known(connection: HTTPConnection) -> None:
         near = difflib.get_close_matches(name, names, 1)
         meant = f"it may be {near[0]!r} that is meant; " if near else ""
         there = f"the parameters here are {', '.join(names)}" if names else "this address takes no parameters"
-        raise Problem(422, f"there is no parameter {name!r} here", field=name, value=value, remedy=meant + there)
+        raise Problem(422, f"unknown parameter {name!r}", field=name, value=value, remedy=meant + there)
 
 
 async def ask(request: Request, scene: Scene, query: Query) -> Answer:
-    """Asks the scene's readers; the query is cancelled if the client hangs up. The body has been read before.
+    """Returns the readers' answer to a query, or cancels the query if the client disconnects.
+
+    The request body must have been read before.
 
     Raises:
-        Problem: as `Readers.ask`; 503, the client has hung up.
+        Problem: see `Readers.ask`; 503 if the client has closed the connection.
     """
     asking = asyncio.ensure_future(scene.readers.ask(query))
     leaving = asyncio.ensure_future(_hung_up(request))
@@ -103,7 +105,7 @@ async def ask(request: Request, scene: Scene, query: Query) -> Answer:
             task.cancel()
             with contextlib.suppress(asyncio.CancelledError, Exception):
                 await task
-    raise Problem(503, "the client has hung up", remedy="ask again")
+    raise Problem(503, "the client closed the connection", remedy="ask again")
 
 
 async def _hung_up(request: Request) -> None:

@@ -1,4 +1,4 @@
-"""Routes of the budget: the limits of a scene's updates."""
+"""Routes of the budget, which limits the iterations and time of a scene's updates."""
 
 from __future__ import annotations
 
@@ -12,15 +12,16 @@ router = APIRouter(prefix="/v1/scenes", tags=["budget"])
 
 @router.get("/{id}/budget")
 async def get(scene: TheRecord) -> SceneBudget:
-    """Returns the budget of frames that are not begun."""
+    """Returns the budget for frames whose reconstruction has not started."""
     return scene.budget()
 
 
 @router.put("/{id}/budget")
 async def put(scene: TheRecord, budget: Budget) -> SceneBudget:
-    """Sets the budget from the first frame on that is not begun; null takes the scene's own setting.
+    """Sets the budget for all frames whose reconstruction has not started; null restores the scene's own setting.
 
-    It is on disk when this answers: after any end of the service each frame gets the budget that held for it.
+    The budget is on disk when the response is sent. After a crash or restart, each frame gets the budget that applied
+    to it.
     """
     await scene.set_budget(budget)
     return scene.budget()

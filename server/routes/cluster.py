@@ -1,4 +1,4 @@
-"""Route of the cluster: machines, their scenes, and what waits for room."""
+"""Route of the cluster: machines, their scenes, and scenes that wait for resources."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ router = APIRouter(prefix="/v1/cluster", tags=["service"])
 
 @router.get("")
 async def get(request: Request, response: Response, scenes: AllScenes, server: TheSettings) -> Cluster:
-    """Returns the machines on which scenes run. What they take is by the estimates of the scenes, not measured.
+    """Returns the machines on which scenes run, with resources reserved according to the scenes' estimates.
 
-    On a cluster with several services it is that of all their scenes; X-Unreachable names those that do not answer.
+    On a cluster with several services, the answer covers the scenes of all of them. X-Unreachable names the services
+    that do not answer.
     """
     placement: Placement = request.app.state.placement
     peers: Peers | None = request.app.state.peers
@@ -37,7 +38,7 @@ async def get(request: Request, response: Response, scenes: AllScenes, server: T
 
 
 def _alone(scenes: Scenes, server: ServerSettings) -> Cluster:
-    """Returns this machine, as the only one."""
+    """Returns a cluster that consists of this machine only."""
     awake = sorted(id for id, scene in scenes.awake.items() if scene.has_place)
     made = [scenes[id].spec for id in awake]
     taken = sum(estimate(RigModel.of(spec.rig), spec.settings, server).memory_mb for spec in made)

@@ -1,4 +1,4 @@
-"""Route of the estimate: memory and disk of a scene before it is made."""
+"""Route of the estimate of a scene's memory and disk usage before it is created."""
 
 from __future__ import annotations
 
@@ -15,5 +15,8 @@ router = APIRouter(prefix="/v1/estimate", tags=["service"])
 
 @router.post("")
 async def of_scene(request: SceneCreate, server: TheSettings) -> SceneEstimate:
-    """Estimates the memory and disk of a scene, and creates nothing. A scene above the limit cannot be created."""
+    """Estimates the memory and disk usage of a scene without creating it.
+
+    A scene above the service's limit cannot be created.
+    """
     return estimate(request.rig, scene_settings(request), server)

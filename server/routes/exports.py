@@ -1,4 +1,4 @@
-"""Routes of exports: files of many frames in the formats of other tools, made in the background."""
+"""Routes of exports: files with many frames in third-party formats, written in the background."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ FILE: dict[int | str, dict[str, Any]] = {
 
 @router.post("/{id}/exports", status_code=202)
 async def begin(scene: TheRecord, exports: AllExports, request: ExportRequest, response: Response) -> ExportModel:
-    """Begins an export of committed frames in the background; `Location` has its place.
+    """Starts an export of committed frames in the background; the `Location` header has its address.
 
-    One export of the service is made at a time, in a process of its own at a low priority: updates and views go ahead.
-    A scene may have 8 exports; a file stays for a day, and not beyond the service's end.
+    The service runs one export at a time, in a separate low-priority process, so that updates and views have priority.
+    A scene can have up to 8 exports. A file is kept for one day, but not across restarts of the service.
     """
     if request.ids is not None and request.format != "tracks":
         raise Problem(
@@ -48,19 +48,22 @@ async def begin(scene: TheRecord, exports: AllExports, request: ExportRequest, r
 
 @router.get("/{id}/exports")
 async def listed(id: SceneId, exports: AllExports) -> ExportList:
-    """Lists the exports of a scene, oldest first. A scene that sleeps is not woken."""
+    """Lists the exports of a scene, oldest first, without waking a sleeping scene."""
     return ExportList(exports=[export.model() for export in exports.of(id)])
 
 
 @router.get("/{id}/exports/{export}")
 async def get(id: SceneId, export: ExportId, exports: AllExports) -> ExportModel:
-    """Returns the state of an export: how many frames are written, or why it failed."""
+    """Returns the state of an export: the number of frames written, or the reason for its failure."""
     return exports.get(id, export).model()
 
 
 @router.get("/{id}/exports/{export}/file", response_class=Response, responses=FILE)
 async def file(id: SceneId, export: ExportId, exports: AllExports, request: Request) -> Response:
-    """Returns the file of an export that is done; numbered files in one .zip. `Range` and `If-None-Match` hold."""
+    """Returns the file of a finished export; formats with numbered files are packed into one .zip.
+
+    `Range` and `If-None-Match` are supported.
+    """
     file_export = exports.get(id, export)
     if file_export.state != ExportState.DONE:
         raise Problem(
@@ -76,22 +79,22 @@ async def file(id: SceneId, export: ExportId, exports: AllExports, request: Requ
         return await immutable_file_response(
             request, file_export.spec.file, tag=file_export.id, media_type=file_export.media_type, name=file_export.name
         )
-    except FileNotFoundError:  # removed between the two
+    except FileNotFoundError:  # removed after the state was checked
         remedy = "ask for another export"
         raise Problem(404, "the file of the export is removed", field="export", value=export, remedy=remedy) from None
 
 
 @router.delete("/{id}/exports/{export}", status_code=204)
 async def remove(id: SceneId, export: ExportId, exports: AllExports) -> None:
-    """Cancels an export that waits or runs; removes one that is over, with its file."""
+    """Cancels a queued or running export, or removes a finished one with its file."""
     await exports.remove(id, export)
 
 
 def _frames(scene: Scene, request: ExportRequest) -> tuple[int, ...]:
-    """Returns the committed frames of the range.
+    """Returns the committed frames in the requested range.
 
     Raises:
-        Problem: 409, none is committed at all; 422, none in this range.
+        Problem: 409 if no frame is committed; 422 if none is committed in this range.
     """
     scene.committed_frame(None, "first")
     committed = scene.committed

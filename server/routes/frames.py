@@ -1,4 +1,4 @@
-"""Routes of frames: upload, reports, export."""
+"""Routes of frames: upload, stored images, reports and export."""
 
 from __future__ import annotations
 
@@ -58,9 +58,9 @@ PICTURE: dict[str, Any] = {
     }
 }
 MOST_STATES = 120
-"""Frames of one compact file that is asked for: some seconds of the reader, some megabytes."""
+"""Maximum number of frames in a requested compact file: a few seconds of reader time and a few megabytes."""
 SENT_AS = {b"\xff\xd8": ("image/jpeg", ".jpg"), b"\x89P": ("image/png", ".png"), b"RI": ("image/webp", ".webp")}
-"""Media type and ending of a picture's file by its first bytes."""
+"""Media type and file extension of an image by its first two bytes."""
 FILE: dict[int | str, dict[str, Any]] = {
     200: {"content": {kind: {"schema": BINARY} for kind, _ in SENT_AS.values()}, "description": "As it was sent."}
 }
@@ -75,10 +75,11 @@ Seconds = Annotated[
 
 @router.put("/{id}/frames/{n}", status_code=202, openapi_extra=BODY)
 async def put(scene: TheScene, n: FrameIndex, request: Request) -> FrameReceipt:
-    """Takes frame n: one JPEG, PNG or WebP a camera, in order and without gaps. On disk when this answers.
+    """Accepts frame n with one JPEG, PNG or WebP per camera; frames must arrive in order and without gaps.
 
-    The same frame again gets the same answer; other content under a known index is refused (409), as is a gap, with the
-    index expected. A full queue answers 429 with Retry-After, or skips where the scene says so; a full disk 507.
+    The frame is on disk when the response is sent. Sending the same frame again gives the same answer. Different
+    content for a known index and gaps are refused (409, with the expected index). If the queue is full, the answer is
+    429 with Retry-After, or the frame is skipped if the scene is configured so. If the disk is full, the answer is 507.
     """
     kind = _media_type(request)
     try:
@@ -108,10 +109,10 @@ async def put_camera(
         FileKind.IMAGE
     ),
 ) -> CameraReceipt:
-    """Takes one camera's picture of frame n, where each camera has its own sender. On disk when this answers.
+    """Accepts one camera's image of frame n, for rigs in which each camera has its own sender.
 
-    The frame closes when all cameras' pictures are in, on POST …/close, or at the scene's deadline. A camera may be
-    some frames ahead of the others; frames close in order.
+    The image is on disk when the response is sent. The frame closes when the images of all cameras have arrived, on
+    POST …/close, or at the scene's deadline. A camera may be a few frames ahead of the others. Frames close in order.
     """
     try:
         if _media_type(request) == FRAME_MEDIA_TYPE:
@@ -129,10 +130,10 @@ async def picture(
     request: Request,
     kind: Annotated[FileKind, Query(description="The picture or its mask.")] = FileKind.IMAGE,
 ) -> Response:
-    """Returns one camera's picture of frame n, byte for byte as it was sent.
+    """Returns one camera's image of frame n, byte for byte as it was sent.
 
-    Pictures are kept as `ingest.keep_frames` of the scene says; 404 names what is not there: the camera, the frame, its
-    pictures, or this one of them.
+    Images are kept according to the scene's `ingest.keep_frames`. A 404 says which is missing: the camera, the frame,
+    all its images, or this image.
     """
     data = await _stored(scene, n, c, kind)
     media_type, ending = SENT_AS[bytes(data[:2])]
@@ -142,22 +143,22 @@ async def picture(
 
 @router.post("/{id}/frames/{n}/close", status_code=202)
 async def close(scene: TheScene, n: FrameIndex) -> FrameReceipt:
-    """Closes a frame that cameras send one by one, with those that are in; what comes later is refused."""
+    """Closes a frame that is sent camera by camera with the images received so far; later images are refused."""
     return await scene.open_frames.close(n)
 
 
 @router.post("/{id}/frames/{n}/missing")
 async def missing(scene: TheScene, n: FrameIndex, request: MissingRequest | None = None) -> FrameReportModel:
-    """Declares the next frame missing, for ever, so that a rig that lost it goes on with the one after.
+    """Declares the next frame permanently missing, so that a rig that lost it can continue with the following one.
 
-    Pictures of it that cameras have sent are dropped. The update after it covers the longer time.
+    Images of the frame that have already arrived are discarded. The next update spans the longer time interval.
     """
     return await scene.open_frames.declare_missing(n, "" if request is None else request.reason)
 
 
 @router.get("/{id}/frames/{n}")
 async def report(scene: TheRecord, n: FrameIndex) -> FrameReportModel:
-    """Returns the state of a frame, and its numbers once it is committed."""
+    """Returns the state of a frame, and its timings and metrics once it is committed."""
     frame_report = await scene.report(n)
     if frame_report is None:
         raise Problem(
@@ -176,7 +177,7 @@ async def report(scene: TheRecord, n: FrameIndex) -> FrameReportModel:
     responses={200: {"content": {"application/octet-stream": {}}, "description": "A 3DGS .ply."}},
 )
 async def ply(scene: TheScene, n: FrameIndex, request: Request) -> Response:
-    """Exports a committed frame in the file format of 3D Gaussian Splatting."""
+    """Returns a committed frame as a 3D Gaussian Splatting .ply file."""
     answer = await ask(request, scene, PlyQuery(scene.committed_frame(n, "n")))
     return immutable_response(request, answer.body, media_type=answer.media_type, name=f"{scene.id[:8]}-{n:06d}.ply")
 
@@ -205,10 +206,10 @@ async def compact(
     limit: Annotated[int, Query(ge=1, le=MOST_STATES, description="Maximum number of frames.")] = MOST_STATES,
     parts: Annotated[bool, Query(description="Include the current part labels of all Gaussians.")] = False,
 ) -> Response:
-    """Exports committed frames as a compact 4D file, which `scas4d export` turns into other formats.
+    """Returns committed frames as a compact 4D file, which `scas4d export` converts to other formats.
 
-    Frames that the scene keeps in a compact file already come with the same bits: the answer ends where that file does,
-    and may start before the requested range, at the key frame that it depends on.
+    Frames that the scene already stores in a compact file are copied bit for bit. The answer then ends at the end of
+    that file, and may start before the requested range at the key frame on which it depends.
     """
     scene.committed_frame(None, "first")
     begin = bisect_left(scene.committed, first)
@@ -230,10 +231,10 @@ async def compact(
 
 
 async def _stored(scene: Scene, n: int, c: str, kind: FileKind) -> memoryview:
-    """Reads a picture or mask from the frame log.
+    """Reads an image or mask from the frame log.
 
     Raises:
-        Problem: 404, there is none; 500, it is damaged.
+        Problem: 404 if it is missing or damaged.
     """
     if c not in scene.rig.names:
         raise Problem(404, f"the rig has no camera {c!r}", field="c", value=c, remedy=f"one of {scene.rig.names}")
@@ -264,6 +265,6 @@ def _body(request: Request) -> AsyncIterator[bytes]:
 
 
 def _length(request: Request) -> int | None:
-    """Returns the announced bytes of the body; the connection has checked that it is a number."""
+    """Returns the Content-Length of the body in bytes, or None if it is absent or not a number."""
     length = request.headers.get("content-length")
     return None if length is None or not length.isdigit() else int(length)

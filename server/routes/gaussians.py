@@ -1,4 +1,4 @@
-"""Route of Gaussians: the frames in which they came and went."""
+"""Route of the lifetimes of Gaussians."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ async def gaussians(
     request: Request,
     ids: Annotated[str, Query(min_length=1, max_length=10_000, description="Ids, separated by commas.")],
 ) -> Response:
-    """Returns the frames in which Gaussians were born, retired and revived. An id is never used for another thing."""
+    """Returns the frames in which Gaussians were created, retired and revived; ids are never reused."""
     scene.committed_frame(None, "id")
     wanted = ids_in(ids)
     check_ids(wanted)

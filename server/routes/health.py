@@ -1,4 +1,4 @@
-"""Routes of health: the process answers, the service is ready, and it can take frames. None needs a token."""
+"""Health check routes for liveness, readiness and frame ingest; none requires a token."""
 
 from __future__ import annotations
 
@@ -17,20 +17,23 @@ from server.settings import ServerSettings
 router = APIRouter(prefix="/health", tags=["service"])
 
 ROOM_MB = 64
-"""A frame of a usual rig has a few MB, and so has the state after it. Frames are taken until nothing is left."""
+"""Free disk space in MB below which the service reports that it is not ready for ingest.
+
+A typical frame takes a few MB, and so does its state. Frames are still accepted until the disk is full.
+"""
 
 
 @router.get("/live")
 async def live(scenes: AllScenes) -> Health:
-    """Answers while the process runs."""
+    """Returns 200 while the process is running."""
     return Health(status="live", version=__version__, scenes=len(scenes))
 
 
 @router.get("/ready")
 async def ready(request: Request, scenes: AllScenes, settings: TheSettings) -> Health:
-    """Answers 200 once scenes are recovered and kernels compiled, else 503. `ready_after`: seconds it took.
+    """Returns 200 once scenes are recovered and kernels are compiled, else 503; `ready_after` is the startup time in s.
 
-    A full disk changes `ingest_ready` alone: views, tracks and exports go on.
+    A full disk only affects `ingest_ready`: views, tracks and exports keep working.
     """
     scenes.recovering.check()
     readiness: Readiness = request.app.state.readiness
@@ -43,20 +46,20 @@ async def ready(request: Request, scenes: AllScenes, settings: TheSettings) -> H
 
 @router.get("/ingest")
 async def ingest(scenes: AllScenes, settings: TheSettings) -> Health:
-    """Answers 200 while frames can be taken, else 503: scenes are being recovered, or the disk has no room."""
+    """Returns 200 while frames can be accepted, or 503 if scenes are being recovered or the disk is full."""
     scenes.recovering.check()
     if (missing := await asyncio.to_thread(room_missing, settings)) is not None:
         raise Problem(
             503,
             missing,
             field="SCAS4D_DATA",
-            remedy="free room in the service's data folder, or shorten the retention of scenes; reads go on meanwhile",
+            remedy="free space in the service's data folder, or shorten the retention of scenes; reads still work",
             headers={"Retry-After": "30"},
         )
     return Health(status="ready", version=__version__, scenes=len(scenes), ingest_ready=True)
 
 
 def room_missing(settings: ServerSettings) -> str | None:
-    """Says that the disk of the data folder has less than `ROOM_MB` free; None where it has more. Blocking."""
+    """Returns a message if the data folder's disk has less than `ROOM_MB` free, else None; blocks."""
     free = shutil.disk_usage(settings.data).free / 1e6
     return None if free >= ROOM_MB else f"the disk of the data folder has {free:.0f} MB free, less than {ROOM_MB}"

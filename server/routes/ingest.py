@@ -1,4 +1,4 @@
-"""Route of frames over a WebSocket: one binary message for a frame or a camera of it, acknowledged in order."""
+"""WebSocket route for frame upload: one binary message per frame or camera image, acknowledged in order."""
 
 from __future__ import annotations
 
@@ -35,18 +35,19 @@ router = APIRouter(prefix="/v1/scenes", tags=["frames"])
 log = logging.getLogger("scas4d.server")
 
 UNSUPPORTED = 1003
+"""WebSocket close code for text messages."""
 AHEAD = 1
-"""Messages that wait while one is being taken; one more is in the hands of uvicorn."""
+"""Number of messages queued while one is being processed; uvicorn buffers one more."""
 
 
 @router.websocket("/{id}/ingest")
 async def ingest(socket: WebSocket, id: str) -> None:
-    """Takes binary messages as `client.wire.framing` writes them, each answered by an `IngestAnswer` as text.
+    """Accepts binary messages in the `client.wire.framing` format and answers each with an `IngestAnswer` as text.
 
-    A message may be sent before the answer to the last one: it is received while that one is synced. The answers keep
-    the order of the messages. What is refused is answered and the socket stays open. The message with
-    `part` is as PUT …/cameras/{c}. A scene that is not here, or that has as many senders as it may, refuses the
-    handshake (404, 429); a message larger than any frame of the rig can be ends the connection (1009).
+    The sender may pipeline messages: one is received while the previous one is synced to disk. Answers keep the order
+    of the messages. A refused message is answered, and the socket stays open. A message with `part` corresponds to
+    PUT …/cameras/{c}. The handshake is refused if the scene does not exist (404) or has too many senders (429). A
+    message larger than any possible frame of the rig closes the connection (1009).
     """
     scenes: Scenes = socket.app.state.scenes
     server: ServerSettings = socket.app.state.settings
@@ -54,7 +55,7 @@ async def ingest(socket: WebSocket, id: str) -> None:
         try:
             scene = await held.enter_async_context(scenes.use(id))
             scene.ingest.add_socket()
-        except Problem as problem:  # the handshake is answered like any request
+        except Problem as problem:  # the handshake is refused with a normal HTTP response
             await socket.send_denial_response(problems.problem_response(problem.document, problem.headers))
             return
         limit_messages(socket.scope, min(int(server.max_body_mb * 1e6), largest_frame(scene.rig)))
@@ -66,7 +67,7 @@ async def ingest(socket: WebSocket, id: str) -> None:
 
 
 async def _serve(socket: WebSocket, scenes: Scenes, id: str) -> None:
-    """Serves until the sender closes, or sends a message that is no frame."""
+    """Processes messages until the sender closes the socket or sends a text message, or the scene is gone."""
     taking: asyncio.Queue[asyncio.Task[IngestAnswer]] = asyncio.Queue(AHEAD)
     answering = asyncio.create_task(_answer(socket, taking))
     whole_before = True
@@ -91,14 +92,14 @@ async def _serve(socket: WebSocket, scenes: Scenes, id: str) -> None:
             head = _head(data)
             whole = isinstance(head, FrameHead) and not head.single_camera
             if not (whole and whole_before):
-                await taking.join()  # what a part decides may depend on all that came before, and the other way round
+                await taking.join()  # single-camera messages and whole frames depend on each other's outcome
             whole_before = whole
-            # They begin in this order, and so they are taken in this order.
+            # Tasks start in the order of the messages, so frames are accepted in that order.
             await taking.put(asyncio.create_task(_take(scene, head, data)))
     except WebSocketDisconnect:
         return
     finally:
-        # A frame that was received whole is taken, even if its sender is gone.
+        # Only the answers are cancelled: a completely received frame is accepted even if its sender has disconnected.
         answering.cancel()
 
 
@@ -107,7 +108,7 @@ async def _answer(socket: WebSocket, taking: asyncio.Queue[asyncio.Task[IngestAn
         answer = await asyncio.shield(await taking.get())
         try:
             await socket.send_text(answer.model_dump_json())
-        except (WebSocketDisconnect, RuntimeError):  # the sender has gone
+        except (WebSocketDisconnect, RuntimeError):  # the sender has disconnected
             pass
         finally:
             taking.task_done()
@@ -142,7 +143,7 @@ async def _take(scene: Scene, head: FrameHead | Problem, data: bytes) -> IngestA
 
 
 def _refusal(index: int | None, problem: Problem) -> IngestAnswer:
-    """Makes the answer that refuses a message; `retry_after` is the Retry-After of the same refusal over HTTP."""
+    """Returns the answer that refuses a message; `retry_after` equals the Retry-After header over HTTP."""
     seconds = (problem.headers or {}).get("Retry-After")
     wait = None if seconds is None else int(seconds)
     return IngestAnswer(index=index, status=problem.status_code, retry_after=wait, problem=problem.document)

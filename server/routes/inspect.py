@@ -1,4 +1,4 @@
-"""Routes for viewers: the rig, and the reports of all frames so far."""
+"""Routes of the rig and of frame reports, used by viewers."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from server.routes.access import TheRecord, TheScene
 router = APIRouter(prefix="/v1/scenes")
 
 MOST_FRAMES = 500
-"""Frames of one answer: each report names every camera."""
+"""Maximum number of frames per answer, limited because each report lists every camera."""
 
 
 @router.get("/{id}/rig", tags=["scenes"])
 async def rig(scene: TheRecord) -> RigModel:
-    """Returns the cameras of the scene, as they were given."""
+    """Returns the camera rig of the scene as it was uploaded, without calibration corrections."""
     return scene.request.rig
 
 
@@ -28,8 +28,8 @@ async def frames(
     first: Annotated[int, Query(ge=0, le=1_000_000_000, description="Index of the first frame.")] = 0,
     limit: Annotated[int, Query(ge=1, le=MOST_FRAMES, description="Maximum number of frames.")] = MOST_FRAMES,
 ) -> FrameList:
-    """Returns the reports of many frames, from `first` on; `next` is the index to go on from."""
-    after = min(first + limit, scene.next_frame)  # frames are numbered without gaps
+    """Returns the reports of up to `limit` frames starting at `first`; `next` is the `first` of the next page."""
+    after = min(first + limit, scene.next_frame)  # frame indices have no gaps
     reports = [await scene.report(index) for index in range(first, after)]
     short = [report.model_copy(update={"loss": [], "curve": []}) for report in reports if report is not None]
     return FrameList(frames=short, next=after if first <= after < scene.next_frame else None)

@@ -1,4 +1,4 @@
-"""Route of metrics, for Prometheus."""
+"""Route of the Prometheus metrics."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ router = APIRouter(tags=["service"])
 
 @router.get("/metrics", response_class=PlainTextResponse)
 async def metrics(request: Request, scenes: AllScenes, settings: TheSettings) -> Response:
-    """Returns counters, histograms and gauges in the text format of Prometheus."""
+    """Returns counters, histograms and gauges in the Prometheus text format."""
     readiness: Readiness = request.app.state.readiness
     gauges = CollectorRegistry()
     state, guard = request.app.state, request.app.state.guard

@@ -1,4 +1,4 @@
-"""Route of parts: Gaussians that move together."""
+"""Route of parts, which are groups of Gaussians that move together."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ async def parts(
         int | None, Query(ge=1, le=254, description="Number of parts; by default chosen automatically.")
     ] = None,
 ) -> Response:
-    """Returns a label for every Gaussian, from its motion over all committed frames."""
+    """Returns a part label for every Gaussian, computed from its motion over all committed frames."""
     scene.committed_frame(None, "id")
     answer = await ask(request, scene, PartsQuery(count))
     return Response(answer.body, media_type=answer.media_type)

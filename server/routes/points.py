@@ -1,4 +1,4 @@
-"""Route of the initial cloud."""
+"""Route of the initial point cloud."""
 
 from __future__ import annotations
 
@@ -21,7 +21,10 @@ from server.storage.disk import full_disk, no_room
 from server.storage.points import points_sha256
 
 MOST_POINTS = 2_000_000
-"""Points of an initial cloud: twenty times the Gaussians that a scene can have, and 100 MB to check."""
+"""Maximum number of points of an initial cloud.
+
+This is 20 times the maximum number of Gaussians of a scene, and takes 100 MB to validate.
+"""
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
@@ -45,12 +48,12 @@ async def put(
         ),
     ] = None,
 ) -> PointsReceipt:
-    """Takes the cloud that frame 0 starts from; it has to come before frame 0.
+    """Accepts the point cloud from which frame 0 is initialized; it must be uploaded before frame 0.
 
-    The body is an npz: `positions` [P, 3] in the rig's world and units, `colours` [P, 3] in 0…1, and optionally
-    `foreground` [P] in 0…1; or `data` [P, 6 or 7] with these as columns, as Dynamic3DGaussians has it in
-    `init_pt_cld.npz`. The same body again gets the same answer. For a reconstruction that is to be begun anew
-    it comes before `PUT …/reconstructions/{n}`, with `reconstruction=n`.
+    The body is an npz with `positions` [P, 3] in the rig's world frame and units, and `colours` [P, 3] in 0…1.
+    `foreground` [P] in 0…1 is optional. Alternatively it holds `data` [P, 6 or 7] with these as columns, like the
+    `init_pt_cld.npz` of Dynamic3DGaussians. Uploading the same body again gives the same answer. To restart a
+    reconstruction from new points, upload them with `reconstruction=n` before `PUT …/reconstructions/{n}`.
     """
     body = await request.body()
     sha256 = hashlib.sha256(body).hexdigest()
@@ -83,10 +86,10 @@ async def put(
 
 
 def check_number(number: int, own: int, next_frame: int) -> None:
-    """Refuses points of a reconstruction that has begun, or that is not the next.
+    """Checks that the points are for a reconstruction that has not started and is the current or the next one.
 
     Raises:
-        Problem: 409.
+        Problem: 409 if not.
     """
     if number == own + 1 or (number == own == 0 and next_frame == 0):
         return
@@ -104,7 +107,7 @@ def check_number(number: int, own: int, next_frame: int) -> None:
 
 
 def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
-    """Reads and checks the arrays of an npz cloud; nothing is unpickled, and the size is checked before unpacking."""
+    """Returns the validated arrays of an npz cloud; nothing is unpickled, and sizes are checked before unpacking."""
     shapes = {"positions": (np.float64, 3), "colours": (np.float32, 3), "foreground": (np.float32, 0)}
     try:
         with zipfile.ZipFile(io.BytesIO(body)) as archive:
@@ -156,10 +159,10 @@ def read_points(body: bytes, limit: int) -> dict[str, NDArray[Any]]:
 
 
 def columns_of(data: NDArray[Any]) -> dict[str, NDArray[Any]]:
-    """Splits the array of an `init_pt_cld.npz` [P, 7]: x y z, r g b, foreground, the last of which may be missing.
+    """Splits the array [P, 7] of an `init_pt_cld.npz` into x y z, r g b and foreground; foreground may be missing.
 
     Raises:
-        Problem: 422, it has another shape.
+        Problem: 422 if the array has a different shape.
     """
     if data.ndim != 2 or data.shape[1] not in (6, 7):
         raise Problem(

@@ -1,4 +1,4 @@
-"""Route of reconstructions: a scene begins anew from its first frame."""
+"""Route that restarts the reconstruction of a scene from its first frame."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ async def put(
     exports: AllExports,
     request: ReconstructionRequest | None = None,
 ) -> SceneStatus:
-    """Begins the reconstruction of a scene anew, after a first frame that failed or came out poor.
+    """Restarts the reconstruction of a scene, e.g. after a first frame that failed or has poor quality.
 
-    It takes the place of the one before, whatever that does: its committed states and exports are dropped. All frames
-    from the first one on are updated again, in order, as far as their pictures are held. It is on disk when this
-    answers; the same request again gets the same answer.
+    The new reconstruction replaces the previous one; its committed states and exports are deleted. All frames
+    whose images are still stored are reconstructed again in order. The restart is on disk when the response is sent.
+    Sending the same request again gives the same answer.
     """
     asked = request or ReconstructionRequest()
     with setting_problems():

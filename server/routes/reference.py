@@ -1,4 +1,4 @@
-"""Routes of the API's reference: Swagger UI as the package `fastapi-offline` has it, with nothing from other sites."""
+"""Routes of the API reference: Swagger UI from the package `fastapi-offline`, without external resources."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ router = APIRouter(include_in_schema=False)
 FOLDER = Path(__file__).parents[1] / "reference"
 VENDORED = ("swagger-ui-bundle.js", "swagger-ui.css")
 HEADERS = security_headers(style_src="'self' 'unsafe-inline'", img_src="'self' data:")
-"""As the viewer's, but Swagger UI sets styles and shows small pictures that its own code has."""
+"""Security headers like those of the viewer, but Swagger UI also needs inline styles and `data:` images."""
 
 
 def _files() -> dict[str, Path]:
-    """Finds the files that are served by name; the package is not imported, as it needs nothing but its files here."""
+    """Returns the served files by name; the package is located without importing it, as only its files are needed."""
     package = find_spec("fastapi_offline")
     assert package is not None, "the package fastapi-offline is not installed; run: pip install 'scas4d[server]'"
     assert package.origin is not None
@@ -33,17 +33,17 @@ FILES = _files()
 
 @router.get("/docs")
 async def page(request: Request) -> Response:
-    """Returns the page."""
+    """Returns the API reference page."""
     return serve_file(request, FILES, "index.html", HEADERS, "/docs")
 
 
 @router.get("/redoc")
 async def elsewhere() -> Response:
-    """Redirects from where FastAPI has a second page of the same."""
+    """Redirects FastAPI's usual ReDoc address to the API reference page."""
     return RedirectResponse("/docs")
 
 
 @router.get("/docs/{name}")
 async def file(request: Request, name: str) -> Response:
-    """Returns a file of the page."""
+    """Returns a file of the API reference page."""
     return serve_file(request, FILES, name, HEADERS, "/docs")

@@ -1,4 +1,4 @@
-"""Routes of novel views."""
+"""Routes that render novel views."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ PICTURES: dict[int | str, dict[str, Any]] = {
     }
 }
 ENDINGS = {one: f".{'jpg' if one == RenderFormat.JPEG else one.value}" for one in RenderFormat}
-"""Of files, by format."""
+"""File extension by format."""
 
 
 @router.post("/{id}/render", response_class=Response, responses=PICTURES)
 async def render(scene: TheScene, request: Request, view: RenderRequest) -> Response:
-    """Renders a committed frame from any camera; this does not wait for an update at work."""
+    """Renders a committed frame from any camera without waiting for a running update."""
     response = await ask(request, scene, render_query(scene, view))
     return Response(
         response.body, media_type=response.media_type, headers={**response.headers, "Cache-Control": "no-store"}
@@ -57,7 +57,7 @@ async def render_by_name(
         int | None, Query(ge=1, le=254, description="Number of parts; by default chosen by the scene.")
     ] = None,
 ) -> Response:
-    """Renders a committed frame from a camera of the rig; the address can stand in an `<img>`."""
+    """Renders a committed frame from a camera of the rig; the URL can be used in an `<img>` element."""
     view = RenderRequest(
         camera=scene.rig.names[0] if camera is None else camera,
         frame=frame,
@@ -69,9 +69,9 @@ async def render_by_name(
         parts=parts,
     )
     query = render_query(scene, view)
-    # The last frame is another one in a moment, and parts are found anew. A frame that was named stays what it is until
-    # the reconstruction is begun anew, but for a damaged state that is made again, as good as before: the tag is a weak
-    # one, and a view is not shown before it was asked whether it still is.
+    # The latest frame and the parts change over time, so such views are not cached. A frame given by index stays the
+    # same until the reconstruction restarts, except that a damaged state may be recomputed with equivalent quality.
+    # Hence the weak ETag, and `no-cache` so that browsers revalidate before they reuse a view.
     keep = {"Cache-Control": "no-store"}
     if view.frame is not None and RenderKind.PARTS not in view.kinds:
         keep = {

@@ -1,4 +1,4 @@
-"""Routes of scenes: create, list, inspect, edit, pause, resume, put to sleep, delete."""
+"""Routes that create, list, inspect, edit, pause, resume, put to sleep and delete scenes."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
 
 def scene_settings(request: SceneCreate) -> Settings:
-    """The preset with the request's changes."""
+    """Returns the settings of the requested preset with the request's changes applied."""
     with setting_problems():
         return preset(request.preset, request.settings)
 
 
 @contextmanager
 def setting_problems() -> Iterator[None]:
-    """Answers wrong settings with a problem."""
+    """Converts errors in settings to `Problem`."""
     try:
         yield
     except SettingError as error:
@@ -45,7 +45,7 @@ def setting_problems() -> Iterator[None]:
 
 
 def check_rig(request: SceneCreate, settings: Settings) -> None:
-    """Refuses settings that cannot work with the rig, and the unit 'auto' if it cannot be found from it."""
+    """Raises `Problem` if the settings do not fit the rig, or the unit 'auto' cannot be derived from it."""
     unit, rig = settings.scene.metres_per_unit, request.rig.rig()
     try:
         rig.world_frame(unit)
@@ -58,7 +58,7 @@ def check_rig(request: SceneCreate, settings: Settings) -> None:
 
 
 def check_nodes(request: SceneCreate, placement: Placement) -> None:
-    """Refuses labels of nodes where scenes run on the service's own machine alone."""
+    """Raises `Problem` if node labels are given but all scenes run on the service's own machine."""
     if request.nodes and not placement.has_labels:
         raise Problem(
             422,
@@ -70,14 +70,14 @@ def check_nodes(request: SceneCreate, placement: Placement) -> None:
 
 
 def check_settings(request: SceneCreate, settings: Settings, server: ServerSettings) -> None:
-    """Refuses settings that cannot work with the rig."""
+    """Raises `Problem` if the settings do not fit the rig, or the scene would exceed the memory limit."""
     check_rig(request, settings)
     estimate.refuse_if_too_large(request.rig, settings, server)
 
 
 @router.post("", status_code=201)
 async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, response: Response) -> SceneStatus:
-    """Creates a scene from a rig; it waits for its first frame."""
+    """Creates a scene from a rig; the scene then waits for its first frame."""
     settings = scene_settings(request)
     for camera in request.rig.cameras:
         pixels = camera.width * camera.height
@@ -98,9 +98,10 @@ async def create(request: SceneCreate, scenes: AllScenes, server: TheSettings, r
 
 @router.get("")
 async def listed(scenes: AllScenes, request: Request, response: Response) -> SceneList:
-    """Lists all scenes, and wakes none; a link has its own alone. 503 while those of an earlier run are recovered.
+    """Lists all scenes without waking them; a share link lists only its own scene.
 
-    On a cluster those of its other services are among them; X-Unreachable names the services that do not answer.
+    The answer is 503 while scenes of an earlier run are being recovered. On a cluster, the list includes the scenes of
+    the other services. X-Unreachable names the services that do not answer.
     """
     scenes.recovering.check()
     permission: Permission = request.scope.get(PERMISSION, ALL)
@@ -116,16 +117,16 @@ async def listed(scenes: AllScenes, request: Request, response: Response) -> Sce
 
 @router.get("/{id}")
 async def inspect(id: SceneId, scenes: AllScenes) -> SceneStatus:
-    """Returns the scene's state, progress and queue, and does not wake it."""
+    """Returns the scene's state, progress and queue without waking it."""
     return scenes.status(id)
 
 
 @router.patch("/{id}")
 async def edit(id: SceneId, scenes: AllScenes, request: SceneEdit) -> SceneStatus:
-    """Renames the scene, archives it or takes that back, or changes how many pictures and states it keeps.
+    """Renames, archives or unarchives the scene, or changes how many images and states it keeps.
 
-    It is on disk when this answers. States that a shorter `keep_states` deletes go within seconds, for good; the scene
-    wakes for that.
+    The change is on disk when the response is sent. A shorter `keep_states` wakes the scene and permanently deletes
+    states within seconds.
     """
     async with scenes.use(id, place=request.keep_states is not None or request.exact_states is not None) as scene:
         await scene.edit(request)
@@ -134,29 +135,29 @@ async def edit(id: SceneId, scenes: AllScenes, request: SceneEdit) -> SceneStatu
 
 @router.post("/{id}/pause")
 async def pause(scene: TheRecord) -> SceneStatus:
-    """Pauses the scene after the frame at work: frames are accepted and not reconstructed, also after a restart."""
+    """Pauses the scene after the current frame: frames are accepted but not reconstructed, even after a restart."""
     await scene.pause(True)
     return scene.status()
 
 
 @router.post("/{id}/resume")
 async def resume(scene: TheScene) -> SceneStatus:
-    """Resumes the scene with the frames that wait."""
+    """Resumes the scene with the queued frames."""
     await scene.pause(False)
     return scene.status()
 
 
 @router.post("/{id}/sleep")
 async def put_to_sleep(id: SceneId, scenes: AllScenes) -> SceneStatus:
-    """Ends the processes of a scene that is idle: it wakes by itself when it is asked or sent something."""
+    """Stops the processes of an idle scene, which wakes automatically on the next request or frame."""
     if (scene := scenes.awake.get(id)) is not None:
         if not scene.idle:
             raise Problem(
                 409,
-                "the scene is not idle: frames are waiting, or a request, a page or a sender is connected to it",
+                "the scene is not idle: frames are waiting, or a request, a page or a sender is connected",
                 field="id",
                 value=id,
-                remedy="wait for its frames, and close pages and senders",
+                remedy="wait for its frames, and close its pages and senders",
             )
         await scenes.put_to_sleep(scene)
     return scenes.status(id)
@@ -164,6 +165,6 @@ async def put_to_sleep(id: SceneId, scenes: AllScenes) -> SceneStatus:
 
 @router.delete("/{id}", status_code=204)
 async def delete(id: SceneId, scenes: AllScenes, exports: AllExports) -> None:
-    """Ends the scene and removes all it has on disk, and its exports."""
+    """Stops the scene and deletes its data on disk and its exports."""
     await scenes.delete(id)
     await exports.forget(id)

@@ -1,4 +1,4 @@
-"""Route of tokens that may only read, and of links to share."""
+"""Route that issues read-only tokens and share links."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ router = APIRouter(prefix="/v1/shares", tags=["service"])
 
 @router.post("", status_code=201)
 async def share(request: ShareRequest, scenes: AllScenes, settings: TheSettings, asked: Request) -> Share:
-    """Makes a token that may only read, of one scene or of all, and the address at which the page shows it.
+    """Creates a read-only token for one scene or for all scenes, and the address at which the viewer shows it.
 
-    It cannot be taken back: it ends by itself, or with the token of the service.
+    The token cannot be revoked: it expires, or becomes invalid when the token of the service changes.
     """
     secret = settings.secret
     if secret is None:
         raise Problem(
             409,
-            "the service has no token: anyone who reaches it may do everything",
+            "the service has no token: anyone who can reach it may do everything",
             field="SCAS4D_TOKEN",
-            remedy="start it with SCAS4D_TOKEN; then others need a token, or a link",
+            remedy="start it with SCAS4D_TOKEN; others then need a token or a link",
         )
     if request.scene is not None:
         peers: Peers | None = asked.app.state.peers
         if request.scene in scenes or peers is None or await peers.owner(request.scene) is None:
-            scenes.status(request.scene)  # 404 where there is none
+            scenes.status(request.scene)  # 404 if it does not exist
     end = int(time.time() + request.seconds)
     token = Sharing(secret).issue(request.scene, end)
     shown = f"scene={request.scene}&" if request.scene is not None else ""

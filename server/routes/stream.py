@@ -1,4 +1,4 @@
-"""Route of subscriptions over a WebSocket, protocol `scas4d.stream.v1` (docs/stream.md)."""
+"""WebSocket route for subscriptions, protocol `scas4d.stream.v1` (docs/stream.md)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ log = logging.getLogger("scas4d.server")
 
 @router.websocket("/{id}/stream")
 async def stream(websocket: WebSocket, id: str) -> None:
-    """Sends scene state, finished frames, live views, tracks and parts, as the client subscribes to them."""
+    """Streams scene state, finished frames, live views, tracks and parts to which the client subscribes."""
     scenes: Scenes = websocket.app.state.scenes
     hub: Hub = websocket.app.state.hub
     async with contextlib.AsyncExitStack() as held:
@@ -34,10 +34,10 @@ async def stream(websocket: WebSocket, id: str) -> None:
             scene = await held.enter_async_context(scenes.use(id))
             _require_protocol(websocket)
             subscriber = hub.join(id, scene.readers.ask, lambda channel: Subscriber(scene, channel))
-        except Problem as problem:  # the handshake is answered like any request: browsers see only that it failed
+        except Problem as problem:  # a normal HTTP response refuses the handshake; browsers see only the failure
             await websocket.send_denial_response(problems.problem_response(problem.document, problem.headers))
             return
-        limit_messages(websocket.scope, 4 * subscriber.limits().message_bytes)  # `_read` says more
+        limit_messages(websocket.scope, 4 * subscriber.limits().message_bytes)  # `_read` enforces the exact limit
         try:
             await websocket.accept(subprotocol=STREAM_PROTOCOL)
             await _serve(websocket, subscriber, websocket.scope.get(PERMISSION, ALL).end)
@@ -59,7 +59,7 @@ def _require_protocol(websocket: WebSocket) -> None:
 
 
 async def _serve(websocket: WebSocket, subscriber: Subscriber, end: float | None) -> None:
-    """Serves until the client or the service closes, or until the end of what the client may do."""
+    """Serves the connection until the client or the service closes it, or the client's permission expires."""
     await subscriber.greet()
     reading = asyncio.create_task(_read(websocket, subscriber))
     writing = asyncio.create_task(_write(websocket, subscriber))
@@ -83,7 +83,7 @@ async def _read(websocket: WebSocket, subscriber: Subscriber) -> None:
         if message["type"] == "websocket.disconnect":
             return
         text = message.get("text")
-        if text is not None and len(text) > limit:  # characters: a bound on the bytes within a factor of four
+        if text is not None and len(text) > limit:  # characters, each up to four bytes in UTF-8
             await websocket.close(TOO_BIG, f"a message of {len(text)} characters; {limit} bytes are taken")
             return
         await subscriber.handle_message(text)

@@ -23,7 +23,7 @@ ANSWERS: dict[int | str, dict[str, Any]] = {
 
 @router.post("/{id}/tracks/query", response_class=Response, responses=ANSWERS)
 async def query(scene: TheScene, http: Request, request: TracksRequest) -> Response:
-    """Returns trajectories in the world of Gaussians by id, of pixels, or of 3D points."""
+    """Returns world-space trajectories of Gaussians given by id, of pixels, or of 3D points."""
     return await answer(http, scene, request)
 
 
@@ -49,7 +49,7 @@ async def tracks(
     project: Annotated[Many, Query(max_length=64, description="Cameras of the rig to project into.")] = None,
     format: Literal["json", "npz"] = "json",
 ) -> Response:
-    """Returns a few trajectories; the query is in the address."""
+    """Returns a few trajectories, requested in the query string."""
     request = TracksRequest(
         ids=ids_in(ids) if ids else None,
         pixels=_numbers(pixel, "pixel", 2) if pixel else None,
@@ -65,22 +65,22 @@ async def tracks(
 
 
 async def answer(http: Request, scene: Scene, request: TracksRequest) -> Response:
-    """Checks the request and asks the reader."""
+    """Returns the response of the readers to a validated track request."""
     response = await ask(http, scene, tracks_query(scene, request))
     return Response(response.body, media_type=response.media_type)
 
 
 def ids_in(text: str) -> list[int]:
-    """Returns the ids of a query parameter."""
+    """Returns the ids in a comma-separated query parameter."""
     try:
         return [int(part) for part in text.split(",")]
     except ValueError:
         raise Problem(
             422,
-            "ids are not whole numbers",
+            "ids must be whole numbers",
             field="ids",
             value=text,
-            remedy="give them with commas between: ids=3,17,2048",
+            remedy="separate them by commas: ids=3,17,2048",
         ) from None
 
 

@@ -1,4 +1,4 @@
-"""Routes of the trade-off between accuracy and time, for a scene on its machine."""
+"""Routes of the trade-off between accuracy and update time of a scene on its machine."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ router = APIRouter(prefix="/v1/scenes", tags=["budget"])
 
 @router.get("/{id}/tradeoff")
 async def get(scene: TheRecord) -> TradeoffModel:
-    """Returns points of accuracy and time: measured in the newest 64 frames, replayed, and extrapolated in time."""
+    """Returns pairs of accuracy and time: measured in the newest 64 frames, replayed, or extrapolated in time."""
     return await answer(scene)
 
 
 @router.post("/{id}/tradeoff", status_code=202)
 async def replay(scene: TheScene, request: ReplayRequest | None = None) -> TradeoffModel:
-    """Measures other numbers of iterations: the newest frames are updated again in the background, in memory.
+    """Measures other iteration counts by replaying the updates of the newest frames in the background, in memory.
 
-    One replay of a scene at a time, on one thread and at a low priority; the scene's own number of iterations is
-    measured with the others, so that their ratios hold. `replay` reports its progress.
+    A scene runs one replay at a time, on one thread at low priority. The scene's own iteration count is also measured,
+    so that the ratios are comparable. The field `replay` reports the progress.
     """
     scene.replays.start(request or ReplayRequest())
     return await answer(scene)
@@ -31,13 +31,13 @@ async def replay(scene: TheScene, request: ReplayRequest | None = None) -> Trade
 
 @router.delete("/{id}/tradeoff")
 async def end(scene: TheScene) -> TradeoffModel:
-    """Ends the replay that is running, if one is; what it has measured stays."""
+    """Stops a running replay, if any; its measurements are kept."""
     await scene.replays.end()
     return await answer(scene)
 
 
 async def answer(scene: Scene) -> TradeoffModel:
-    """Returns all points that are known now."""
+    """Returns all trade-off points known so far."""
     newest = scene.committed[-tradeoff.NEWEST :]
     frame_reports = [await scene.report(index) for index in newest]
     first = scene.committed[0] if newest else 0

@@ -1,4 +1,4 @@
-"""Routes of the viewer's page: its files as they are, without a build step, and nothing from other sites."""
+"""Routes of the viewer: static files without a build step or external resources."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ FOLDER = Path(__file__).parents[1] / "viewer"
 FILES = {
     str(file.relative_to(FOLDER)): file
     for file in FOLDER.rglob("*")
-    if file.suffix in MEDIA_TYPES and file.parent.name != "player"  # of the page that `scas4d export --player` writes
+    if file.suffix in MEDIA_TYPES and file.parent.name != "player"  # used by `scas4d export --player` only
 }
-"""The files that are served: these names and no others."""
-HEADERS = security_headers(worker_src="'self'")  # what a rig or a scene is called stays text
+"""Files that are served, by name; all other names are refused."""
+HEADERS = security_headers(worker_src="'self'")  # prevents script injection through names of rigs or scenes
 
 
 @router.get("/")
 @router.get("/viewer/")
 async def page(request: Request) -> Response:
-    """Returns the page."""
+    """Returns the viewer page."""
     return serve_file(request, FILES, "index.html", HEADERS, "/viewer/")
 
 
 @router.get("/viewer")
 async def elsewhere() -> Response:
-    """Redirects to the page from the address without a slash."""
+    """Redirects the address without a trailing slash to the viewer page."""
     return RedirectResponse("/viewer/")
 
 
 @router.get("/viewer/{name:path}")
 async def file(request: Request, name: str) -> Response:
-    """Returns a file of the page."""
+    """Returns a file of the viewer."""
     return serve_file(request, FILES, name, HEADERS, "/viewer/")

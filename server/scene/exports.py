@@ -186,10 +186,10 @@ class Exports:
         if len(waiting) >= MAX_WAITING:
             raise Problem(
                 429,
-                f"{count_noun(len(waiting), 'export')} of the service not over",
+                f"{count_noun(len(waiting), 'export')} of the service not finished",
                 field="id",
                 value=id,
-                remedy="ask again when one is over",
+                remedy="try again when one is finished",
                 headers={"Retry-After": "10"},
             )
         kept = [
@@ -200,7 +200,7 @@ class Exports:
         if len(kept) >= MAX_PER_SCENE:
             raise Problem(
                 409,
-                f"the scene has {count_noun(len(kept), 'export')}, as many as it may",
+                f"the scene has {count_noun(len(kept), 'export')}, the maximum",
                 field="id",
                 value=id,
                 remedy=f"remove one: DELETE /v1/scenes/{id}/exports/EXPORT, as {kept[0].id}",
@@ -217,7 +217,7 @@ class Exports:
                 f"frames; the export takes about {(needed - exporter.RESERVE_BYTES) / 1e6:.1f} MB",
                 field="last",
                 value=frames,
-                remedy="export fewer frames, a smaller format (spz, s4d), or remove exports that are done",
+                remedy="export fewer frames, a smaller format (spz, s4d), or remove finished exports",
             )
 
     async def _run_in_turn(self, export: Export) -> None:

@@ -106,7 +106,7 @@ class Replays:
                 f"start from, one to warm up, and {count_noun(count, 'frame')} that count",
                 field="frames",
                 value=count,
-                remedy="ask again when more frames are committed, or for fewer frames (ingest.keep_states says how "
+                remedy="try again when more frames are committed, or for fewer frames (ingest.keep_states says how "
                 "many states are kept)",
             )
         base, indices = committed[-count - 2], list(committed[-count - 1 :])
@@ -114,10 +114,10 @@ class Replays:
         if gone:
             raise Problem(
                 409,
-                f"the state of frame {gone[-1]} is deleted: the {len(indices)} frames after it have none to start from",
+                f"the state of frame {gone[-1]} is deleted: the {len(indices)} frames after it cannot start",
                 field="frames",
                 value=count,
-                remedy="ask for fewer frames, or make scenes that keep more states (ingest.keep_states)",
+                remedy="ask for fewer frames, or create scenes that keep more states (ingest.keep_states)",
             )
         bare = [index for index in indices if not frames[index].files]
         if bare:
@@ -128,7 +128,7 @@ class Replays:
                 field="frames",
                 value=count,
                 remedy=(f"ask for at most {count_noun(held - 1, 'frame')}, or " if held > 1 else "")
-                + "make scenes that keep more pictures (ingest.keep_frames)",
+                + "create scenes that keep more pictures (ingest.keep_frames)",
             )
         return base, indices
 

@@ -243,7 +243,7 @@ class Scene:
                 f"the state of frame {index} was damaged on disk and is being recomputed",
                 field=field,
                 value=index,
-                remedy="ask again, or for another frame",
+                remedy="try again, or request another frame",
                 headers={"Retry-After": "2"},
             )
         other = f"ask for a committed frame, {frames.committed[0]} to {frames.committed[-1]}"
@@ -255,7 +255,7 @@ class Scene:
                 reason = "deleted by the scene's retention"
             raise Problem(
                 404,
-                f"frame {index} is {reason}; only committed frames that are kept can be read",
+                f"frame {index} is {reason}; only committed frames that were not deleted can be read",
                 field=field,
                 value=index,
                 remedy=other,
@@ -328,7 +328,7 @@ class Scene:
         if waiting and self.ledger.fatal is None:
             raise Problem(
                 409,
-                f"{count_noun(waiting, 'frame')} of the scene not finished",
+                f"{count_noun(waiting, 'frame')} of the scene unfinished",
                 field="archived",
                 value=True,
                 remedy="wait until `queued` and `open_frames` of its status are empty (POST …/resume if it is paused)",

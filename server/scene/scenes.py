@@ -161,7 +161,7 @@ class Scenes:
             await scene.stop()
             await asyncio.to_thread(write_status_cache, scene.spec.folder, status)
         except Exception:  # the folder has all data of the scene
-            log.exception("scene %s did not end as it should", scene.id)
+            log.exception("scene %s did not end properly", scene.id)
         del self.awake[scene.id]
         log.info("scene %s sleeps", scene.id)
 
@@ -216,7 +216,7 @@ class Scenes:
             known = isinstance(error, DefinitionError | OSError)
             reason = message_of(error) if known else f"the service failed: {type(error).__name__}: {message_of(error)}"
             self.unreadable[folder.name] = reason
-            log.error("folder %s is left as it is: %s", folder.path, reason, exc_info=None if known else error)
+            log.error("folder %s was left unchanged: %s", folder.path, reason, exc_info=None if known else error)
             return False
         for sentence in restored.content.damage:
             if sentence not in said:

@@ -110,10 +110,10 @@ def scene_to_put_to_sleep(scenes: Iterable[Scene], settings: ServerSettings) -> 
         return min(idle, key=lambda scene: scene.used)
     raise Problem(
         429,
-        f"{count_noun(len(here), 'scene')} of at most {settings.max_scenes} are awake, and none of them is idle",
+        f"{count_noun(len(here), 'scene')} of at most {settings.max_scenes} are awake, and none is idle",
         field="SCAS4D_MAX_SCENES",
         value=settings.max_scenes,
-        remedy="ask again when one is: nothing waits in it, and no page or sender is connected to it; put one to sleep "
+        remedy="try again when one is idle (no waiting frames, pages or senders), put one to sleep "
         "(POST /v1/scenes/ID/sleep), delete one, or raise SCAS4D_MAX_SCENES",
         headers={"Retry-After": "10"},
     )

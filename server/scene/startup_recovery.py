@@ -56,7 +56,7 @@ class StartupRecovery:
             f"recovering {self._count - len(self._left)} of {count_noun(self._count, 'scene')}",
             field="id" if id is not None else None,
             value=id,
-            remedy="ask again: all acknowledged frames are on disk, and are being read",
+            remedy="try again: all acknowledged frames are on disk and are being read",
             headers={"Retry-After": "1"},
             recovering=list(self._left),
         )

@@ -165,6 +165,6 @@ def camera_of(rig: Rig, name: str) -> Camera:
             f"the rig has no camera {name!r}",
             field="camera",
             value=name,
-            remedy=f"name one of {', '.join(rig.names)}, or give the camera itself",
+            remedy=f"name one of {', '.join(rig.names)}, or give a whole camera",
         )
     return rig[name]

@@ -33,8 +33,8 @@ def full_disk(error: Exception) -> Problem:
     """Returns the 507 response for a full disk."""
     return Problem(
         507,
-        f"the disk has no room: {message_of(error)}",
-        remedy="free room in the service's data folder, or shorten the scene's retention, and send the same again",
+        f"the disk is full: {message_of(error)}",
+        remedy="free space in the service's data folder, or shorten the scene's retention, and send the same again",
         headers={"Retry-After": "5"},
     )
 
@@ -81,7 +81,7 @@ def lock_data(data: Path) -> FolderLock:
         return FolderLock(DataFolder(data).lock, wait=False)
     except BlockingIOError:
         raise RuntimeError(
-            f"another service is at work in {data}; stop it, or give this one another folder: --data FOLDER"
+            f"another service uses {data}; stop it, or give this one another folder: --data FOLDER"
         ) from None
 
 

@@ -127,13 +127,13 @@ def _fill_folder(states: Path, epoch: int, before: int | None) -> None:
             if before is None or _link_all(epoch_folder(states, before), beside):
                 break
         else:
-            raise FencingError(f"{states.name}.{before} kept changing while it was taken over")
+            raise FencingError(f"{states.name}.{before} kept changing during the takeover")
         sync_folder(beside)
         try:
             beside.rename(folder)
         except OSError:
             if folder.exists():
-                raise FencingError(f"another service began {folder.name}; one has a data folder") from None
+                raise FencingError(f"another service started {folder.name}; only one may use a data folder") from None
             raise
     finally:
         shutil.rmtree(beside, ignore_errors=True)
@@ -171,7 +171,7 @@ def _link_all(source: Path, target: Path) -> bool:
         names = _names(source)
     except FileNotFoundError:
         raise FencingError(
-            f"{source.name} is gone, which is read; put it back, or remove the link to it to go on without"
+            f"{source.name} is missing; put it back, or remove the link to it to continue without its states"
         ) from None
     for name in names:
         try:

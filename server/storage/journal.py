@@ -214,7 +214,7 @@ class Journal:
             Problem: 503, the journal is closed.
         """
         if self._closed:
-            raise Problem(503, "the scene was closed", remedy="ask again: a scene that was deleted is not found then")
+            raise Problem(503, "the scene was closed", remedy="try again; a deleted scene then gives 404")
         done: asyncio.Future[None] = asyncio.get_running_loop().create_future()
         self._waiting.append((events, done))
         self._begin()

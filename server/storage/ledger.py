@@ -322,8 +322,8 @@ class SceneLog:
     def deletable(self, rule: Retention) -> list[int]:
         """Returns the frames whose images the retention rule deletes now, in ascending order.
 
-        Images are kept for unfinished frames. They are also kept for all frames after the commit to which an
-        interrupted scene may have to roll back, because those frames would be updated again.
+        Images of unfinished frames are kept. An interrupted scene may roll back to an earlier commit, so the images of
+        all later frames are kept, too.
         """
         ledger, pictures = self.ledger, self.pictures
         if len(ledger.committed) < NEWEST_KEPT or (rule.last is None and rule.bytes is None):

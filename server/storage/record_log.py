@@ -126,7 +126,7 @@ def read_at(data: memoryview, at: int) -> tuple[LogRecord | Damage, int]:
     """
     header = data[at : at + HEADER.size]
     if len(header) < HEADER.size or header[:4] != MAGIC:
-        return _skip(data, at, "no record begins here")
+        return _skip(data, at, "no record starts here")
     _, version, kind, nought, head_length, index, body_length = HEADER.unpack(header)
     head_end = at + PREFIX + head_length
     if version not in (WHOLE, BY_FILE) or nought or head_length > MAX_HEAD or head_end > len(data):
@@ -271,7 +271,7 @@ def check_record(file: Readable) -> Iterator[int]:
     """
     header = file.read(PREFIX)
     if len(header) < PREFIX or header[:4] != MAGIC:
-        raise ValueError("no record begins here")
+        raise ValueError("no record starts here")
     _, version, _, nought, head_length, _, body_length = HEADER.unpack_from(header)
     if version not in (WHOLE, BY_FILE) or nought or head_length > MAX_HEAD:
         raise ValueError("the header is of another version, damaged, or cut")

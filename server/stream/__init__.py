@@ -1,1 +1,1 @@
-"""Subscriptions: the subscribers of scenes, their messages and their live queries."""
+"""WebSocket subscriptions to scenes: subscribers, their outgoing messages and their live queries."""

@@ -1,7 +1,7 @@
-"""Subscriptions that query the readers: views, tracks, parts. Each has one query and one message under way.
+"""Live queries for views, tracks and parts; each has at most one query and one message in flight.
 
-A live query asks only when its message before was sent, for the newest frame at that moment: a slow client costs less,
-and a camera that is dragged is rendered where it is, not everywhere it was.
+A live query is issued only after its previous message was sent, and asks for the newest frame at that time. Slow
+clients thus cause less load, and a dragged camera is rendered only at its current pose.
 """
 
 from __future__ import annotations
@@ -29,12 +29,13 @@ log = logging.getLogger("scas4d.server")
 
 @dataclass(frozen=True)
 class LiveSharedQuery:
-    """A query of a subscription at one moment.
+    """Query of a subscription at one point in time.
 
     Attributes:
-        key: the same for all who would get the same answer.
-        head: of the message that the answer will be; media type and headers are the answer's.
-        changes: how many it answers for.
+        key: key that is equal for all subscribers that would get the same answer.
+        query: query to the readers.
+        head: head of the message that carries the answer; media type and headers are filled in from the answer.
+        changes: number of changes that the answer covers.
     """
 
     key: Hashable
@@ -44,10 +45,11 @@ class LiveSharedQuery:
 
 
 class LiveQuery(ABC):
-    """One subscription to views, tracks or parts.
+    """Subscription to views, tracks or parts.
 
     Attributes:
-        request: what the client asks for. tag: the client's, of that request; comes back with what is sent for it.
+        request: the client's current request.
+        tag: the client's tag for that request, echoed in every message sent for it.
     """
 
     request: Any
@@ -63,18 +65,18 @@ class LiveQuery(ABC):
         self._sent: Hashable = None
 
     def set_request(self, request: Model, tag: int | None) -> None:
-        """Changes the request from now on."""
+        """Replaces the request and triggers a new answer."""
         self.request = request
         self.tag = tag
         self.change()
 
     def change(self) -> None:
-        """Notes that there may be something newer to send."""
+        """Signals that there may be newer data to send."""
         self._changes += 1
         self._changed.set()
 
     async def run(self) -> None:
-        """Asks and sends until it is cancelled."""
+        """Issues queries and sends the answers until cancelled."""
         while True:
             await self._changed.wait()
             await self._outbox.sent(self.id)
@@ -109,13 +111,13 @@ class LiveQuery(ABC):
 
     def _ask(self) -> LiveSharedQuery:
         query = self.query()
-        # Parts are found from the whole history: the same query has another answer after a commit.
+        # Parts are computed from the whole history, so the same query has a different answer after a commit.
         newest = self.scene.committed[-1] if self.needs_all_frames(query) else None
         head = self.head(query).model_copy(update={"id": self.id, "tag": self.tag})
         return LiveSharedQuery((fingerprint(query), newest), query, head, self._changes)
 
     def due(self) -> bool:
-        """Returns True if there is something to ask for now."""
+        """Returns True if a query should be issued now."""
         return True
 
     def needs_all_frames(self, query: Query) -> bool:
@@ -123,12 +125,16 @@ class LiveQuery(ABC):
         return False
 
     def on_sent(self, head: BinaryHead) -> None:
-        """Notes that the message with this head is on its way."""
+        """Called after the message with this head was put into the outbox."""
         return
 
     @abstractmethod
     def query(self) -> Query:
-        """Returns the query to ask now; raises `Problem` if the request cannot be asked."""
+        """Returns the query to issue now.
+
+        Raises:
+            Problem: the request is invalid.
+        """
 
     @abstractmethod
     def head(self, query: Query) -> BinaryHead:
@@ -136,87 +142,87 @@ class LiveQuery(ABC):
 
 
 class LiveRender(LiveQuery):
-    """A view of the newest frame, or of a chosen one, from a camera that may be moved."""
+    """Live view of the newest or a chosen frame from a movable camera."""
 
     request: RenderRequest
 
     def query(self) -> RenderQuery:
-        """Returns the view as the reader takes it."""
+        """Returns the render query."""
         return render_query(self.scene, self.request)
 
     def head(self, query: Query) -> BinaryHead:
-        """Names the frame."""
+        """Returns the message head with the frame index."""
         assert isinstance(query, RenderQuery)
         return _head("render", query.frame)
 
     def needs_all_frames(self, query: Query) -> bool:
-        """Returns True for parts."""
+        """Returns True if the view shows parts."""
         return isinstance(query, RenderQuery) and "parts" in query.kinds
 
 
 class LiveTracks(LiveQuery):
-    """Trajectories: first over all frames asked for, then over those committed since; none is missed."""
+    """Live trajectories: first over all requested frames, then over newly committed ones, without gaps."""
 
     request: TracksRequest
     _from: int | None = None
     _at: int | None = None
 
     def set_request(self, request: Model, tag: int | None) -> None:
-        """Changes the request; its trajectories are sent from their beginning."""
+        """Replaces the request; its trajectories are sent from the first requested frame."""
         self._from = self._at = None
         super().set_request(request, tag)
 
     def due(self) -> bool:
-        """Returns True if frames within those asked for were not sent."""
+        """Returns True if requested frames have not been sent yet."""
         newest, last = self.scene.committed[-1], self.request.last
         return self._from is None or (self._from <= newest and (last is None or self._from <= last))
 
     def query(self) -> TracksQuery:
-        """Asks for the frames that were not sent yet."""
+        """Returns the query for the frames that have not been sent yet."""
         first = self.request.first if self._from is None else self._from
-        if self._at is None:  # stays the same frame when the scene gives up its first ones
+        if self._at is None:  # fixed now, because retention may later delete the first frames
             self._at = self.scene.committed[0] if self.request.at is None else self.request.at
         return tracks_query(self.scene, self.request.model_copy(update={"first": first, "at": self._at}))
 
     def head(self, query: Query) -> BinaryHead:
-        """Names the frames."""
+        """Returns the message head with the first and last frame index."""
         assert isinstance(query, TracksQuery)
         return _head("tracks", query.frames[-1]).model_copy(update={"first": query.frames[0]})
 
     def on_sent(self, head: BinaryHead) -> None:
-        """Goes on after the last frame sent."""
+        """Continues after the last frame that was sent."""
         self._from = head.frame + 1
 
 
 class LiveParts(LiveQuery):
-    """Labels of all Gaussians."""
+    """Live part labels of all Gaussians."""
 
     request: PartsSubscription
     _next: int | None = None
 
     def set_request(self, request: Model, tag: int | None) -> None:
-        """Changes the request, which is answered at once."""
+        """Replaces the request, which is answered immediately."""
         self._next = None
         super().set_request(request, tag)
 
     def due(self) -> bool:
-        """Returns True if enough frames came since the last message."""
+        """Returns True if enough frames were committed since the last message."""
         return self._next is None or self.scene.committed[-1] >= self._next
 
     def query(self) -> PartsQuery:
-        """Returns the number of parts as the reader takes it."""
+        """Returns the parts query."""
         return PartsQuery(self.request.count)
 
     def head(self, query: Query) -> BinaryHead:
-        """Names the newest frame."""
+        """Returns the message head with the newest frame index."""
         return _head("parts", self.scene.committed[-1])
 
     def needs_all_frames(self, query: Query) -> bool:
-        """Returns True: parts are found from all frames."""
+        """Returns True, since parts are computed from all frames."""
         return True
 
     def on_sent(self, head: BinaryHead) -> None:
-        """Waits for more frames before the next message."""
+        """Schedules the next message after `request.every` frames."""
         self._next = head.frame + self.request.every
 
 

@@ -1,4 +1,4 @@
-"""Messages that wait for one subscriber: replies in order, and of each subscription the newest message only."""
+"""Outgoing messages of one subscriber: replies in order, and only the newest message per subscription."""
 
 from __future__ import annotations
 
@@ -11,10 +11,13 @@ from client.wire.base import Model
 from server.counters import STREAM_MISSED
 
 MAX_UNSENT_REPLIES = 64
-"""A client that sends without reading is not listened to until it has read down to so many replies."""
+"""Maximum number of unsent replies.
+
+At this limit the service stops reading from the client until the client has read replies.
+"""
 
 Make = Callable[[int], str | bytes]
-"""A message, made when it is sent, from how many it took the place of."""
+"""Factory that builds a message just before it is sent, from the number of messages that it replaces."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +28,7 @@ class _Slot:
 
 
 class Outbox:
-    """Unsent messages of a subscriber, for one event loop. It is bounded by the number of subscriptions."""
+    """Queue of unsent messages of a subscriber on one event loop; its size is bounded by the subscription count."""
 
     def __init__(self) -> None:
         self._replies: deque[str] = deque()
@@ -36,13 +39,13 @@ class Outbox:
         self._last = False
 
     async def reply(self, message: Model) -> None:
-        """Adds what must arrive; waits while too much of that is unsent."""
+        """Adds a message that must be delivered; waits while `MAX_UNSENT_REPLIES` replies are unsent."""
         async with self._news:
             await self._news.wait_for(lambda: len(self._replies) < MAX_UNSENT_REPLIES)
         self._reply(message)
 
     def close_with(self, message: Model | None) -> None:
-        """Adds the last message, if there is one; what else waits is forgotten."""
+        """Discards all unsent messages and adds an optional last message."""
         self._replies.clear()
         self._slots.clear()
         if message is not None:
@@ -51,11 +54,13 @@ class Outbox:
         self._poster.set()
 
     def put(self, id: str, make: Make, *, missed: int = 0, weight: int = 1) -> None:
-        """Sets the newest message of a subscription.
+        """Sets the newest message of a subscription, replacing an unsent one.
 
         Args:
-            missed: what it took the place of before it came here.
-            weight: what it adds to the count of the next one if that takes its place unsent.
+            id: id of the subscription.
+            make: builds the message when it is sent.
+            missed: number of messages that it replaced before it was put here.
+            weight: number added to the `missed` count of its successor if it is replaced before it is sent.
         """
         if self._last:
             return
@@ -63,24 +68,24 @@ class Outbox:
         STREAM_MISSED.inc(missed + (0 if old is None else old.weight))
         if old is not None:
             missed += old.missed + old.weight
-        # In the old one's place: what changes often does not have to wait behind everything else each time.
+        # Keeps the position of the replaced message, so that frequent changes do not move it to the end each time.
         self._slots[id] = _Slot(make, missed, weight)
         self._poster.set()
 
     def drop(self, id: str) -> None:
-        """Forgets what waits of a subscription."""
+        """Discards the unsent message of a subscription."""
         self._slots.pop(id, None)
 
     async def sent(self, id: str) -> None:
-        """Waits until nothing of a subscription is unsent."""
+        """Waits until the subscription has no unsent message."""
         async with self._news:
             await self._news.wait_for(lambda: id not in self._slots and self._sending != id)
 
     async def send_all(self, send: Callable[[str | bytes], Awaitable[None]]) -> None:
-        """Sends until the last message is out, one after the other, replies first.
+        """Sends messages one at a time, replies first, until the last message has been sent.
 
         Args:
-            send: a coroutine function that waits for the connection; what is put meanwhile is newer.
+            send: coroutine function that returns once the connection has accepted the message.
         """
         while True:
             await self._poster.wait()

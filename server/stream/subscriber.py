@@ -1,4 +1,4 @@
-"""One client of a scene's stream: its subscriptions, and the messages that the scene's events become."""
+"""Client of a scene's stream: its subscriptions, and the messages generated from the scene's events."""
 
 from __future__ import annotations
 
@@ -40,9 +40,12 @@ from server.stream.outbox import Outbox
 T = TypeVar("T")
 
 MAX_SUBSCRIPTIONS = 16
-"""Subscriptions of one subscriber: enough for a page with views of some cameras. A second stream takes more."""
+"""Maximum number of subscriptions per subscriber, enough for a page with several views.
+
+A client that needs more can open a second stream.
+"""
 MESSAGE_KB = 256
-"""Largest message of a subscriber: some 8000 pixels to track."""
+"""Maximum size in kB of a message from a subscriber, enough for about 8000 pixels to track."""
 
 FIELD_PREFIX = "docs/stream.md lists the messages"
 
@@ -50,10 +53,10 @@ LIVE: dict[Topic, type[LiveQuery]] = {Topic.RENDER: LiveRender, Topic.TRACKS: Li
 
 
 class Subscriber:
-    """Listens to a scene for one client. The route that holds the connection empties its outbox.
+    """Subscriber to a scene on behalf of one client; the route that owns the connection drains its outbox.
 
     Attributes:
-        closing: code and reason of the connection's end, once the outbox has its last message.
+        closing: code and reason with which the connection is closed after the last message of the outbox.
     """
 
     def __init__(self, scene: Scene, channel: Channel) -> None:
@@ -65,7 +68,7 @@ class Subscriber:
         self._live: dict[str, tuple[LiveQuery, asyncio.Task[None]]] = {}
 
     def limits(self) -> StreamLimits:
-        """Returns the limits that the client is sent."""
+        """Returns the limits that are sent to the client."""
         return StreamLimits(
             subscriptions=MAX_SUBSCRIPTIONS,
             message_bytes=MESSAGE_KB * 1000,
@@ -74,11 +77,15 @@ class Subscriber:
         )
 
     async def greet(self) -> None:
-        """Sends the first message."""
+        """Sends the hello message."""
         await self.outbox.reply(Hello(protocol=STREAM_PROTOCOL, scene=self.scene.id, limits=self.limits()))
 
     async def handle_message(self, text: str | None) -> None:
-        """Takes a message of the client, None for a binary one; a wrong one is answered and changes nothing."""
+        """Handles a text message of the client; invalid ones get an error reply and have no other effect.
+
+        Args:
+            text: the message, or None if a binary message was received.
+        """
         id: str | None = None
         tag: int | None = None
         try:
@@ -102,14 +109,14 @@ class Subscriber:
             await self.outbox.reply(StreamProblem(id=id, tag=tag, problem=problem.document))
 
     def close(self) -> None:
-        """Ends all subscriptions of a client that has left."""
+        """Ends all subscriptions after the client has disconnected."""
         for id in list(self._topics):
             self._end(id)
 
     # Events of the hub.
 
     def on_event(self, event: Event) -> None:
-        """Something happened in the scene."""
+        """Handles an event of the scene."""
         for id, topic in self._topics.items():
             if topic == Topic.SCENE:
                 self._put_status(id)
@@ -120,11 +127,11 @@ class Subscriber:
                 live.change()
 
     def on_close(self, reason: str) -> None:
-        """The scene is no more."""
+        """Handles the deletion of the scene."""
         self.outbox.close_with(SceneGone(reason=reason))
 
     def on_restart(self) -> None:
-        """The scene is another one from here on: the client connects anew, as after a restart of the service."""
+        """Handles the restart of the reconstruction: the client must reconnect, as after a service restart."""
         self.closing = (SCENE_RESTARTS, "the reconstruction is begun anew")
         self.outbox.close_with(None)
 
@@ -133,7 +140,11 @@ class Subscriber:
     def _known(self, id: str) -> Topic:
         if id not in self._topics:
             raise Problem(
-                404, f"no subscription {id!r}", field="id", value=id, remedy="subscribe first; ids are yours to choose"
+                404,
+                f"no subscription {id!r}",
+                field="id",
+                value=id,
+                remedy="subscribe first, with an id of your choice",
             )
         return self._topics[id]
 
@@ -143,7 +154,7 @@ class Subscriber:
         if message.id not in self._topics and len(self._topics) >= MAX_SUBSCRIPTIONS:
             raise Problem(
                 429,
-                f"{count_noun(len(self._topics), 'subscription')} open already, and no more are taken",
+                f"{count_noun(len(self._topics), 'subscription')} are already open, the maximum",
                 field="subscriptions",
                 value=MAX_SUBSCRIPTIONS,
                 remedy="unsubscribe from another one, or open a second stream",
@@ -169,7 +180,7 @@ class Subscriber:
         if message.id not in self._live:
             raise Problem(
                 422,
-                f"topic {topic} has nothing to update",
+                f"topic {topic} cannot be updated",
                 field="id",
                 value=message.id,
                 remedy="update subscriptions to render, tracks or parts",
@@ -185,7 +196,7 @@ class Subscriber:
         self.outbox.drop(id)
 
     def _put_status(self, id: str) -> None:
-        # The status is read when it is sent: a slow subscriber gets it as it is then.
+        # The status is read at send time, so that a slow subscriber gets the current one.
         def make(missed: int) -> str:
             return _text("scene", id, missed, "status", self._channel.status(self.scene.status))
 
@@ -196,7 +207,7 @@ class Subscriber:
 
 
 def _text(kind: str, id: str, missed: int, name: str, value: str) -> str:
-    """A `SceneMessage` or `FrameMessage` around a value that is JSON already, written once for all who listen."""
+    """Returns a `SceneMessage` or `FrameMessage` around a value that was serialized once for all subscribers."""
     return f'{{"type":"{kind}","id":{json.dumps(id)},"missed":{missed},"{name}":{value}}}'
 
 

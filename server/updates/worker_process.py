@@ -167,7 +167,7 @@ class WorkerProcess:
             return
         await asyncio.sleep(SWEEP_AFTER_S)
         if names := await asyncio.to_thread(remove_earlier_epochs, self.spec.folder.states, epoch):
-            log.info("scene %s: removed %s, of workers before", self.spec.folder.name, ", ".join(names))
+            log.info("scene %s: removed %s of earlier workers", self.spec.folder.name, ", ".join(names))
 
     def start_in(self, seconds: float) -> None:
         """Schedules the start of the next process; call this after every unexpected exit."""

@@ -254,7 +254,7 @@ scripts/bench table out/quality --out docs/quality.md
 - Code: {f"{len(cores)} state(s) of the core's sources ({', '.join(cores)})" if cores else "–"}.
 
 An iteration is one forward and backward render of one training view. Figures are means over updates and test cameras;
-"updates" is the number of updates measured. A difference is taken over the updates that both sides have. Definitions
+"updates" names the measured updates. A difference is taken over the updates that both sides have. Definitions
 of the metrics: `scas4d_core/metrics/`.
 
 ## Targets
@@ -291,7 +291,8 @@ def _updates(metric: str, rows: Sequence[Row], shared: int) -> str:
     if "capture_frames" not in rows[0]:
         return "–"
     covered = [shared] if metric == "psnr" else list(dict.fromkeys(int(row["updates"]) for row in rows))
-    return " and ".join(str(n) for n in covered) + f" of {int(rows[0]['capture_frames']) - 1}"
+    whole = int(rows[0]["capture_frames"]) - 1
+    return "all" if covered == [whole] else " and ".join(map(str, covered)) + f" of {whole}"
 
 
 def _mean(figures: Sequence[Figure | None]) -> Figure | None:
@@ -300,7 +301,7 @@ def _mean(figures: Sequence[Figure | None]) -> Figure | None:
         return None
     parts = [figure.parts for figure in known if figure.parts is not None]
     both = (float(np.mean([a for a, _ in parts])), float(np.mean([b for _, b in parts]))) if parts else None
-    words = ", ".join(figure.updates for figure in known)
+    words = ", ".join(dict.fromkeys(figure.updates for figure in known))
     return Figure(float(np.mean([figure.value for figure in known])), both, words)
 
 

@@ -73,7 +73,7 @@ def test_a_data_folder_in_use_is_one_line(tmp_path):
 
 def test_a_data_folder_that_cannot_be_is_one_line(tmp_path):
     (tmp_path / "file").touch()
-    assert "name another with --data" in refused(tmp_path / "file", 0)
+    assert "choose another one with --data" in refused(tmp_path / "file", 0)
 
 
 def test_a_host_of_another_machine_is_one_line(tmp_path):

@@ -34,7 +34,7 @@ def test_what_is_given_wins_over_the_environment_and_that_over_the_file(tmp_path
         ('host = "::"', "no token"),
         ('allowed_origins = ["studio.example"]', "allowed_origins.*scheme"),
         ('token_file = "nowhere"', "there is no file nowhere"),
-        ('token = "a-token-of-thirty-two-characters"\ntoken_file = "nowhere"', "two tokens"),
+        ('token = "a-token-of-thirty-two-characters"\ntoken_file = "nowhere"', "both set"),
     ],
 )
 def test_a_bad_file_is_refused_by_name(tmp_path, text, said):

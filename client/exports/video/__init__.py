@@ -1,1 +1,1 @@
-"""Videos: camera paths, states at any time, overlays, encoding."""
+"""Video rendering: camera paths, states at arbitrary times, overlays and encoding."""

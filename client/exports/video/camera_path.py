@@ -1,4 +1,4 @@
-"""Paths of the camera of a video: an orbit, a camera of the rig, or key poses with a smooth way between them."""
+"""Camera paths for videos: an orbit, a fixed camera, or smoothly interpolated key poses."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 CameraPath = Callable[[float], Camera]
-"""Seconds since the beginning of the video to the camera, in the user's world, as large as the picture."""
+"""Function from seconds since the start of the video to a camera in the user's world, at the size of the video."""
 
 MAX_ELEVATION = np.radians(88)
-"""Highest an orbit goes: straight from above, "up" would have no direction."""
+"""Maximum elevation of an orbit in radians; at 90 degrees the up direction would be undefined."""
 
 
 def fit_to_size(camera: Camera, size: tuple[int, int]) -> Camera:
-    """The camera for a picture of another size (width, height): its own picture fits whole, in the middle.
+    """Returns a camera for another image size (width, height), in which the original image is centred and fits.
 
     >>> camera = Camera("a", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
     >>> wide = fit_to_size(camera, (256, 96))
@@ -42,7 +42,7 @@ def fit_to_size(camera: Camera, size: tuple[int, int]) -> Camera:
 
 
 def centre_axis(camera: Camera, size: tuple[int, int]) -> Camera:
-    """As ``fit_to_size``, with the optical axis in the middle of the picture."""
+    """Returns the camera like ``fit_to_size``, but with square pixels and the principal point at the image centre."""
     fitted_camera = fit_to_size(camera, size)
     scale = min(fitted_camera.fx, fitted_camera.fy)
     lens = np.array([[scale, 0, size[0] / 2], [0, scale, size[1] / 2], [0, 0, 1]])
@@ -50,7 +50,7 @@ def centre_axis(camera: Camera, size: tuple[int, int]) -> Camera:
 
 
 def fixed_path(camera: Camera, size: tuple[int, int]) -> CameraPath:
-    """The path of a camera that stands.
+    """Returns the path of a static camera.
 
     >>> camera = Camera("a", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
     >>> fixed_path(camera, (64, 48))(3.0).cx
@@ -61,14 +61,17 @@ def fixed_path(camera: Camera, size: tuple[int, int]) -> CameraPath:
 
 
 def orbit_path(rig: Rig, start: Camera, size: tuple[int, int], turn: float) -> CameraPath:
-    """A way around the point that the rig looks at.
+    """Returns an orbit around the point at which the rig looks.
 
     Args:
-        start: the camera where it begins, and whose picture fits whole. turn: degrees a second, to the camera's right.
+        rig: rig that defines the orbit's centre and up direction.
+        start: camera at which the orbit starts, and whose image fits into the video.
+        size: (width, height) of the video.
+        turn: angular speed in degrees per second, towards the camera's right.
 
     >>> lens = [[100, 0, 32], [0, 100, 24], [0, 0, 1]]
     >>> pose = np.eye(4)
-    >>> pose[2, 3] = 2  # two units before the point that it looks at
+    >>> pose[2, 3] = 2  # two units in front of the target
     >>> rig = Rig((Camera("a", lens, pose, 64, 48),))
     >>> path = orbit_path(rig, rig["a"], (64, 48), turn=90)
     >>> path(0.0).centre.round(6) + 0, path(1.0).centre.round(6) + 0
@@ -81,7 +84,7 @@ def orbit_path(rig: Rig, start: Camera, size: tuple[int, int], turn: float) -> C
     distance = float(np.linalg.norm(offset)) or view.radius
     height = float(offset @ view.up)
     flat = offset - height * view.up
-    if np.linalg.norm(flat) < 1e-6 * distance:  # right above: from below in its picture
+    if np.linalg.norm(flat) < 1e-6 * distance:  # directly above or below the target: any horizontal direction will do
         flat = np.cross(view.up, np.eye(3)[np.abs(view.up).argmin()])
     pitch = float(np.clip(np.arctan2(height, np.linalg.norm(flat)), -MAX_ELEVATION, MAX_ELEVATION))
     flat = flat / np.linalg.norm(flat)
@@ -97,16 +100,20 @@ def orbit_path(rig: Rig, start: Camera, size: tuple[int, int], turn: float) -> C
 def key_pose_path(
     file: Path, rig: Rig, size: tuple[int, int], seconds_of_frame: Mapping[int, float], start: Camera
 ) -> CameraPath:
-    """The path through the key poses of a file; before the first and after the last key the camera stands.
+    """Returns the path through the key poses of a file; the camera rests before the first and after the last key.
 
-    Positions go along a natural cubic spline, so do the points that are looked at where every key has one; else the
-    rotations go along one (``scipy.spatial.transform.RotationSpline``).
+    Positions follow a natural cubic spline. If every key has a `look_at` point, these points follow one as well.
+    Otherwise the rotations are interpolated with ``scipy.spatial.transform.RotationSpline``.
 
     Args:
-        seconds_of_frame: of the video, by frame of the scene. start: has the field of view where no key says.
+        file: JSON file of key poses.
+        rig: rig that defines the default up direction.
+        size: (width, height) of the video.
+        seconds_of_frame: time in the video of each frame of the scene.
+        start: camera that defines the field of view if no key does.
 
     Raises:
-        InputError: a fault in the file; the message names the field.
+        InputError: the file is invalid; the message names the field.
     """
     given = read_key_poses(file)
     lens = centre_axis(start, size)
@@ -161,7 +168,7 @@ def _camera(key: KeyPose, place: int, lens: Camera, up: Float, file: Path) -> Ca
 
 
 def _focal_lengths(given: KeyPoses, times: Float, lens: Camera) -> Float:
-    """[K] pixels at the keys; keys that do not say are between those that do."""
+    """Returns the focal lengths [K] of the keys in pixels; keys without a field of view are interpolated."""
     said = [
         (time, lens.height / 2 / np.tan(np.radians(key.field_of_view) / 2))
         for time, key in zip(times.tolist(), given.keys, strict=True)
@@ -173,7 +180,7 @@ def _focal_lengths(given: KeyPoses, times: Float, lens: Camera) -> Float:
 
 
 def _spline(times: Float, points: Sequence[Sequence[float] | Float]) -> Callable[[float], Float]:
-    """[3] at a time, on a natural cubic spline through [K, 3]."""
+    """Returns a natural cubic spline through points [K, 3] as a function of time."""
     from scipy.interpolate import CubicSpline
 
     through = np.array(points, np.float64)

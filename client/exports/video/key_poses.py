@@ -13,12 +13,15 @@ from scas4d_core.errors import InputError
 
 
 class KeyPose(Model):
-    """One pose of the camera and its moment; user's world and units, OpenCV axes.
+    """Camera pose at a point in time, in the user's world and units with OpenCV axes.
 
     Attributes:
-        time: seconds since the beginning of the video. frame: or the frame of the scene that is shown then.
-        position, look_at: of the camera, and a point in the middle of its picture.
-        world_to_camera: 4×4, in place of both. field_of_view: degrees over the picture's height.
+        time: seconds since the start of the video.
+        frame: frame of the scene that is shown at that time, as an alternative to `time`.
+        position: position of the camera.
+        look_at: point that appears at the image centre.
+        world_to_camera: 4×4 matrix, as an alternative to `position` and `look_at`.
+        field_of_view: vertical field of view in degrees.
     """
 
     time: Annotated[FiniteFloat, Field(ge=0)] | None = None
@@ -38,15 +41,16 @@ class KeyPose(Model):
         if placed and (self.position is None or self.look_at is None):
             raise ValueError("position and look_at go together; give both")
         if placed and self.position == self.look_at:
-            raise ValueError("position and look_at are the same point; give a point before the camera")
+            raise ValueError("position and look_at are the same point; give a point in front of the camera")
         return self
 
 
 class KeyPoses(Model):
-    """A camera path by its key poses.
+    """Camera path defined by key poses.
 
     Attributes:
-        keys: in order of time. up: direction that is upwards in the picture of poses by look_at; the rig's where None.
+        keys: key poses in order of time.
+        up: up direction of the image for poses with `look_at`; None for the rig's up direction.
     """
 
     keys: Annotated[list[KeyPose], Field(min_length=1, max_length=10_000)]
@@ -55,15 +59,15 @@ class KeyPoses(Model):
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.up is not None and not any(self.up):
-            raise ValueError("up is zero; give a direction")
+            raise ValueError("up is the zero vector; give a direction")
         return self
 
 
 def read_key_poses(path: Path) -> KeyPoses:
-    """Reads key poses.
+    """Reads key poses from a JSON file.
 
     Raises:
-        InputError: no such file, or a fault in it; the message names the field.
+        InputError: the file does not exist or is invalid; the message names the field.
 
     >>> out.mkdir()
     >>> file = out / "keys.json"
@@ -72,7 +76,7 @@ def read_key_poses(path: Path) -> KeyPoses:
     [0.0, 0.0, -3.0]
     """
     if not path.is_file():
-        raise InputError(f"path {str(path)!r} is no file", "give orbit, camera, or a JSON file of key poses")
+        raise InputError(f"path {str(path)!r} is not a file", "give orbit, camera, or a JSON file of key poses")
     try:
         return KeyPoses.model_validate_json(path.read_bytes())
     except ValidationError as error:
@@ -88,5 +92,5 @@ def read_key_poses(path: Path) -> KeyPoses:
 
 
 def pose_error(path: Path, place: int, error: CameraError) -> InputError:
-    """The error of a pose that is no camera."""
+    """Returns the error for a `world_to_camera` matrix that is not a valid camera pose."""
     return InputError(f"{path.name}: keys[{place}].world_to_camera: {error.fault}", error.remedy)

@@ -1,4 +1,4 @@
-"""States at the times of a video: the nearest that was reconstructed, or one between two."""
+"""States at the times of a video: the nearest reconstructed state, or an interpolated one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scas4d_core.gaussians import Gaussians, quaternions_to_matrices
 
 
 class Moment(NamedTuple):
-    """A state at a time; ``frame`` is the index of the nearest frame."""
+    """State at a point in time; ``frame`` is the index of the nearest frame."""
 
     frame: int
     state: Gaussians
@@ -21,12 +21,12 @@ class Moment(NamedTuple):
 def moments(
     states: Iterable[tuple[int, float, Gaussians]], wanted: Iterable[float], *, between: bool = False
 ) -> Iterator[Moment]:
-    """States at times, in seconds and rising; two states are in memory at once.
+    """Yields the states at the given times, with two states in memory at a time.
 
     Args:
-        states: index, seconds and state of frames, in order. wanted: before the first and after the last frame it is
-            that frame's state.
-        between: whether states are interpolated; else the nearest is taken, of two that are as near the earlier.
+        states: index, time in seconds and state of the frames, in order.
+        wanted: times in seconds in ascending order; times outside the frames give the first or last state.
+        between: whether to interpolate states; otherwise the nearest state is used, and the earlier one on a tie.
 
     >>> at = [(k, float(k), Gaussians.of_points([[k, 0, 2]], radius=0.1)) for k in range(3)]
     >>> [moment.frame for moment in moments(at, [0, 0.4, 0.6, 1.5, 9])]
@@ -49,10 +49,11 @@ def moments(
 
 
 def interpolate(a: Gaussians, b: Gaussians, share: float) -> Gaussians:
-    """A state between two of a scene, at ``share`` 0…1 of the way from ``a`` to ``b``.
+    """Returns the state interpolated between two states of a scene, at fraction ``share`` (0…1) from ``a`` to ``b``.
 
-    Centres and colours go straight; axes turn with the material rotations, so that what turns keeps its size. What is
-    there in one state alone stays where it is there, and fades.
+    Centres and colours are interpolated linearly. Covariance factors are interpolated in the rotating frame of each
+    Gaussian, so that rotating Gaussians keep their size. Gaussians present in only one of the states keep their
+    position and fade.
 
     >>> a = Gaussians.of_points([[0, 0, 2]], radius=0.1)
     >>> b = a.concatenate(Gaussians.of_points([[0, 1, 2]], radius=0.1))
@@ -87,13 +88,13 @@ def interpolate(a: Gaussians, b: Gaussians, share: float) -> Gaussians:
 
 
 def _mix(a: NDArray[Any], b: NDArray[Any], part: NDArray[Any]) -> NDArray[np.float32]:
-    """Rows between those of two arrays, ``part`` [N] of the way."""
+    """Returns the rows of two arrays interpolated linearly with the weights ``part`` [N]."""
     ways = part.reshape(-1, *[1] * (a.ndim - 1))
     return np.asarray(a + ways * (b - a), np.float32)
 
 
 def _slerp(a: NDArray[Any], b: NDArray[Any], part: NDArray[Any]) -> NDArray[np.float32]:
-    """[N, 4] unit quaternions between two, the short way."""
+    """Returns unit quaternions [N, 4] interpolated along the shorter arc (normalized linear interpolation)."""
     near = np.where((a * b).sum(axis=1, keepdims=True) < 0, -b, b)
     mixed = _mix(a, near, part)
     size = np.linalg.norm(mixed, axis=1, keepdims=True)

@@ -1,4 +1,4 @@
-"""Tracks drawn over pictures: trails behind Gaussians that move, which fade."""
+"""Overlay of tracks on images, drawn as fading trails behind moving Gaussians."""
 
 from __future__ import annotations
 
@@ -16,20 +16,24 @@ from scas4d_core.gaussians import Gaussians
 Picture = NDArray[np.uint8]
 
 SHARPER = 2
-"""Lines are drawn so many times larger and then reduced: their edges are smooth."""
+"""Supersampling factor of the drawn lines, for antialiasing."""
 WIDTH = 1 / 200
-"""Of the picture's height."""
+"""Line width as a fraction of the image height."""
 OPAQUE = 0.5
-"""Opacity from which a Gaussian is of a surface and not of haze."""
+"""Minimum opacity of a Gaussian that counts as part of a surface rather than haze."""
 CANDIDATES_PER_ROW = 0.5
-"""Share of the Gaussians, those that move most, of which some are taken."""
+"""Fraction of the moving Gaussians, those with the largest motion, from which tracks are selected."""
 
 
 def moving_rows(states: Sequence[Gaussians], count: int) -> NDArray[np.intp]:
-    """[count] rows, or fewer: of the Gaussians that move most, some whose ways are far apart; none where none moves.
+    """Returns up to `count` rows of Gaussians with large motion whose trajectories are far apart.
+
+    The result is empty if nothing moves.
 
     Args:
-        states: of some frames, the first the earliest; motion is measured from it. Only what moves in all is taken.
+        states: states of a few frames, the earliest first; motion is measured relative to it. Only Gaussians that are
+            moving in all of them are considered.
+        count: maximum number of rows.
 
     >>> a = Gaussians.of_points([[0, 0, 2], [1, 0, 2], [2, 0, 2]], radius=0.1)
     >>> b = a.replace(means=a.means + np.float32([[0, 0, 0], [0, 1, 0], [0, 2, 0]]))
@@ -54,10 +58,12 @@ def moving_rows(states: Sequence[Gaussians], count: int) -> NDArray[np.intp]:
 
 
 class Trails:
-    """The last places of some Gaussians, in the world; drawn from any camera.
+    """Trails of the latest positions of selected Gaussians, which can be drawn from any camera.
 
     Args:
-        rows: of the Gaussians. world: user's world to inside. length: places that are kept of each, at least 2.
+        rows: rows of the Gaussians.
+        world: transform between the user's world and the internal world.
+        length: number of positions kept per Gaussian, at least 2.
 
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1)
     >>> trails = Trails(np.array([0]), WorldFrame(np.zeros(3)), length=9)
@@ -74,19 +80,24 @@ class Trails:
         self._colours = [part_colour(number) for number in range(len(rows))]
 
     def add(self, state: Gaussians) -> None:
-        """Adds the places of a state, the newest."""
+        """Appends the positions of the newest state."""
         places = self._world.to_user(state.means[self._rows])
         places[~state.present[self._rows]] = np.nan
         self._places.append(places)
 
     def draw(self, picture: Picture, camera: Camera) -> Picture:
-        """The picture [H, W, 3] with the trails over it; camera: of the picture, user's world."""
+        """Returns the image [H, W, 3] with the trails drawn over it.
+
+        Args:
+            picture: rendered image.
+            camera: camera of the image, in the user's world.
+        """
         height, width = picture.shape[:2]
         uv = np.stack([camera.project(places)[0] for places in self._places]) * SHARPER
         sheet = Image.new("RGBA", (width * SHARPER, height * SHARPER))
         draw = ImageDraw.Draw(sheet)
         thick = max(4, round(WIDTH * height * SHARPER))
-        inside = (np.abs(uv) < 4 * SHARPER * max(width, height)).all(axis=2)  # NaN is not; nor what is far outside
+        inside = (np.abs(uv) < 4 * SHARPER * max(width, height)).all(axis=2)  # false for NaN
         for step in range(1, len(uv)):
             alpha = round(255 * step / (len(uv) - 1))
             for track in np.flatnonzero(inside[step - 1] & inside[step]):

@@ -1,4 +1,4 @@
-"""Colours of Gaussians by their part, for pictures in which the shading still shows."""
+"""Colours of Gaussians by part that preserve the shading of the scene."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from client.wire import part_colour
 from scas4d_core.gaussians import Gaussians
 
 LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
-"""Of BT.709."""
+"""Luminance weights of RGB according to BT.709."""
 DARKEST = 0.35
-"""Brightness of a part where the scene is black; 1 where it is white."""
+"""Brightness factor of a part colour for a black Gaussian; for a white one it is 1."""
 
 
 def part_colours(state: Gaussians, labels: NDArray[Any]) -> NDArray[np.float32]:
-    """[N, 3] RGB: the colour of the part, as bright as the Gaussian is; grey where it belongs to none.
+    """Returns RGB [N, 3]: the part's colour scaled by the Gaussian's brightness, or grey if it belongs to no part.
 
     Args:
-        labels: [M] part of each Gaussian, −1 for none; those after the M-th belong to none.
+        state: state with N Gaussians.
+        labels: [M] part label of each Gaussian, −1 for none; Gaussians beyond the M-th belong to no part.
 
     >>> state = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1, colours=1.0)
     >>> part_colours(state, np.array([0])).round(2)

@@ -1,4 +1,4 @@
-"""The point that a rig looks at, its up direction and its distance, as the page finds them (docs/viewer.md)."""
+"""Target point, up direction and radius of a rig, computed as in the viewer (docs/viewer.md)."""
 
 from __future__ import annotations
 
@@ -12,21 +12,25 @@ from scas4d_core.cameras import Camera, Rig
 Float = NDArray[np.float64]
 
 PARALLEL = 1e-6
-"""Of the largest entry, cubed: a smaller determinant means that the optical axes do not meet in a point."""
+"""Determinant threshold, relative to the cube of the largest matrix entry.
+
+Below it, the optical axes are considered parallel and have no common point.
+"""
 FAR = 20.0
-"""In radii of the rig: axes that meet farther away are parallel."""
+"""Distance of the intersection, in radii of the rig, beyond which the optical axes are considered parallel."""
 
 
 @dataclass(frozen=True, eq=False)
 class RigView:
-    """The place of a scene, by its rig; user's world and units.
+    """Location of a scene derived from its rig, in the user's world and units.
 
     Attributes:
-        target: [3] the point nearest to all optical axes; where they are parallel, a point before the cameras.
-        up: [3] unit, against the mean of the pictures' "down". radius: median distance of the cameras from the target.
+        target: point [3] closest to all optical axes; if they are parallel, a point in front of the cameras.
+        up: unit vector [3] opposite to the mean image-down direction of the cameras.
+        radius: median distance of the cameras from the target.
 
     >>> poses = np.stack([np.eye(4)] * 2)
-    >>> poses[1, :3, :3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]]  # the second looks along x, and stands at x = -2
+    >>> poses[1, :3, :3] = [[0, 0, -1], [0, 1, 0], [1, 0, 0]]  # the second camera is at x = -2 and looks along x
     >>> poses[:, :3, 3] = [0, 0, 2]
     >>> lens = [[100, 0, 32], [0, 100, 24], [0, 0, 1]]
     >>> view = RigView.of(Rig(tuple(Camera(str(k), lens, pose, 64, 48) for k, pose in enumerate(poses))))
@@ -40,7 +44,7 @@ class RigView:
 
     @classmethod
     def of(cls, rig: Rig) -> RigView:
-        """The view of a rig."""
+        """Returns target, up direction and radius of a rig."""
         centres = np.stack([camera.centre for camera in rig.cameras])
         ahead = np.stack([camera.rotation[2] for camera in rig.cameras])
         ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
@@ -61,7 +65,7 @@ class RigView:
 
 
 def _nearest_to_axes(centres: Float, ahead: Float) -> Float | None:
-    """[3] the point with the least sum of squared distances from lines [N, 3]; None where they leave it open."""
+    """Returns the point [3] with the least sum of squared distances to N lines, or None if it is not unique."""
     across = np.eye(3) - ahead[:, :, None] * ahead[:, None, :]
     matrix = across.sum(axis=0)
     if len(centres) < 2 or abs(np.linalg.det(matrix)) < PARALLEL * np.abs(matrix).max() ** 3:
@@ -76,9 +80,9 @@ def _unit(vector: Float) -> Float:
 
 
 def look_at(camera: Camera, eye: Float, target: Float, up: Float) -> Camera:
-    """The camera moved to ``eye`` [3] and turned towards ``target`` [3], ``up`` [3] upwards in its picture.
+    """Returns the camera moved to ``eye`` [3] and oriented towards ``target`` [3], with ``up`` [3] as up direction.
 
-    Where it looks along ``up``, the picture's "up" is some direction across.
+    If the viewing direction is parallel to ``up``, an arbitrary perpendicular direction is used.
 
     >>> camera = Camera("a", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)
     >>> moved = look_at(camera, np.array([5.0, 0, 0]), np.zeros(3), np.array([0.0, -1, 0]))

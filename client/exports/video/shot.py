@@ -1,4 +1,4 @@
-"""A video as it was asked for: checked, and rendered picture by picture."""
+"""Validation of video options, and frame-by-frame rendering of a video."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from scas4d_core.captures.images import resize_area
 from scas4d_core.errors import InputError
 
 MOST_PICTURES = 1_000_000
-"""Of a video; more is a mistake in its rate or its speed."""
+"""Maximum number of images in a video; a larger number indicates a wrong frame rate or speed."""
 
 
 @dataclass(frozen=True)
@@ -28,15 +28,19 @@ class VideoOptions:
     """Options of a video.
 
     Attributes:
-        path: `orbit_path`, `camera`, or a JSON file of key poses (docs/videos.md).
-        camera: of the rig or of the compared capture, to look through or to start the orbit at; None: the first.
-        turn: degrees a second of the orbit, to the camera's right.
-        fps: of the video; None: that of the frames. speed: seconds of the scene in one of the video.
-        seconds: of the video; None: until the frames end.
-        size: (width, height) of the render; None: that of the camera.
-        between: whether states are interpolated. tracks: how many; trail: their length in seconds of the video.
-        parts: whether Gaussians have the colours of their parts.
-        background: RGB in 0…1; None: the scene's.
+        path: `orbit`, `camera`, or a JSON file of key poses (docs/videos.md).
+        camera: name of a camera of the rig or the compared capture, used as viewpoint or start of the orbit; None for
+            the first.
+        orbit_speed: angular speed of the orbit in degrees per second, towards the camera's right.
+        fps: frame rate of the video; None for the rate of the source.
+        speed: seconds of scene time per second of video.
+        seconds: duration of the video; None for the duration of the frames.
+        size: (width, height) of the rendered image; None for the size of the camera.
+        interpolate: whether states are interpolated between frames.
+        tracks: number of tracks to draw.
+        trail: length of the tracks in seconds of video.
+        parts: whether Gaussians are coloured by part.
+        background: RGB in 0…1; None for the scene's background.
     """
 
     path: str = "orbit"
@@ -55,12 +59,17 @@ class VideoOptions:
 
 @dataclass(frozen=True, eq=False)
 class Shot:
-    """A video that can be made.
+    """Validated video that is ready to be rendered.
 
     Attributes:
-        given: the states. times: seconds of its frames that are shown, by index. options: as asked for.
-        fps: of the video. count: of pictures. size: (width, height) of the render. path: of the camera.
-        truth: the true picture of a frame, of that size; None where none is asked for.
+        given: source of the states.
+        times: times in seconds of the shown frames, by index.
+        options: requested options.
+        fps: frame rate of the video.
+        count: number of images.
+        size: (width, height) of the rendered image.
+        path: camera path.
+        truth: returns the ground truth image of a frame at that size; None without a comparison.
     """
 
     given: Source
@@ -78,7 +87,7 @@ class Shot:
         return self.size[0] * (1 if self.truth is None else 2), self.size[1]
 
     def pictures(self) -> Iterator[Picture]:
-        """The pictures, [H, W, 3], one after the other; two states are in memory at once."""
+        """Yields the images [H, W, 3] of the video, with two states in memory at a time."""
         from scas4d_core.engines.limits import DEFAULT, rig_limits
         from scas4d_core.query.view import ViewRenderer
 
@@ -103,34 +112,42 @@ class Shot:
     def _labels(self) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
         labels = self.given.parts()
         if labels is None:
-            raise InputError(f"parts: {self.given.name} holds none", "leave --parts out; there are none without motion")
+            raise InputError(
+                f"parts: {self.given.name} holds none", "leave --parts out; a scene without motion has no parts"
+            )
         return labels
 
     def _trails(self) -> Trails:
         rows = moving_rows(self.given.some(list(self.times)), self.options.tracks)
         if not rows.size:
-            raise InputError("tracks: nothing moves in these frames", "leave --tracks out, or choose other --frames")
+            raise InputError(
+                "tracks: there is no motion in these frames", "leave --tracks out, or choose other --frames"
+            )
         return Trails(rows, self.given.head.world, round(self.options.trail * self.fps) + 1)
 
 
 def plan_shot(
     given: Source, low: int, high: int, options: VideoOptions, compared: Capture | None, *, even: bool
 ) -> Shot:
-    """Checks what is asked for.
+    """Validates the options and returns the video to render.
 
     Args:
-        given: the states. low, high: first and last frame. compared: its true pictures are shown to the right.
-        even: whether both sides of the picture have to be even; an odd size of a camera is cut, one that was asked
-            for is refused.
+        given: source of the states.
+        low: first frame.
+        high: last frame.
+        options: requested options.
+        compared: capture whose ground truth images are shown on the right, or None.
+        even: whether width and height must be even. The odd size of a camera is rounded down; an odd requested size is
+            an error.
 
     Raises:
-        InputError: frames, a camera or pictures that are not there, or options that contradict each other.
+        InputError: frames, a camera or images do not exist, or options contradict each other.
     """
     _check(options, compared)
     times = given.within(low, high)
     first, last = min(times.values()), max(times.values())
     fps = options.fps or given.rate
-    # The last frame is shown for as long as a picture.
+    # The last frame is shown for the duration of one image.
     length = (last - first) / options.speed + 1 / fps if options.seconds is None else options.seconds
     if length * fps > MOST_PICTURES:
         raise InputError(
@@ -157,7 +174,11 @@ def _check(options: VideoOptions, compared: Capture | None) -> None:
 
 
 def _camera(given: Source, name: str | None, compared: Capture | None) -> Camera:
-    """The camera of a name, as the scene has refined it, or one that only the capture has; without a name the first."""
+    """Returns a camera by name, or the first without a name; refined cameras of the scene precede those of the capture.
+
+    Raises:
+        InputError: there are no cameras, or none with this name.
+    """
     cameras = {}
     if compared is not None:
         cameras = {
@@ -185,7 +206,9 @@ def _size(asked: tuple[int, int] | None, camera: Camera, even: bool) -> tuple[in
         return width, height
     fits = max(width // 2 * 2, 2), max(height // 2 * 2, 2)
     if asked is not None:
-        raise InputError(f"size {width}x{height} is odd, and an MP4 cannot be", f"give {fits[0]}x{fits[1]}, or a .webp")
+        raise InputError(
+            f"size {width}x{height} is odd, which MP4 does not support", f"give {fits[0]}x{fits[1]}, or a .webp"
+        )
     return fits
 
 
@@ -200,7 +223,7 @@ def _path(
 
 
 def _truth(compared: Capture, camera: Camera, size: tuple[int, int], last: int) -> Callable[[int], Picture]:
-    """Gives the true picture of a frame, in the place where ``fitted`` puts the camera's own."""
+    """Returns a function that gives the ground truth image of a frame, placed like the camera's in ``fit_to_size``."""
     training = camera.name in compared.full_rig.names
     if not training and (compared.full_test_rig is None or camera.name not in compared.full_test_rig.names):
         raise InputError(f"compare: capture {compared.name} has no camera {camera.name!r}", "give another --camera")

@@ -1,4 +1,4 @@
-"""`scas4d video`: states rendered along a path of the camera, as an MP4 or an animated WebP."""
+"""Implementation of `scas4d video`, which renders states along a camera path to an MP4 or an animated WebP."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from scas4d_core.captures import Capture
 from scas4d_core.errors import InputError
 
 SMALLEST, LARGEST = 16, 7680
-"""Pixels of a side of the render; encoders and memory end there."""
+"""Minimum and maximum width and height of the rendered image in pixels, limited by encoders and memory."""
 
 
 def make_video(
@@ -27,25 +27,25 @@ def make_video(
     url: str,
     token: str | None,
 ) -> Path:
-    """Renders a video; two states and one picture are in memory at a time.
+    """Renders a video and returns its path; two states and one image are in memory at a time.
 
     Args:
-        source: as `opened` takes it. out: ends in `.mp4` or `.webp`; None: an MP4 beside the source, named after it.
-        frames: `A:B`, the frames from A to B, both counted in; None: all.
-        compared: the capture; the true picture of the same camera is shown to the right of each render.
-        url, token: of the service.
-
-    Returns:
-        The file.
+        source: source of the states, see `opened`.
+        out: path that ends in `.mp4` or `.webp`; None for an MP4 next to the source, named after it.
+        options: options of the video.
+        frames: range `A:B`, inclusive; None for all.
+        compared: capture whose ground truth image of the same camera is shown to the right of each rendered image.
+        url: address of the service.
+        token: token of the service.
 
     Raises:
-        InputError: an option that cannot be, or frames, a camera or parts that are not there.
+        InputError: an option is invalid, or frames, a camera or parts do not exist.
         MissingExtraError: PyAV is not installed.
     """
     low, high = frame_range(frames)
     if out is not None:
         check_suffix(out)
-    pyav()  # before anything is fetched or compiled
+    pyav()  # fail early, before anything is downloaded or compiled
     with opened(source, low, high, options.parts, url, token) as given, Bars() as bars:
         if given.of.damage is not None:
             console.print(f"only a part can be read: {given.of.damage}", soft_wrap=True)
@@ -64,7 +64,7 @@ def make_video(
 
 
 def picture_size(text: str) -> tuple[int, int]:
-    """Width and height of a size.
+    """Parses an image size and returns (width, height).
 
     >>> picture_size("1280x720")
     (1280, 720)
@@ -79,7 +79,7 @@ def picture_size(text: str) -> tuple[int, int]:
 
 
 def background_colour(text: str) -> tuple[float, float, float]:
-    """RGB in 0…1 of a colour.
+    """Parses a colour name or hex code and returns RGB in 0…1.
 
     >>> background_colour("#ff8000"), background_colour("white")
     ((1.0, 0.5019607843137255, 0.0), (1.0, 1.0, 1.0))

@@ -1,4 +1,4 @@
-"""Writes videos through PyAV, picture by picture: H.264 in an MP4, or an animated WebP."""
+"""Video files written image by image with PyAV: H.264 in an MP4, or an animated WebP."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ Picture = NDArray[np.uint8]
 
 SUFFIXES = (".mp4", ".webp")
 QUALITY = {".mp4": {"crf": "18", "preset": "medium"}, ".webp": {"quality": "90", "lossless": "0"}}
-"""Options of the encoders; at these the eye sees no loss."""
+"""Encoder options, chosen for visually lossless quality."""
 FINEST_RATE = 65535
-"""Largest denominator of a rate: the containers have no room for more."""
+"""Largest denominator of a frame rate that the containers can store."""
 
 
 def check_suffix(path: Path) -> str:
-    """The suffix of a video, in small letters.
+    """Returns the suffix of a video file in lower case.
 
     Raises:
-        InputError: it is none that is written.
+        InputError: the suffix is not supported.
 
     >>> check_suffix(Path("a.MP4"))
     '.mp4'
@@ -44,20 +44,21 @@ def check_suffix(path: Path) -> str:
 
 @contextmanager
 def video_file(path: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
-    """Writes pictures of one size as a video; folders are made, and the file has its name when it is whole.
+    """Writes images of equal size to a video; missing folders are created, and the file appears once it is complete.
 
-    An MP4 is 4:2:0 with 8 bits, which everything plays, in the colours of BT.709 with limited range, and says so. A
-    WebP repeats for ever. A picture is encoded when it is added; none is kept.
+    An MP4 uses 8-bit 4:2:0 for compatibility, with BT.709 colours in limited range, tagged as such. A WebP loops
+    forever. Images are encoded as they are added and are not kept.
 
     Args:
-        path: ends in `.mp4` or `.webp`. fps: pictures a second.
+        path: path that ends in `.mp4` or `.webp`.
+        fps: frames per second.
 
     Yields:
-        A function that adds a picture, [H, W, 3], sRGB values 0…255; of an MP4 an odd row or column at the end is left
-        out, as the encoding needs.
+        A function that adds an image [H, W, 3] with sRGB values 0…255. In an MP4, an odd last row or column is cropped,
+        as required by the encoding.
 
     Raises:
-        InputError: another suffix, no picture was added, or the file cannot be written.
+        InputError: the suffix is not supported, no image was added, or the file cannot be written.
         MissingExtraError: PyAV is not installed.
 
     >>> with video_file(out / "grey.mp4", 25) as add:
@@ -85,10 +86,10 @@ def video_file(path: Path, fps: float) -> Iterator[Callable[[Picture], None]]:
 
 
 class _Encoder:
-    """One file that is being written.
+    """Encoder of one video file.
 
     Attributes:
-        count: pictures so far.
+        count: number of images added so far.
     """
 
     def __init__(self, path: Path, suffix: str, fps: float) -> None:
@@ -125,7 +126,7 @@ class _Encoder:
         self.count += 1
 
     def finish(self) -> None:
-        """Writes what the encoder still holds."""
+        """Flushes the encoder."""
         self._container.mux(self._stream.encode(None))
 
     def close(self) -> None:

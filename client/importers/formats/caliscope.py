@@ -1,7 +1,8 @@
 """Reads caliscope's `camera_array.toml`.
 
-Each camera has a table `[cameras.<id>]` with `size` (width, height), `matrix`, `distortions` (5, or 4 if `fisheye`),
-`rotation` as a matrix [3][3] or Rodrigues vector [3], and `translation`, world to camera. A camera is named after its
+Each camera has a table `[cameras.<id>]` with `size` (width, height), `matrix` and `distortions` (5, or 4 if `fisheye`).
+Its `rotation`, a matrix [3][3] or Rodrigues vector [3], and its `translation` are world to camera. A camera is named
+after its
 video, `cam_<id>.mp4`, or `port_<id>.mp4` in earlier versions, which wrote `port` instead of `cam_id`.
 `rotation_count` rotates images only for caliscope's trackers, not for the calibration, so it is not used. Cameras that
 are marked as ignored or have no pose are left out, with a remark.

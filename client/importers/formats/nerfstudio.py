@@ -86,9 +86,7 @@ def _view(where: str, meta: Mapping[str, Any], frame: Mapping[str, Any], undo: F
 
 
 def _default_model(given: Mapping[str, Any]) -> str:
-    """Infers the camera model from `is_fisheye` and the coefficients if the file names none, as in instant-ngp's
-    files.
-    """
+    """Infers the camera model from `is_fisheye` and the coefficients, because instant-ngp's files do not name it."""
     if given.get("is_fisheye"):
         return "OPENCV_FISHEYE"
     return "OPENCV" if any(given.get(key) for key in COEFFICIENTS) else "PINHOLE"

@@ -29,9 +29,7 @@ MATRIX_FIELD = re.compile(rb"^\s*<?(" + "|".join(MATRIX).encode() + rb")\s*[ :>]
 
 
 def camera_files(folder: Path) -> list[Path]:
-    """Returns the files in the folder that contain a camera matrix. Excludes EasyMocap's files, which contain
-    several.
-    """
+    """Returns the files in the folder that contain a single camera matrix, which excludes EasyMocap's files."""
     if not folder.is_dir():
         return []
     files = sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDS and path.is_file())

@@ -40,9 +40,7 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 """Converts OpenGL's camera axes to OpenCV's."""
 METRES = 1e-3
 WHOLE = 0.1
-"""Largest deviation of the subpixels per pixel from an integer. Real files have ratios such as 69568/1087 or
-122879/1919.
-"""
+"""Tolerance when rounding the subpixels per pixel; real files have ratios such as 69568/1087 or 122879/1919."""
 
 
 @dataclass

@@ -103,9 +103,7 @@ def screen_novelty(seen: FrameObservation, least: int, new: float = 0.0, bare: f
         least: minimum number of such cameras. new, bare: minimum shares of each camera's pixels.
     """
     glimpses = _coarse_novelties(seen) if seen.result.trace.kept is Candidate.END else []
-    if (
-        len(glimpses) >= min(SCREENED_CAMERAS, len(seen.views)) > 0
-    ):  # with fewer, the update ended earlier than planned
+    if len(glimpses) >= min(SCREENED_CAMERAS, len(seen.views)) > 0:  # with fewer, the update ended earlier than planned
         seem = [one.view for one in glimpses if one.new >= COARSE_SHARE * new and one.bare >= COARSE_SHARE * bare]
         return novelty_of_views(seen, seem[: max(SCREENED_CAMERAS, least)]) if len(seem) >= least else []
     count = len(seen.views)

@@ -29,11 +29,11 @@ LARGEST = wp.constant(wp.float32(EXPONENT / log2(e)))
 """Bound of an exponential's argument."""
 SMALLEST_COSINE = wp.constant(wp.float32(HALF_TURN))
 COLUMNS = 10
-"""Parameters of a cluster: r, t, c (three each) and s."""
+"""ClusterParameters of a cluster: r, t, c (three each) and s."""
 
 
 @wp.struct
-class Parameters:
+class ClusterParameters:
     """The parameters of a cluster, with its rotation as a unit quaternion and as a matrix."""
 
     r: wp.vec3
@@ -45,9 +45,9 @@ class Parameters:
 
 
 @wp.func
-def parameters_of(table: wp.array2d[wp.float32], cluster: wp.int32) -> Parameters:
+def parameters_of(table: wp.array2d[wp.float32], cluster: wp.int32) -> ClusterParameters:
     """Reads a row of a layer's table."""
-    found = Parameters()
+    found = ClusterParameters()
     found.r = wp.vec3(table[cluster, 0], table[cluster, 1], table[cluster, 2])
     found.t = wp.vec3(table[cluster, 3], table[cluster, 4], table[cluster, 5])
     found.c = wp.vec3(table[cluster, 6], table[cluster, 7], table[cluster, 8])

@@ -1,4 +1,4 @@
-"""Errors of files that are damaged, cut, or none of ours: they end as one sentence with the file's name."""
+"""Converts errors of files that are damaged, truncated or not exports to one-sentence errors with the file name."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ FAULTS = (
     ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, MemoryError, OSError, EOFError,
     struct.error, zipfile.BadZipFile,
 )  # fmt: skip
-"""Exceptions that reading a hostile or damaged export can raise: its own numbers say where to read, and how much."""
+"""Exceptions that reading a malicious or damaged export can raise, since its own numbers control offsets and sizes."""
 
 
 @contextmanager
 def translate_read_errors(name: str) -> Iterator[None]:
-    """Takes what goes wrong for a fault of the file.
+    """Converts exceptions raised while reading a file to an ``InputError``.
 
     Args:
-        name: of the file, for the message.
+        name: name of the file, for the message.
 
     Raises:
-        InputError: it cannot be read.
+        InputError: the file cannot be read.
 
     >>> with translate_read_errors("a.glb"):
     ...     {}["accessors"]

@@ -1,4 +1,4 @@
-"""Reads a frame of ``.glb`` with KHR_gaussian_splatting, as ``exports.gltf`` writes it."""
+"""Reads a frame from a ``.glb`` with KHR_gaussian_splatting, as written by ``exports.gltf``."""
 
 from __future__ import annotations
 
@@ -20,13 +20,14 @@ REMEDY = "give a .glb of scas4d export --format glb"
 
 
 class GltfFrame:
-    """The document and the bytes of one file.
+    """The document and the binary data of one file.
 
     Args:
-        data: of the file. name: of it, for messages.
+        data: bytes of the file.
+        name: name of the file, for messages.
 
     Raises:
-        InputError: it is no .glb, or holds no single set of splats.
+        InputError: the file is not a .glb, or contains an animation of parts.
     """
 
     def __init__(self, data: bytes, name: str) -> None:
@@ -44,17 +45,17 @@ class GltfFrame:
 
     @property
     def metres_per_unit(self) -> float:
-        """Metres of one of the user's units."""
+        """Metres per unit of the user's world."""
         unit = self._document.get("asset", {}).get("extras", {}).get("metres_per_unit", 1.0)
         if not isinstance(unit, int | float) or not 0 < unit < float("inf"):
             raise InputError(f"{self._name}: metres_per_unit is {unit!r}", REMEDY)
         return float(unit)
 
     def cloud(self) -> Cloud:
-        """The Gaussians in the user's world and unit, OpenCV axes; of the harmonics all that the file has.
+        """Returns the Gaussians in the user's world and unit with OpenCV axes, with all harmonics of the file.
 
         Raises:
-            InputError: attributes are missing, or there are no ids.
+            InputError: attributes or ids are missing, or the file does not contain exactly one set of splats.
         """
         if not self._meshes:
             none = np.zeros((0, 3))
@@ -95,7 +96,7 @@ class GltfFrame:
         return cloud.half_turned().scaled(1 / self.metres_per_unit)
 
     def _values(self, number: int) -> NDArray[np.float64]:
-        """[N, width] of an accessor."""
+        """Returns the values [N, width] of an accessor."""
         accessor = self._document["accessors"][number]
         view = self._document["bufferViews"][accessor["bufferView"]]
         width, count = WIDTHS[accessor["type"]], accessor["count"]
@@ -106,7 +107,7 @@ class GltfFrame:
 
 
 def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
-    """The document and the binary chunk (glTF 2.0, section 4.4)."""
+    """Returns the document and the binary chunk (glTF 2.0, section 4.4)."""
     magic, version, _ = struct.unpack_from("<4sII", data)
     if magic != b"glTF" or version != 2:
         raise ValueError("it does not begin as one")

@@ -1,4 +1,4 @@
-"""Opens what an export has left: numbered files in a folder or a .zip, one file, USD. Refuses what lost the ids."""
+"""Opens exports: numbered files in a folder or a .zip, a single file, or USD. Rejects formats without ids."""
 
 from __future__ import annotations
 
@@ -33,18 +33,18 @@ LOST = {
 REMEDY = "give a .s4d file, USD, or numbered .glb files (scas4d export --format s4d, usd, glb)"
 Bytes = Callable[[], bytes]
 LARGEST = 1 << 30
-"""Bytes of a frame's file in a .zip: a small archive can hold more than the memory does."""
+"""Maximum size in bytes of a frame's file in a .zip; a small archive can decompress to more than the memory."""
 
 
 def open_export(path: Path | str, frames_per_second: float = DEFAULT_FPS) -> ExportedStates:
-    """Opens an export as states; one frame is read at a time.
+    """Opens an export as states; frames are read one at a time.
 
     Args:
-        path: a folder or a .zip of numbered .glb or .ply files, one such file, or USD.
-        frames_per_second: of numbered files: frame n is at n / frames_per_second.
+        path: folder or .zip of numbered .glb or .ply files, a single such file, or USD.
+        frames_per_second: frame rate of numbered files; frame n is at n / frames_per_second.
 
     Raises:
-        InputError: it is none, or its format has no ids of Gaussians.
+        InputError: the path is not an export, or its format has no Gaussian ids.
 
     >>> open_export("scene.splat")
     Traceback (most recent call last):
@@ -140,15 +140,15 @@ def _sequence(source: str, suffix: str, files: dict[int, tuple[str, Bytes]], rat
 
 
 class PlyRows:
-    """Reads numbered .ply files, whose rows are Gaussians where all files have the same.
+    """Reads numbered .ply files. Rows identify Gaussians if all files have the same rows.
 
-    A Gaussian keeps its opacity for ever, so rows with other opacities are other Gaussians.
+    A Gaussian's opacity never changes, so rows with different opacities are different Gaussians.
 
     Args:
-        files: name and bytes of each.
+        files: name of each file, and a function that reads its bytes.
 
     Raises:
-        InputError: the first is no such file.
+        InputError: the first file is not a 3DGS .ply.
     """
 
     def __init__(self, files: list[tuple[str, Bytes]]) -> None:
@@ -158,10 +158,10 @@ class PlyRows:
         self.glossy = any(name.startswith("f_rest_") for name in vertex.data.dtype.names)
 
     def cloud(self, place: int) -> Cloud:
-        """The Gaussians of a frame in the user's world; ids are rows.
+        """Returns the Gaussians of a frame in the user's world; ids are row numbers.
 
         Raises:
-            InputError: it has other Gaussians than the first.
+            InputError: the frame has other Gaussians than the first.
         """
         name, read = self._files[place]
         splats = read_ply(io.BytesIO(read()), name)

@@ -1,9 +1,9 @@
-"""States from the clouds of a sequence's frames: rows that keep their matter, births, and what is gone for a while.
+"""Reconstructs states from the clouds of a sequence's frames: rows with fixed identity, births, and retirements.
 
-A cloud has the Gaussians that are there in its frame, with their ids. A Gaussian gets its row in the frame in which it
-comes first, and is retired in each in which it is not. What files do not hold is found: a Gaussian moves where its
-place changes at all, and its material rotation is that of the axes of its covariance, which exports name by the axes
-that were carried along.
+A cloud has the Gaussians present in its frame, with their ids. A Gaussian gets its row in the first frame that contains
+it, and is retired in each frame that does not. Data missing from the files is inferred: a Gaussian moves if its
+position changes. Its material rotation is that of its covariance's axes, which exports keep in the order of the
+transported axes.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
 STANDS = 1e-6
-"""Of the extent of the Gaussians: one that moves by less stands. float32 in files has a tenth of that."""
+"""Displacement relative to the Gaussians' extent below which one is static; float32 resolves a tenth of it."""
 
 
 @dataclass(frozen=True, eq=False)
 class _GaussianTable:
-    """What the frames hold of each Gaussian, by row: ids, moving, opacities [N], and the first axes [N, 4]."""
+    """Constant data of each Gaussian, by row: ids, moving flags and opacities [N], and initial axes [N, 4]."""
 
     ids: Int
     moving: NDArray[np.bool_]
@@ -41,14 +41,17 @@ class _GaussianTable:
 
 @dataclass(eq=False)
 class ExportedStates:
-    """A sequence of clouds as states. One frame is in memory at a time, and what is known of each Gaussian.
+    """Presents a sequence of clouds as states. Only one frame is in memory, plus the constant data of each Gaussian.
 
     Attributes:
-        frames: indices, rising. times: seconds, rising.
-        cloud: returns that of a frame by its place in ``frames``, in the user's world and unit, OpenCV axes.
-        head: its world has no origin of its own: a file has none.
-        part_of: label by id; empty where the file has none. remarks: what was lost, a sentence each.
-        damage: always None, as a compact file may have some.
+        frames: frame indices in increasing order.
+        times: times in seconds, in increasing order.
+        cloud: returns the cloud of a frame by its position in ``frames``, in the user's world and unit, with OpenCV
+            axes.
+        head: header of the states; the origin of its world is zero, because files have none.
+        part_of: part label by id; empty if the file has none.
+        remarks: lost information, one sentence each.
+        damage: always None; exists for compatibility with compact files.
 
     >>> from scas4d_core.exports.cloud import cloud_of
     >>> first = Gaussians.of_points([[0, 0, 2], [1, 0, 2]], radius=0.1)
@@ -70,22 +73,22 @@ class ExportedStates:
 
     @property
     def known(self) -> _GaussianTable:
-        """The frames are read once for it."""
+        """Constant data of each Gaussian; the first access reads all frames."""
         if self._known is None:
             self._known = self._survey()
         return self._known
 
     def parts(self) -> Int | None:
-        """[N] part of each Gaussian by row, −1 for none; None where the file has none."""
+        """Returns the part of each Gaussian [N] by row, −1 for none, or None if the file has no parts."""
         if not self.part_of:
             return None
         return np.array([self.part_of.get(id, -1) for id in self.known.ids.tolist()], np.int64)
 
     def states(self, low: int = 0, high: int | None = None) -> Iterator[tuple[int, float, Gaussians]]:
-        """Yields index, seconds and state of the frames from ``low`` to ``high``, in the inside world of ``head``.
+        """Yields index, time in seconds and state of frames ``low`` to ``high``, in the internal world of ``head``.
 
         Raises:
-            InputError: a file is damaged, or does not follow those before.
+            InputError: a file is damaged, or is inconsistent with previous ones.
         """
         known, world = self.known, self.head.world
         row_of = {id: row for row, id in enumerate(known.ids.tolist())}
@@ -134,7 +137,7 @@ class ExportedStates:
             moving[rows, 0] = np.maximum(moving[rows, 0], away)
             opacities[rows, 0] = np.maximum(opacities[rows, 0], of.opacities)
         extent = float(np.ptp(first, axis=0).max(initial=0)) if len(first) else 0.0
-        far = float(np.abs(first).max(initial=0))  # a difference below float32's resolution is no motion
+        far = float(np.abs(first).max(initial=0))  # ignore differences below float32's resolution
         least = max(STANDS * extent, 4 * float(np.finfo(np.float32).eps) * far)
         return _GaussianTable(
             np.fromiter(ids, np.int64, len(ids)), moving[:, 0] > least, opacities[:, 0].astype(np.float32), turns
@@ -165,7 +168,7 @@ def _state(
 
 
 def default_header(metres_per_unit: float, frames_per_second: float | None) -> FileHeader:
-    """The head of states in the user's world, in metres.
+    """Returns a header for states in the user's world, in metres.
 
     >>> default_header(0.01, 30.0).world.to_inside(np.array([[100.0, 0, 0]]))
     array([[1., 0., 0.]])

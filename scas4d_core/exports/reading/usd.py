@@ -1,4 +1,4 @@
-"""Reads a sequence from USD as ``exports.usd`` writes it: Gaussians with ids, over time, and their parts."""
+"""Reads a sequence from USD as written by ``exports.usd``: Gaussians with ids over time, and their parts."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ REMEDY = "give a file of scas4d export --format usd"
 
 
 def open_usd(path: Path) -> ExportedStates:
-    """Opens a file; a frame is read when it is asked for.
+    """Opens a file; frames are read on demand.
 
     Raises:
-        InputError: usd-core is missing, it is no such file, or has no ids.
+        InputError: usd-core is missing, or the file is not such an export or has no ids.
     """
     usd, geometry, volume = (import_optional(f"pxr.{name}", "usd") for name in ("Usd", "UsdGeom", "UsdVol"))
     failure = import_optional("pxr.Tf", "usd").ErrorException
@@ -46,7 +46,7 @@ def open_usd(path: Path) -> ExportedStates:
     codes = _codes(stage, prim)
     first, begin = int(origin.get("first_frame", 0)), float(origin.get("first_time_s", 0.0))
     frames = [first + round(code) for code in codes]
-    if len(set(frames)) < len(frames):  # several in one time code: the rate is not that of the frames
+    if len(set(frames)) < len(frames):  # several frames per time code, so the rate is not the frame rate
         frames = list(range(first, first + len(codes)))
     parts = primvars.GetPrimvar("scas4d:part").Get() if primvars.HasPrimvar("scas4d:part") else None
     part_of = {} if parts is None else dict(zip(reader.ids.tolist(), np.array(parts).tolist(), strict=True))
@@ -62,7 +62,7 @@ def open_usd(path: Path) -> ExportedStates:
 
 
 def _codes(stage: Any, prim: Any) -> list[float]:
-    """Time codes of the frames: those of any sample, for what does not change has one alone."""
+    """Returns the time codes of the frames, from all samples, because unchanging attributes have a single sample."""
     codes = {float(stage.GetStartTimeCode()), float(stage.GetEndTimeCode())}
     scope = stage.GetPrimAtPath(PARTS)
     for each in [prim, *(scope.GetChildren() if scope else ())]:
@@ -72,10 +72,10 @@ def _codes(stage: Any, prim: Any) -> list[float]:
 
 
 class _Reader:
-    """Reads the Gaussians that are there at a time code."""
+    """Reads the Gaussians present at a time code."""
 
     def __init__(self, stage: Any, prim: Any, ids: NDArray[np.int64]) -> None:
-        self._stage = stage  # it must outlive its prims
+        self._stage = stage  # the stage must outlive its prims
         self._prim, self.ids = prim, ids
         self.degree = int(prim.GetRadianceSphericalHarmonicsDegreeAttr().Get() or 0)
 

@@ -67,7 +67,7 @@ def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], see
             break
     else:
         raise InitialPointsError(
-            "images: no two cameras look at one place; check that the calibration belongs to the pictures, and that "
+            "images: no two cameras see the same place; check that the calibration belongs to the pictures, and that "
             "its poses are the way round that its format has them (world to camera; transforms.json: camera to world)"
         )
     seen = observe(views, points[shared], inside[:, shared])

@@ -105,7 +105,7 @@ def test_up_may_be_given_and_one_key_is_enough(tmp_path):
             r"keys\[0\].world_to_camera: .* is not a rotation",
         ),
         ({"keys": [placed(0, (0, 0, 1), field_of_view=190)]}, r"keys\[0\].field_of_view 190: .* less than or equal"),
-        ({"up": [0, 0, 0], "keys": [placed(0, (0, 0, 1))]}, "up is zero"),
+        ({"up": [0, 0, 0], "keys": [placed(0, (0, 0, 1))]}, "up is the zero vector"),
     ],
 )
 def test_faults_of_a_file_name_their_field(tmp_path, document, said):

@@ -202,7 +202,7 @@ def test_tracks_of_what_stands_are_refused(tmp_path):
     with CompactWriter(tmp_path / "states.s4d", FileHeader(WORLD, rig=make_rig())) as writer:
         still = state(0)
         writer.add(0, 0.0, still.replace(foreground=0 * still.foreground))
-    with pytest.raises(InputError, match="tracks: nothing moves in these frames; leave --tracks out"):
+    with pytest.raises(InputError, match="tracks: there is no motion in these frames; leave --tracks out"):
         made(tmp_path, tmp_path / "a.mp4", VideoOptions(path="camera", tracks=3))
     with pytest.raises(InputError, match="parts: states holds none; leave --parts out"):
         made(tmp_path, tmp_path / "a.mp4", VideoOptions(path="camera", parts=True))
@@ -222,7 +222,7 @@ def test_a_moment_from_all_around(source, tmp_path):
         ("a.gif", FRONT, {}, r"out .*a.gif' ends in '.gif'; give a name that ends in .mp4 or .webp"),
         ("a.mp4", VideoOptions(path="camera", size=(63, 48)), {}, "size 63x48 is odd, .*; give 62x48, or a .webp"),
         ("a.mp4", VideoOptions(path="camera", camera="up"), {}, "camera 'up' is not there; give one of front, side"),
-        ("a.mp4", VideoOptions(path="way.json"), {}, "path 'way.json' is no file; give orbit, camera, or a JSON file"),
+        ("a.mp4", VideoOptions(path="way.json"), {}, "path 'way.json' is not a file; give orbit, camera, or a JSON"),
         ("a.mp4", FRONT, {"frames": "7:9"}, "frames 7:9 are not in states; it has frames 0 to 4"),
         ("a.mp4", VideoOptions(fps=200, speed=1e-6), {}, "speed 1e-06 make 80000001 pictures; give --frames"),
         ("a.mp4", VideoOptions(), {"compared": True}, "compare is given for path 'orbit'; give --path camera"),

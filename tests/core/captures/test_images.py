@@ -193,7 +193,7 @@ def test_any_value_but_zero_is_foreground(value):
 
 
 def test_masks_with_two_readings_are_refused():
-    with pytest.raises(ImageError, match="alpha channel can be read two ways"):
+    with pytest.raises(ImageError, match="alpha channel is ambiguous"):
         decode_mask(encoded(Image.new("RGBA", (4, 4))))
     with pytest.raises(ImageError, match="cannot be read as a picture"):
         decode_mask(encoded(Image.new("L", (4, 4)), "JPEG"))

@@ -275,7 +275,7 @@ def test_cameras_that_see_nothing_in_common_are_refused(scene):
         )
     )
     images = {name: np.full((128, 128, 3), 9, np.uint8) for name in rig.names}
-    with pytest.raises(InitialPointsError, match="no two cameras look at one place"):
+    with pytest.raises(InitialPointsError, match="no two cameras see the same place"):
         initial_points(rig, images, {}, stereo=False)
 
 

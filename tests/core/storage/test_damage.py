@@ -181,7 +181,7 @@ def test_a_damaged_state_is_left_out_until_another_file_is_there(tmp_path):
     assert reader.refresh((2,)) == ([2], [])
     assert same(reader.gaussians(2), state(7).replace(opacities=state(0).opacities))
     assert reader.report(2) == {"recomputed": True}
-    with pytest.raises(HistoryError, match="frame 10 cannot take the place"):
+    with pytest.raises(HistoryError, match="frame 10 cannot replace"):
         writer.replace(10, 9.0, arrays, {})
 
 

@@ -72,7 +72,7 @@ class Cluster(LosableCluster):
     def _host(self, name: str, needs: ResourceNeeds) -> Any:
         class Actor:
             start = Method(lambda: Answer(StartResult("node", 4711)))
-            post = take = stop = Method(self._never)
+            post = receive = stop = Method(self._never)
 
         return Actor()
 

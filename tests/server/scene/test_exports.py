@@ -213,7 +213,7 @@ def test_limits_are_told(ran, service, monkeypatch, http):
     sdk, id = ran
     monkeypatch.setattr(rules, "MAX_PER_SCENE", 1)
     done = over(sdk, id, sdk.begin_export(id, "ply").id)
-    with pytest.raises(Conflict, match="1 export, as many as it may"):
+    with pytest.raises(Conflict, match="1 export, the maximum"):
         sdk.begin_export(id, "ply")
     monkeypatch.setattr(rules, "MAX_WAITING", 0)
     assert problem(http.post(f"/v1/scenes/{id}/exports", json={"format": "ply"}), 429)["remedy"]
@@ -283,5 +283,5 @@ def test_a_scene_that_sleeps_is_exported_asleep_and_leftovers_go_at_the_start(tm
 
 def test_failures_are_told_without_paths():
     full = OSError(28, "No space left on device", "/usr/share/a.npz")
-    assert exporter.explain(full).startswith("the disk has no room (No space left on device)")
+    assert exporter.explain(full).startswith("the disk is full (No space left on device)")
     assert exporter.explain(RuntimeError("in /usr/share/a.npz")) == "RuntimeError: in a.npz"

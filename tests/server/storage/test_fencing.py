@@ -236,7 +236,7 @@ def test_a_local_worker_that_is_at_work_still_is_waited_for(
     held = FolderLock(lock, wait=False)
     held.write("4711\n")
     monkeypatch.setattr(fencing, "LOCK_WAIT_S", 0.1)
-    with pytest.raises(FencingError, match=r"process 4711\) does not end"):
+    with pytest.raises(FencingError, match=r"process 4711\) is still running"):
         begin_epoch(states, lock)
     assert not states.is_symlink()
     monkeypatch.setattr(fencing, "LOCK_WAIT_S", 60)
@@ -269,7 +269,7 @@ def test_states_that_are_gone_are_not_begun_anew(states: Path, lock: Path) -> No
     os.remove(states)
     states.symlink_to("states.3")
     os.rmdir(states.parent / "states.3")
-    with pytest.raises(FencingError, match=r"states\.3 is gone, which is read; put it back"):
+    with pytest.raises(FencingError, match=r"states\.3 is missing; put it back"):
         begin_epoch(states, lock)
 
 
@@ -288,7 +288,7 @@ def test_two_services_cannot_both_have_an_epoch(states: Path, lock: Path, monkey
     for name in os.listdir(epoch_folder(states, 1)):
         if not name.startswith("."):
             os.remove(epoch_folder(states, 1) / name)
-    with pytest.raises(FencingError, match=r"another service began states\.1"):
+    with pytest.raises(FencingError, match=r"another service started states\.1"):
         begin_epoch(states, lock)
 
 
