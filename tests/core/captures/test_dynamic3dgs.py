@@ -189,7 +189,10 @@ ELSEWHERE[1][0][3] = 0.01
         ({"k": [[1, 2], [3]]}, "k must be numbers"),
         ({"k": [[[["a"] * 3] * 3] * 3] * 3}, "k must be numbers"),
         ({"k": [[[[9.0, 0, float("nan")], [0, 9.0, 3], [0, 0, 1]]] * 3] * 3}, "camera '0': intrinsics holds NaN"),
-        ({"w2c": [MOVED, MOVED, ELSEWHERE]}, "w2c of camera number 1 changes at frame 2; a rig's cameras must not move"),
+        (
+            {"w2c": [MOVED, MOVED, ELSEWHERE]},
+            "w2c of camera number 1 changes at frame 2; a rig's cameras must not move",
+        ),
         ({"cam_id": [[0, 1, 3], [0, 1, 3], [1, 0, 3]]}, "cam_id of frame 2 differs"),
         ({"cam_id": []}, "cam_id must be a list of frames"),
         ({"cam_id": [[0, 0, 3]] * 3}, "given twice: 0"),
