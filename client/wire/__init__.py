@@ -1,4 +1,4 @@
-"""Models of everything that crosses the wire, one file per resource; the service imports them."""
+"""Models of the requests and responses, one file per resource; the service imports them."""
 
 from client.wire.base import MAX_CAMERAS, MAX_PIXELS_A_SIDE, CameraName, Model, Pixel, Row3, Row4
 from client.wire.budgets import Budget, EffectiveBudget, SceneBudget

@@ -1,4 +1,4 @@
-"""Base class and field types of the models on the wire."""
+"""Base class and field types of the wire models."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ CameraName = Annotated[
 
 
 def check_labels(labels: dict[str, str]) -> dict[str, str]:
-    """Raises an InputError for a label that no node can have."""
+    """Raises an InputError for an invalid node label."""
     for name, value in labels.items():
         for what, text, pattern in (("name", name, f"(?:{LABEL_WORD}/)?{LABEL_WORD}"), ("value", value, LABEL_WORD)):
             if re.fullmatch(pattern, text) is None:
@@ -46,6 +46,6 @@ Pixel = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
 
 
 class Model(BaseModel):
-    """Base of the models on the wire. An unknown field is an error, so that a misspelt one is noticed."""
+    """Base of the wire models. Unknown fields are errors, so that misspelt ones are noticed."""
 
     model_config = ConfigDict(extra="forbid")

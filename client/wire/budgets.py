@@ -1,4 +1,4 @@
-"""Budgets of updates, on the wire."""
+"""Wire models of update budgets."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Iterations = Annotated[int, Field(strict=True, ge=1, le=MOST_ITERATIONS)]
 
 
 class Budget(Model):
-    """Limits of a scene's updates. A field that is null is as the scene was made."""
+    """Limits of a scene's updates. Null fields take the scene's settings."""
 
     iterations: Iterations | None = Field(
         default=None, description="Iterations per frame; see the setting `update.iterations`."
@@ -55,7 +55,7 @@ class Budget(Model):
 
 
 class BudgetFields(TypedDict, total=False):
-    """Fields of `Budget` as keyword arguments; one that is left out is as the scene was made."""
+    """Fields of `Budget` as keyword arguments. Omitted fields take the scene's settings."""
 
     iterations: int | None
     budget_ms: float | None
@@ -64,7 +64,7 @@ class BudgetFields(TypedDict, total=False):
 
 
 class EffectiveBudget(Model):
-    """The limits that apply, each field filled in."""
+    """The effective limits, with every field filled in."""
 
     iterations: int
     budget_ms: float | None = Field(description="Milliseconds per frame; null: no limit.")
@@ -73,7 +73,7 @@ class EffectiveBudget(Model):
 
 
 class SceneBudget(Model):
-    """The budget of a scene."""
+    """The requested and effective budget of a scene."""
 
     scene: str
     requested: Budget = Field(description="The budget as last set; a field is null if it was never set.")

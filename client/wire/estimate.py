@@ -1,4 +1,4 @@
-"""Memory and disk that a scene will take, before it is created."""
+"""Estimated memory and disk of a scene."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from client.wire.base import Model
 
 
 class SceneEstimate(Model):
-    """Memory and disk, in MB of a million bytes; `docs/operations.md` has the formula and what was measured."""
+    """Estimated memory and disk in MB (10⁶ bytes); `docs/operations.md` has the formula."""
 
     pixels: int = Field(description="Pixels of all cameras together, as sent.")
     scaled_pixels: int = Field(description="Pixels of all cameras after `settings.scene.image_scale`.")

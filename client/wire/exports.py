@@ -1,4 +1,4 @@
-"""Exports of a scene that the service makes, on the wire."""
+"""Wire models of exports."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class ExportState(StrEnum):
 
 
 class ExportRequest(Model):
-    """A request for an export: the committed frames of a range in the format of another tool (docs/exports.md)."""
+    """A request to export a range of committed frames (docs/exports.md)."""
 
     format: ExportFormat = Field(description="The format; docs/exports.md lists what each contains and loses.")
     first: FrameNumber | None = Field(default=None, description="First frame; null: the first committed frame.")
@@ -53,7 +53,7 @@ class ExportRequest(Model):
 
 
 class ExportModel(Model):
-    """An export. It is kept in memory and on disk until it is removed, `expires`, or the service ends."""
+    """An export. The service keeps it until it is removed, it expires, or the service stops."""
 
     id: str
     scene: str

@@ -1,4 +1,4 @@
-"""Frames on the wire: receipts and reports."""
+"""Wire models of frames: receipts and reports."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scas4d_core.frame_outcome import AlarmKind, FrameOutcome
 
 
 class FrameReceipt(Model):
-    """The frame is on disk and will be reconstructed in its turn. The same frame again gets the same receipt."""
+    """Confirms that a frame is on disk and queued. Repeating the same frame returns the same receipt."""
 
     scene: str
     index: int
@@ -22,7 +22,7 @@ class FrameReceipt(Model):
 
 
 class CameraReceipt(Model):
-    """One camera's files are on disk. The same again gets the same receipt, but for what came in since."""
+    """Confirms that one camera's files are on disk. Repeating them returns it with the current cameras."""
 
     scene: str
     index: int
@@ -33,7 +33,7 @@ class CameraReceipt(Model):
 
 
 class FrameState(StrEnum):
-    """State of a frame. The last four are final."""
+    """The state of a frame. The last four are final."""
 
     OPEN = "open"
     QUEUED = "queued"
@@ -49,13 +49,13 @@ FINISHED = frozenset({FrameState.COMMITTED, FrameState.FAILED, FrameState.MISSIN
 
 
 class MissingRequest(Model):
-    """Declares a frame missing, for ever."""
+    """A request to declare a frame missing, permanently."""
 
     reason: str = Field(default="", max_length=500, description="Reason, for people.")
 
 
 class CameraFitModel(Model):
-    """Fit of one camera's picture when it was last rendered: a bumped or changed camera shows."""
+    """How well one camera's picture fits the render. Moved or changed cameras stand out."""
 
     psnr: float | None = Field(description="PSNR in dB.")
     colour_shift: tuple[float, float, float] | None = Field(
@@ -70,7 +70,7 @@ class CameraFitModel(Model):
 
 
 class AlarmModel(Model):
-    """Something that a person should look at."""
+    """An alarm: something that needs a person's attention."""
 
     kind: AlarmKind = Field(
         description=(
@@ -86,7 +86,7 @@ class AlarmModel(Model):
 
 
 class CameraTimingModel(Model):
-    """Moment at which a camera's pictures seem to be taken, by the motion in all frames so far."""
+    """Time offset of a camera, estimated from the motion in all frames so far."""
 
     frames: float = Field(
         description=("Offset in frames: positive is later than the other cameras. The median over the cameras is 0.")
@@ -96,7 +96,7 @@ class CameraTimingModel(Model):
 
 
 class CurvePointModel(Model):
-    """One point of an update's progress."""
+    """One point of an update's loss curve."""
 
     iterations: int
     milliseconds: float = Field(description="Milliseconds since the update started, after decoding.")
@@ -117,7 +117,7 @@ class EffectModel(Model):
 
 
 class FirstCloudModel(Model):
-    """Origin of the points from which frame 0 was fitted, and how sure they are."""
+    """Origin and coverage of the initial points of frame 0."""
 
     method: str = Field(
         description=(
@@ -135,7 +135,7 @@ class FirstCloudModel(Model):
 
 
 class CameraResidualModel(Model):
-    """Distance of the features of one camera's picture from the calibration."""
+    """Disagreement between the features of one camera's picture and the calibration."""
 
     pixels: float | None = Field(
         description=(
@@ -147,7 +147,7 @@ class CameraResidualModel(Model):
 
 
 class RefinedCameraModel(Model):
-    """A camera after refinement, against the calibration as it was given."""
+    """A camera after refinement, compared with the given calibration."""
 
     rotation_deg: float = Field(description="Change of rotation, degrees.")
     translation: float = Field(description="Change of the camera's centre, in the calibration's unit.")
@@ -174,7 +174,7 @@ class RefinementModel(Model):
 
 
 class CalibrationModel(Model):
-    """The calibration against the pictures of frame 0."""
+    """The calibration compared with the pictures of frame 0."""
 
     cameras: dict[str, CameraResidualModel] = Field(description="Residuals by camera, before refinement.")
     miscalibrated: list[str] = Field(description="Cameras that clearly disagree with their calibration.")
@@ -304,7 +304,7 @@ class FrameReportModel(Model):
 
 
 class FrameList(Model):
-    """Frames in the order of their indices, without their losses and curves."""
+    """Reports of frames in index order, without losses and curves."""
 
     frames: list[FrameReportModel]
     next: int | None = Field(description="`first` of the next request; null if there are no more frames.")

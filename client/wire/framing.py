@@ -1,4 +1,4 @@
-"""A frame as bytes, the same over HTTP and WebSocket: `S4DF`, a uint32 LE length, a JSON head, then the files.
+"""The binary frame format: `S4DF`, a little-endian uint32 length, a JSON header, then the files.
 
 As the body of `PUT /v1/scenes/{id}/frames/{n}` its content type is `FRAME_MEDIA_TYPE`; over `WS …/ingest` it is one
 binary message. The head says which file is how long, and the files follow one after the other in that order, so
@@ -34,11 +34,11 @@ MAX_INDEX = 1_000_000_000
 
 
 class FramingError(InputError):
-    """Bytes that are no frame: the message names the fault and the remedy."""
+    """Invalid frame bytes. The message names the fault and the remedy."""
 
 
 class FileKind(StrEnum):
-    """Kind of a file: image or mask."""
+    """The kind of a file: image or mask."""
 
     IMAGE = "image"
     MASK = "mask"
@@ -53,7 +53,7 @@ class FrameFile(Model):
 
 
 class FrameHead(Model):
-    """FileHeader of a framed body: the frame's index, time and files."""
+    """The header of a framed body: the frame's index, time and files."""
 
     index: int = Field(ge=0, le=MAX_INDEX)
     time: FiniteFloat | None = Field(
@@ -67,7 +67,7 @@ class FrameHead(Model):
 
 
 class IngestAnswer(Model):
-    """Answers one binary message of `WS …/ingest`, as JSON text, in the order of the messages."""
+    """The answer to one binary message of `WS …/ingest`, sent as JSON text in message order."""
 
     index: int | None = Field(description="Index of the frame; null if the message could not be read.")
     status: int = Field(description="The same status as over HTTP: 202, 409, 422, 429, 507 …")
@@ -86,7 +86,7 @@ def frame_chunks(
     *,
     part: bool = False,
 ) -> list[bytes]:
-    """A frame's bytes in pieces, none of them a copy of a file: prefix with head, then the files.
+    """Yields the bytes of a frame without copying files: prefix with header, then each file.
 
     Args:
         index: of the frame.
@@ -103,7 +103,7 @@ def frame_chunks(
 
 
 def head_length(prefix: bytes | bytearray | memoryview) -> int:
-    """Bytes of the head, from the first `PREFIX.size` bytes.
+    """Returns the size of the header in bytes, read from the first `PREFIX.size` bytes.
 
     Raises:
         FramingError: they are not those of a frame.
@@ -121,7 +121,7 @@ def head_length(prefix: bytes | bytearray | memoryview) -> int:
 
 
 def parse_head(data: bytes | bytearray | memoryview) -> FrameHead:
-    """The head from its JSON.
+    """Parses the JSON header.
 
     Raises:
         FramingError: no JSON, or not of the fields that a head has.
@@ -135,7 +135,7 @@ def parse_head(data: bytes | bytearray | memoryview) -> FrameHead:
 
 
 def parse_frame(data: bytes | bytearray | memoryview) -> tuple[FrameHead, list[memoryview]]:
-    """The head, and the bytes of each of its files, not copied.
+    """Returns the header and views of the bytes of each file.
 
     Raises:
         FramingError: truncated, longer than the head says, or no frame.

@@ -1,4 +1,4 @@
-"""Part segmentation on the wire."""
+"""Wire models of the part segmentation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ GOLDEN = 0.618033988749895
 
 
 class PartsModel(Model):
-    """A part label for every Gaussian. Parts that go on when frames are committed keep their labels and colours."""
+    """A part label for every Gaussian. Parts keep their labels and colours across frames."""
 
     count: int = Field(description="Number of parts.")
     frame: int = Field(description="The newest frame used to find the parts.")
@@ -29,7 +29,7 @@ class PartsModel(Model):
 
 
 def part_colour(label: int) -> tuple[int, int, int]:
-    """RGB, 0…255, of a part."""
+    """Returns the RGB colour, 0…255, of a part."""
     red, green, blue = colorsys.hsv_to_rgb(
         (0.58 + label * GOLDEN) % 1, (0.65, 0.45, 0.85)[label % 3], (0.95, 0.8)[label % 2]
     )
@@ -37,7 +37,7 @@ def part_colour(label: int) -> tuple[int, int, int]:
 
 
 def parts_model(labels: NDArray[np.int64], ids: NDArray[np.int64], frame: int) -> PartsModel:
-    """Labels [N] of Gaussians [N] as they go over the wire."""
+    """Converts labels [N] of Gaussians [N] to the wire model."""
     return PartsModel(
         count=len(np.unique(labels[labels >= 0])),
         frame=frame,

@@ -1,4 +1,4 @@
-"""Cameras and rigs on the wire."""
+"""Wire models of cameras and rigs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scas4d_core.errors import InputError
 
 
 class CameraModel(Model):
-    """A pinhole camera without distortion; OpenCV axes; pixel centres at +0.5."""
+    """A pinhole camera without distortion, with OpenCV axes and pixel centres at +0.5."""
 
     name: CameraName
     intrinsics: Annotated[list[Row3], Field(min_length=3, max_length=3)] = Field(
@@ -33,14 +33,14 @@ class CameraModel(Model):
         return self
 
     def camera(self) -> Camera:
-        """The camera of the core."""
+        """Converts to the core's camera."""
         return Camera(
             self.name, np.array(self.intrinsics), np.array(self.world_to_camera), width=self.width, height=self.height
         )
 
     @classmethod
     def of(cls, camera: Camera) -> CameraModel:
-        """The camera as it goes over the wire."""
+        """Converts a camera to the wire model."""
         return cls(
             name=camera.name,
             intrinsics=camera.intrinsics.tolist(),
@@ -66,10 +66,10 @@ class RigModel(Model):
         return self
 
     def rig(self) -> Rig:
-        """The rig of the core."""
+        """Converts to the core's rig."""
         return Rig(tuple(camera.camera() for camera in self.cameras))
 
     @classmethod
     def of(cls, rig: Rig) -> RigModel:
-        """The rig as it goes over the wire."""
+        """Converts a rig to the wire model."""
         return cls(axes="opencv", cameras=[CameraModel.of(camera) for camera in rig.cameras])

@@ -1,4 +1,4 @@
-"""Scenes on the wire."""
+"""Wire models of scenes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from scas4d_core.errors import InputError
 
 
 class Retention(Model):
-    """Retention of data that comes frame by frame: all of it, the last N frames, or the newest bytes."""
+    """A retention rule for per-frame data: keep all, the last N frames, or the newest bytes."""
 
     last: int | None = Field(
         default=None, ge=0, description="Number of newest frames to keep. Not together with `bytes`."
@@ -32,7 +32,7 @@ class Retention(Model):
 
 
 class StateBounds(Model):
-    """The largest error that a state may have once it is in a compact file (docs/format.md)."""
+    """Error bounds of states in compact files (docs/format.md)."""
 
     position: float = Field(
         default=0.04, ge=1e-6, le=1, description="Error of the centre, relative to the Gaussian's size."
@@ -47,7 +47,7 @@ class StateBounds(Model):
 
 
 class IngestSettings(Model):
-    """Rules of a scene for frames that are sent, and for what it keeps of them."""
+    """Rules for the frames of a scene: queue, incomplete frames, and retention."""
 
     queue_frames: int | None = Field(
         default=None,
@@ -95,7 +95,7 @@ class IngestSettings(Model):
 
 
 class SceneCreate(Model):
-    """A new scene: the rig, and how to reconstruct what it sees."""
+    """A request to create a scene: the rig and the settings."""
 
     rig: RigModel
     name: str = Field(default="", max_length=200, description="Name for people; the service generates the id.")
@@ -119,7 +119,7 @@ class SceneCreate(Model):
 
 
 class SceneEdit(Model):
-    """Changes of a scene; what is left out or null stays as it is."""
+    """Changes to a scene. Omitted and null fields stay unchanged."""
 
     name: str | None = Field(default=None, max_length=200, description="New name.")
     archived: bool | None = Field(
@@ -146,7 +146,7 @@ class SceneEdit(Model):
 
 
 class ReconstructionRequest(Model):
-    """Another beginning of a scene's reconstruction, from its first frame on, in place of the one before."""
+    """A request to restart a scene's reconstruction from its first frame."""
 
     settings: dict[str, Any] = Field(
         default_factory=dict, description="Changes of the scene's settings, nested as on creation."
@@ -173,7 +173,7 @@ class ReconstructionRequest(Model):
 
 
 class SceneState(StrEnum):
-    """State of a scene."""
+    """The state of a scene."""
 
     AWAITING = "awaiting_first_frame"
     INITIALISING = "initialising"
@@ -185,7 +185,7 @@ class SceneState(StrEnum):
 
 
 class ProgressModel(Model):
-    """Progress of the first frame."""
+    """Progress of frame 0."""
 
     stage: str
     done: int
@@ -200,14 +200,14 @@ class ProgressModel(Model):
 
 
 class EffectStatus(EffectModel):
-    """The switch of one effect in a scene's status, with the words that describe the effect."""
+    """The switch of one effect in a scene's status, with a description."""
 
     group: str = Field(description="motion, coherence, appearance, cameras or presence.")
     description: str = Field(description="A sentence that describes the effect.")
 
 
 class SceneStatus(Model):
-    """A scene as it is now."""
+    """The current status of a scene."""
 
     id: str
     name: str
@@ -287,7 +287,7 @@ class SceneList(Model):
 
 
 class PointsReceipt(Model):
-    """The initial points were taken."""
+    """Confirms that the initial points were accepted."""
 
     points: int
     sha256: str

@@ -1,4 +1,4 @@
-"""The service itself on the wire: health, errors."""
+"""Wire models of the service: health, errors, tickets, shares, cluster."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from client.wire.base import Model
 
 
 class Health(Model):
-    """The service answers."""
+    """Health of the service."""
 
     status: Literal["live", "ready"]
     version: str
@@ -24,7 +24,7 @@ class Health(Model):
 
 
 class Ticket(Model):
-    """Opens one WebSocket from a browser, which cannot send a bearer token with it."""
+    """A ticket that opens one WebSocket from a browser, which cannot send a bearer token."""
 
     ticket: str
     subprotocol: str = Field(description="Offer it in Sec-WebSocket-Protocol, in addition to the stream's protocol.")
@@ -32,7 +32,7 @@ class Ticket(Model):
 
 
 class ProblemDetails(BaseModel):
-    """RFC 9457. `field`, `value` and `remedy` are ours: what was wrong, with which value, and what to do."""
+    """A problem document (RFC 9457), extended by `field`, `value` and `remedy`."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -46,7 +46,7 @@ class ProblemDetails(BaseModel):
 
 
 class ShareRequest(Model):
-    """A token that may only read."""
+    """A request for a read-only token."""
 
     scene: str | None = Field(
         default=None, max_length=64, description="The only scene that the token can read; null: all scenes."
@@ -57,7 +57,7 @@ class ShareRequest(Model):
 
 
 class Share(Model):
-    """A token that may only read, and the page's address that has it."""
+    """A read-only token, and the viewer's address with it."""
 
     token: str = Field(description="For `Authorization: Bearer`.")
     scene: str | None
@@ -68,7 +68,7 @@ class Share(Model):
 
 
 class Node(Model):
-    """A machine on which processes of scenes run."""
+    """A machine that runs processes of scenes."""
 
     id: str
     host: str
@@ -87,7 +87,7 @@ class Node(Model):
 
 
 class WaitingProcess(Model):
-    """A process that no node has room for."""
+    """A process that waits for a node with enough resources."""
 
     scene: str
     role: str
@@ -98,7 +98,7 @@ class WaitingProcess(Model):
 
 
 class Cluster(Model):
-    """Machines of the service, and what waits for room on them."""
+    """The machines of the service and the processes that wait for them."""
 
     placement: Literal["local", "ray"]
     nodes: list[Node]

@@ -1,4 +1,4 @@
-"""Subscriptions on the wire, protocol `scas4d.stream.v1`; docs/stream.md says the same in words.
+"""Wire models of subscriptions, protocol `scas4d.stream.v1` (docs/stream.md).
 
 A client sends text messages, `ClientMessage`. The service sends text messages, and binary ones for bulk: the magic
 `S4DS`, the length of a JSON head as uint32 little-endian, the head, and the bytes that it describes.
@@ -42,7 +42,7 @@ Tag = Annotated[
 
 
 class Topic(StrEnum):
-    """Topic of a subscription."""
+    """The topic of a subscription."""
 
     SCENE = "scene"
     FRAMES = "frames"
@@ -52,11 +52,11 @@ class Topic(StrEnum):
 
 
 class NoRequest(Model):
-    """Of topics without anything to choose."""
+    """The request of topics without options."""
 
 
 class PartsSubscription(Model):
-    """Labels again and again."""
+    """A subscription to part labels."""
 
     count: int | None = Field(
         default=None, ge=1, le=254, description="Number of parts; by default chosen automatically."
@@ -83,7 +83,7 @@ REQUESTS: dict[Topic, type[Model]] = {
 
 
 class Subscribe(Model):
-    """Begins a subscription; under an id in use it takes the place of the one before."""
+    """Starts a subscription, replacing one with the same id."""
 
     type: Literal["subscribe"] = "subscribe"
     id: SubscriptionId
@@ -93,7 +93,7 @@ class Subscribe(Model):
 
 
 class Update(Model):
-    """Changes what a subscription asks for: the members given replace those before. A moved camera is one of these."""
+    """Changes members of a subscription's request, for example when the camera moves."""
 
     type: Literal["update"] = "update"
     id: SubscriptionId
@@ -116,7 +116,7 @@ CLIENT_MESSAGE: TypeAdapter[Subscribe | Update | Unsubscribe] = TypeAdapter(Clie
 
 
 class StreamLimits(Model):
-    """Limits of the service for one client."""
+    """The service's limits for one client."""
 
     subscriptions: int = Field(description="Maximum number of subscriptions.")
     message_bytes: int = Field(description="Maximum size of a client's message.")
@@ -134,21 +134,21 @@ class Hello(Model):
 
 
 class Subscribed(Model):
-    """A `subscribe` was taken."""
+    """Confirms a `subscribe`."""
 
     type: Literal["subscribed"] = "subscribed"
     id: SubscriptionId
 
 
 class Unsubscribed(Model):
-    """Nothing more comes under this id."""
+    """Confirms an `unsubscribe`: no more messages with this id follow."""
 
     type: Literal["unsubscribed"] = "unsubscribed"
     id: SubscriptionId
 
 
 class StreamProblem(Model):
-    """A refusal. With an id: the subscription stays and waits for its next `update` or frame."""
+    """A refusal. With an id, the subscription remains and waits for its next `update` or frame."""
 
     type: Literal["error"] = "error"
     id: SubscriptionId | None = None
@@ -157,7 +157,7 @@ class StreamProblem(Model):
 
 
 class SceneMessage(Model):
-    """The scene as it is now."""
+    """The current status of the scene."""
 
     type: Literal["scene"] = "scene"
     id: SubscriptionId
@@ -166,7 +166,7 @@ class SceneMessage(Model):
 
 
 class FrameMessage(Model):
-    """Report of a frame: committed with its metrics, or the reason why not."""
+    """The report of a finished frame: its metrics, or the reason why it was not committed."""
 
     type: Literal["frame"] = "frame"
     id: SubscriptionId
@@ -175,7 +175,7 @@ class FrameMessage(Model):
 
 
 class SceneGone(Model):
-    """The scene was deleted; the service closes with 4404 next."""
+    """The scene was deleted; the service then closes the WebSocket with 4404."""
 
     type: Literal["gone"] = "gone"
     reason: str
@@ -194,7 +194,7 @@ SERVER_MESSAGE: TypeAdapter[
 
 
 class BinaryHead(Model):
-    """FileHeader of a binary message: describes the bytes after it."""
+    """The header of a binary message, which describes the bytes after it."""
 
     type: Literal["render", "tracks", "parts"]
     id: SubscriptionId
@@ -211,13 +211,13 @@ class BinaryHead(Model):
 
 
 def pack(head: Model, body: bytes) -> bytes:
-    """A binary message."""
+    """Builds a binary message from its header and body."""
     text = head.model_dump_json(exclude_none=True).encode()
     return b"".join((_PREFIX.pack(MAGIC, len(text)), text, body))
 
 
 def unpack(message: bytes) -> tuple[BinaryHead, bytes]:
-    """FileHeader and body of a binary message.
+    """Splits a binary message into its header and body.
 
     Raises:
         ValueError: not one of ours.

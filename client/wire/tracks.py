@@ -1,4 +1,4 @@
-"""Trajectories on the wire."""
+"""Wire models of trajectories."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from client.wire.rigs import CameraModel
 
 
 class TracksRequest(Model):
-    """Trajectories of what exactly one of ids, pixels and points names."""
+    """A request for trajectories of ids, pixels or points: exactly one of them."""
 
     ids: Annotated[list[int], Field(min_length=1)] | None = Field(default=None, description="Ids of Gaussians.")
     pixels: Annotated[list[Pixel], Field(min_length=1)] | None = Field(
@@ -63,7 +63,7 @@ class TracksModel(Model):
 
 
 class GaussianModel(Model):
-    """The life of one Gaussian. It is there from its birth and from each revival on, until it is retired."""
+    """The lifetime of one Gaussian: present from birth and from each revival until retired."""
 
     id: int
     born: int = Field(description="Frame of birth; the first frame for the initial Gaussians.")
@@ -72,7 +72,7 @@ class GaussianModel(Model):
 
 
 class GaussiansModel(Model):
-    """The lives of Gaussians, in the order asked for."""
+    """Lifetimes of Gaussians in the requested order."""
 
     frame: int = Field(description="The newest committed frame.")
     gaussians: list[GaussianModel]
@@ -87,7 +87,7 @@ def tracks_model(
     pixels: dict[str, NDArray[Any]],
     visible: dict[str, NDArray[np.bool_]],
 ) -> TracksModel:
-    """Arrays [T, Q, …] to the lists [Q][T] of the wire; NaN becomes null."""
+    """Converts arrays [T, Q, …] to the wire model's lists [Q][T]; NaN becomes null."""
 
     def lists(array: NDArray[Any]) -> list[list[list[float] | None]]:
         finite = np.isfinite(array).all(axis=-1)

@@ -1,4 +1,4 @@
-"""Accuracy against time of a scene on its machine, on the wire."""
+"""Wire models of accuracy against time."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MOST_BUDGETS = 8
 
 
 class PointKind(StrEnum):
-    """Origin of a point: measured, extrapolated or replayed."""
+    """The origin of a point: measured, replayed or extrapolated."""
 
     MEASURED = "measured"
     REPLAYED = "replayed"
@@ -23,7 +23,7 @@ class PointKind(StrEnum):
 
 
 class TradeoffPoint(Model):
-    """Milliseconds, error and PSNR of a frame with so many iterations."""
+    """Milliseconds, error and PSNR per frame for a number of iterations."""
 
     kind: PointKind = Field(
         description=(
@@ -48,7 +48,7 @@ class TradeoffPoint(Model):
 
 
 class CurveMean(Model):
-    """Mean progress of updates after so many of their iterations."""
+    """Mean progress of updates after a number of their iterations."""
 
     planned: int = Field(description="Total iterations of the update.")
     iterations: int
@@ -66,7 +66,7 @@ class TimeModel(Model):
 
 
 class ReplayState(StrEnum):
-    """State of the replay that was asked for last."""
+    """The state of the latest replay."""
 
     NONE = "none"
     RUNNING = "running"
@@ -75,7 +75,7 @@ class ReplayState(StrEnum):
 
 
 class ReplayStatus(Model):
-    """The replay that was asked for last; it and its points are kept in memory, until the service ends."""
+    """The latest replay. It is kept in memory until the service stops."""
 
     state: ReplayState = ReplayState.NONE
     iterations: list[int] = Field(
@@ -90,7 +90,7 @@ class ReplayStatus(Model):
 
 
 class TradeoffModel(Model):
-    """Accuracy against time, for this scene on this machine."""
+    """Accuracy against time for this scene on this machine."""
 
     scene: str
     points: list[TradeoffPoint] = Field(description="Points by kind, then by iterations.")
@@ -101,7 +101,7 @@ class TradeoffModel(Model):
 
 
 class ReplayRequest(Model):
-    """A request to measure budgets."""
+    """A request to measure other numbers of iterations."""
 
     iterations: Annotated[list[Iterations], Field(min_length=1, max_length=MOST_BUDGETS)] = Field(
         default=[25, 50, 200],

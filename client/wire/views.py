@@ -1,4 +1,4 @@
-"""Novel views on the wire."""
+"""Wire models of novel views."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from client.wire.rigs import CameraModel
 
 
 class RenderKind(StrEnum):
-    """Kind of a render."""
+    """The kind of a render."""
 
     COLOUR = "colour"
     DEPTH = "depth"
@@ -21,7 +21,7 @@ class RenderKind(StrEnum):
 
 
 class RenderFormat(StrEnum):
-    """Encoding of a render."""
+    """The encoding of a render."""
 
     PNG = "png"
     JPEG = "jpeg"
@@ -34,7 +34,7 @@ Unit = Annotated[float, Field(ge=0, le=1)]
 
 
 class RenderRequest(Model):
-    """A novel view."""
+    """A request for a novel view."""
 
     camera: CameraModel | str = Field(description="Any camera in the rig's world, or the name of a camera of the rig.")
     frame: int | None = Field(default=None, ge=0, description="Index of a committed frame; by default the last one.")

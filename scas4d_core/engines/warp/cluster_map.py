@@ -29,7 +29,7 @@ LARGEST = wp.constant(wp.float32(EXPONENT / log2(e)))
 """Bound of an exponential's argument."""
 SMALLEST_COSINE = wp.constant(wp.float32(HALF_TURN))
 COLUMNS = 10
-"""ClusterParameters of a cluster: r, t, c (three each) and s."""
+"""Parameters of a cluster: r, t, c (three each) and s."""
 
 
 @wp.struct
