@@ -2,19 +2,19 @@
 
 The loop (``update.frame_update``) decides; an engine computes. The calls of one attempt at a frame, in order::
 
-    engine.bind(plan, structure)            # once for a hierarchy: allocate, compile, capture graphs
-    engine.load_views(views, probes)        # pictures of the frame
+    engine.bind(plan, structure)            # once per hierarchy: allocate, compile, capture graphs
+    engine.load_views(views, probes)        # images of the frame
     engine.load_state(previous)             # Θ_{t−1}, no motion
-    engine.set_tables(tables)               # the start: no motion, or that of the frame before
+    engine.set_tables(tables)               # initial motion: none, or that of the previous frame
     engine.probe(...)                       # image losses of the candidates on a few views
-    engine.begin(start)                     # fresh moments
-    engine.iterate(views, step)             # deform, render, compare, backward, Adam: once an iteration
-    engine.log(), engine.leave_out(views)   # at the gate, once each camera was rendered
-    engine.probe(...)                       # where a stopping rule looks, and at the end
+    engine.begin(start)                     # zero moments
+    engine.iterate(views, step)             # deform, render, compare, backward, Adam: once per iteration
+    engine.log(), engine.leave_out(views)   # once every camera was rendered: exclude outlying cameras
+    engine.probe(...)                       # for the stopping rule, and at the end
     engine.state(learnt=True)               # Θ_t
 
 Only ``probe``, ``log``, ``tables``, ``state``, ``exposures`` and ``gains`` make the host wait for the device: about ten
-calls a frame, none in an iteration.
+calls per frame, and none during an iteration.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ from scas4d_core.structure.hierarchy import Hierarchy
 Array = NDArray[np.float32]
 
 REPORT = "report"
-"""Stage of the time that an update spends on its own report: timers, colour shifts, writing and publishing it."""
+"""Name of the stage in which an update prepares its own report: timers, colour shifts, writing and publishing."""
 KEPT_PICTURES = 8
-"""Views of the last iterations whose renderings the log keeps: evidence for effects is taken from them."""
+"""Number of recent views whose renderings the log keeps, as evidence for effects."""
 KEPT_ROWS = 128
-"""Rows of a kept rendering, about: of larger pictures every so many rows and columns are kept."""
+"""Approximate number of rows of a kept rendering; larger ones are subsampled."""
 
 
 class EngineError(ValueError):
-    """An engine cannot do what a plan asks for.
+    """The engine does not support what a plan requires.
 
-    ``UpdateEngine.bind`` and ``FitEngine.load_table`` raise it; nothing later does.
+    Only ``UpdateEngine.bind`` and ``FitEngine.load_table`` raise it.
 
     Args:
-        engine: name of the engine. asked: what it cannot do, one item a field of the plan.
+        engine: name of the engine. asked: the unsupported fields of the plan.
 
     >>> print(EngineError("torch", ["gloss"]))
     engine torch cannot compute: gloss; switch the effect off, or choose another device
@@ -77,28 +77,28 @@ class Tables:
 
     @classmethod
     def identity(cls, hierarchy: Hierarchy) -> Tables:
-        """No motion."""
+        """Returns tables without motion."""
         clusters = [np.zeros((count, 10), np.float32) for count in hierarchy.sizes]
         return cls(clusters, np.zeros((len(hierarchy.rows), 9), np.float32))
 
     def copy(self) -> Tables:
-        """The same parameters in arrays of their own."""
+        """Returns a copy with its own arrays."""
         return Tables([values.copy() for values in self.clusters], self.deltas.copy())
 
 
 @dataclass(frozen=True, eq=False)
 class AttemptStart:
-    """What stays the same through the iterations of one attempt. A parameter whose rate is 0 is not stepped.
+    """Constants of the iterations of one attempt. A parameter with rate 0 is not updated.
 
     Attributes:
         layers: Adam's rates (r, t in metres, c and s) of each layer, coarse to fine.
         position, rotation, scale: rates of Δp (metres), ΔR, Δs.
         colour, static_colour: rates of RGB of moving and of static Gaussians.
         beta1, beta2: Adam's decays.
-        samples: of entries of the hierarchy's order, [S] int64 each; ``StepScalars.sample`` picks one.
-        gains: [cameras, 3] the gains that the cameras start with, in the plan's order; None: not followed.
-        curve: whether terms that only the reported loss needs are computed; the state is the same without.
-        lap: called with the name of a stage when it is done, on engines that wait for each stage.
+        samples: samples of entries in the hierarchy's order, [S] int64 each; ``StepScalars.sample`` selects one.
+        gains: [cameras, 3] initial gains of the cameras, in the plan's order; None: gains are not estimated.
+        curve: whether to compute terms that only the reported loss needs; they do not change the state.
+        lap: called with the name of each finished stage, by engines that wait for each stage.
     """
 
     layers: tuple[tuple[float, float, float], ...]
@@ -117,12 +117,12 @@ class AttemptStart:
 
 @dataclass(frozen=True)
 class StepScalars:
-    """What changes from iteration to iteration: a few numbers.
+    """The scalars that change between iterations.
 
     Attributes:
-        frozen: number of layers, from the coarsest, that do not learn any more.
-        layers: factor on the rates of each layer in this iteration; 0: it is not stepped.
-        own: factor on the rates of Δp, ΔR, Δs. colour: factor on those of the colours. gloss: on those of the gloss.
+        frozen: number of frozen layers, starting with the coarsest.
+        layers: factor on the rates of each layer; 0: the layer is not updated.
+        own: factor on the rates of Δp, ΔR, Δs. colour: on those of the colours. gloss: on those of the gloss.
         smooth_gloss: whether the changes of the gloss are averaged over neighbours after this step.
         rigidity: weight of rigidity in this iteration.
         sample: index of the attempt's sample whose neighbours are compared.
@@ -141,10 +141,11 @@ class StepScalars:
 
 
 class Thinned(NamedTuple):
-    """A rendering of which every so many rows and columns are kept.
+    """A subsampled rendering.
 
     Attributes:
-        every: so many. planes: [5, h, w] float32, RGB before the camera's exposure, label, transmittance left.
+        every: step between the kept rows and columns.
+        planes: [5, h, w] float32: RGB before the camera's exposure, label, remaining transmittance.
     """
 
     every: int
@@ -152,13 +153,13 @@ class Thinned(NamedTuple):
 
     @classmethod
     def of(cls, features: Array, transmittance: Array) -> Thinned:
-        """Of a rendering: features [4, H, W] and transmittance left [H, W]."""
+        """Subsamples a rendering: features [4, H, W] and remaining transmittance [H, W]."""
         every = max(1, min(transmittance.shape) // KEPT_ROWS)
         return cls(every, np.concatenate([features[:, ::every, ::every], transmittance[None, ::every, ::every]]))
 
 
 class ViewRecord(NamedTuple):
-    """One rendering of a training view, as the log has it.
+    """The log entry of one rendering of a training view.
 
     Attributes:
         view: index of the view. psnr: dB. colour_shift: [3] mean of the picture minus mean of the rendering, RGB in
@@ -175,9 +176,9 @@ class IterationLog:
     """The log of the iterations since ``begin``.
 
     Attributes:
-        losses: weighted sum of the terms of each iteration. rendered: each rendering, in order.
-        pictures: the last renderings that were kept, by index of the view, oldest first.
-        guards: the guards that acted, and how often (``guards.GUARDS``).
+        losses: weighted sum of the terms of each iteration. rendered: all renderings, in order.
+        pictures: the kept renderings by index of the view, oldest first.
+        guards: number of times that each guard acted (``guards.GUARDS``).
     """
 
     losses: list[float] = field(default_factory=list)
@@ -186,7 +187,7 @@ class IterationLog:
     guards: dict[str, int] = field(default_factory=dict)
 
     def keep(self, view: int, picture: Thinned) -> None:
-        """Keep a rendering, and of earlier ones the newest ``KEPT_PICTURES``."""
+        """Adds a rendering and drops all but the newest ``KEPT_PICTURES``."""
         self.pictures.pop(view, None)
         self.pictures[view] = picture
         for old in list(self.pictures)[:-KEPT_PICTURES]:
@@ -194,85 +195,85 @@ class IterationLog:
 
 
 class UpdateEngine(Protocol):
-    """Computes the updates of one scene on one device, and owns the memory that they take.
+    """Computes the updates of one scene on one device, and owns their memory.
 
     Attributes:
-        name: of the engine, as messages name it.
+        name: name of the engine, for messages.
     """
 
     name: str
 
     @property
     def renderer(self) -> Renderer:
-        """Draws states with the background and limits of the plan."""
+        """The renderer of states, with the background and limits of the plan."""
 
     def bind(self, plan: UpdatePlan, structure: Structure) -> None:
-        """Prepare for the updates of a plan: allocate, compile.
+        """Prepares for the updates of a plan: allocates and compiles.
 
         Raises:
-            EngineError: the engine cannot do what the plan asks for.
+            EngineError: the engine does not support what the plan requires.
         """
 
     def load_views(self, views: Sequence[TrainingView], probes: Sequence[TrainingView]) -> None:
-        """Take the pictures of a frame; views that it already has are not taken again.
+        """Loads the images of a frame; views that are already loaded are reused.
 
         Args:
-            views: training views; ``iterate`` names them by index.
-            probes: views on which states are compared, of cameras of ``views``; ``probe`` names them by index.
+            views: training views; ``iterate`` refers to them by index.
+            probes: views for comparing states, of the same cameras; ``probe`` refers to them by index.
         """
 
     def load_state(self, previous: Gaussians) -> None:
-        """Take Θ_{t−1}, from which an attempt starts; no motion, nothing learnt."""
+        """Loads Θ_{t−1}, without motion or learnt colours."""
 
     def set_tables(self, tables: Tables) -> None:
-        """Set the parameters of the deformation."""
+        """Sets the parameters of the deformation."""
 
     def begin(self, start: AttemptStart) -> None:
-        """Begin the iterations of an attempt, with moments of zero and an empty log."""
+        """Starts the iterations of an attempt, with zero moments and an empty log."""
 
     def iterate(self, views: Sequence[int], step: StepScalars) -> None:
-        """One iteration: deform, render, compare, carry back, step.
+        """Runs one iteration: deform, render, compare, backward, step.
 
         Args:
-            views: of the iteration, by index; the image and mask losses are the mean over them.
+            views: indices of the views; the image and mask losses are their mean.
         """
 
     def leave_out(self, views: Sequence[int]) -> None:
-        """Views, by index, that have no turn any more in this attempt: their cameras' gains stay."""
+        """Excludes views, by index, from the rest of the attempt; their cameras' gains stay unchanged."""
 
     def wait(self, iteration: int) -> None:
-        """Wait until the device is near an iteration, so that the host's clock measures its work."""
+        """Waits until the device is close to an iteration, so that the host's clock measures its work."""
 
     def probe(self, which: Sequence[int], *, moved: bool, learnt: bool) -> list[float]:
-        """The image loss of a state in some of the probe views.
+        """Returns the image losses of a state on some of the probe views.
 
         Args:
-            which: indices of the views. moved: Θ_{t−1} deformed by the tables, else as it is.
-            learnt: with the colours, gloss and environment learnt so far, else those of Θ_{t−1}.
+            which: indices of the views. moved: whether Θ_{t−1} is deformed by the tables.
+            learnt: whether to use the learnt colours, gloss and environment instead of those of Θ_{t−1}.
         """
 
     def tables(self) -> Tables:
-        """The parameters of the deformation as they are now."""
+        """Returns the current parameters of the deformation."""
 
     def log(self) -> IterationLog:
-        """The log of the iterations so far."""
+        """Returns the log of the iterations so far."""
 
     def state(self, learnt: bool) -> Gaussians:
-        """Θ_{t−1} deformed by the tables, with material rotations (house rule: turns accumulate).
+        """Returns Θ_{t−1} deformed by the tables, with accumulated material rotations.
 
         Args:
-            learnt: with the colours, gloss and environment learnt so far, else those of Θ_{t−1}.
+            learnt: whether to use the learnt colours, gloss and environment instead of those of Θ_{t−1}.
         """
 
     def gradients(self) -> dict[str, Array]:
-        """Gradients of the last iteration's loss, before its step: for tests, before anything else is rendered.
+        """Returns the gradients of the last iteration's loss, for tests, before anything else is rendered.
 
-        By table: "cluster 0" and so on [K, 10] and "deltas" [M, 9] in the columns of ``Tables``; where they are learnt,
+        Keys are "cluster 0" … [K, 10] and "deltas" [M, 9], with the columns of ``Tables``; if they are learnt, also
         "colours" [N, 3], "gloss" [M, 3] and "environment".
         """
 
     def exposures(self) -> Mapping[str, Array]:
-        """[C, 2] gain and offset of each camera that has views, by name, as they are now."""
+        """Returns the current [C, 2] gain and offset of each camera with views, by name."""
 
     def gains(self) -> Array:
-        """[cameras, 3] the gains of the cameras, with what the renderings since the last round say."""
+        """Returns the [cameras, 3] gains, updated with the renderings since the last round."""
