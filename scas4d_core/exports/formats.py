@@ -10,8 +10,8 @@ from types import MappingProxyType
 from scas4d_core.errors import InputError
 from scas4d_core.exports.usd import SUFFIXES as USD_SUFFIXES
 
-USER_AXES = "the user's: x right, y down, z forward"
-Y_UP = "x right, y up, z towards the viewer"
+USER_AXES = "user's, y down"
+Y_UP = "y up"
 WITH_PARTS = ("usd", "s4d")
 """Formats that include parts if there are any."""
 
@@ -164,7 +164,7 @@ _FORMATS = (
         name="s4d",
         suffixes=(".s4d",),
         numbered=False,
-        axes="x right, y down, z forward, from the `origin` in the header",
+        axes="y down, from the `origin` in the header",
         unit="metre; the header has `metres_per_unit`",
         colour="sRGB; gloss as it is",
         scale="by the factor, within bounds in the header ([format.md](format.md))",

@@ -50,7 +50,6 @@ COLUMNS = (
     ("3D %", "track_3d_median", ".2f"),
     ("2D %", "mte_2d", ".2f"),
     ("parts ARI", "parts_ari", ".3f"),
-    ("flicker", "flicker", ".2f"),
 )
 """Heading, name in ``Point.scores``, form."""
 
@@ -104,17 +103,15 @@ def chosen(means: Sequence[Point]) -> dict[str, Point]:
 
 def score_table(points: Sequence[Point], default: Point | None = None, counts: bool = False) -> str:
     """A Markdown table, a line a setting, its time against ``default``'s; ``counts`` adds a column of Gaussians."""
-    head = ["setting", *(["Gaussians"] if counts else []), "s/frame", "× default", "CPU s", *(h for h, _, _ in COLUMNS)]
+    head = ["setting", *(["Gaussians"] if counts else []), "s/frame", "× default", *(h for h, _, _ in COLUMNS)]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for point in points:
         ratio = "–" if default is None else f"{point.seconds / default.seconds:.2f}"
-        cpu = "–" if point.cpu_seconds is None else f"{point.cpu_seconds:.2f}"
         cells = [
             point.variant.label,
             *([f"{point.gaussians:,.0f}"] if counts else []),
             f"{point.seconds:.2f}",
             ratio,
-            cpu,
         ]
         for _, name, form in COLUMNS:
             value = point.scores[name]

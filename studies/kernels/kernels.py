@@ -212,8 +212,7 @@ def table(row: Row) -> str:
             assert threshold is not None
             reached = of["median"] < threshold or (sense == "≤" and of["median"] == threshold)
             must, word = f"{sense} {threshold:g} {unit}", "reached" if reached else "**missed**"
-        smallest = f"{of['min']:.{digits}f}" if "min" in of else ""
-        return f"| {what} | {of['median']:.{digits}f} | {smallest} | {unit} | {must} | {word} |"
+        return f"| {what} | {of['median']:.{digits}f} | {unit} | {must} | {word} |"
 
     lines = []
     for name, on, metric in (
@@ -236,7 +235,7 @@ def table(row: Row) -> str:
         line("update over passes", row["ratio_update_spread"], "×", "ratio_update"),
         line("peak memory of the run", {"median": row["peak_mb"]}, "MB", "peak_mb", 0),
     ]
-    return "\n".join(["| | median | smallest | unit | target | |", "|---|---|---|---|---|---|", *lines])
+    return "\n".join(["| | median | unit | target | |", "|---|---|---|---|---|", *lines])
 
 
 BEGIN, END = "<!-- scripts/bench kernels: begin -->", "<!-- scripts/bench kernels: end -->"

@@ -243,7 +243,7 @@ def test_the_page_has_its_plots_and_tables(tmp_path):
         table = text.split(f"**{words}**\n\n")[1].split("\n\n")[0]
         assert f"| {label} |" in table
         assert "| scas4d 100 |" in table
-    assert f"| scas4d 100 | 1.00 | 1.00 | 1.00 | {made_psnr(DEFAULT):.2f} |" in text
+    assert f"| scas4d 100 | 1.00 | 1.00 | {made_psnr(DEFAULT):.2f} |" in text
     assert "`scas4d` robot 0.20, cloth 0.20 (3 seeds)" in text
     refused = CliRunner().invoke(app, [*command, "--only", "plots"])
     assert refused.exit_code == 2
