@@ -24,7 +24,7 @@ FRAMES = Counter(
 INGEST_BYTES = Counter("scas4d_ingest_bytes", "Encoded pictures and masks of acknowledged frames.", registry=registry)
 DEGRADED = Counter(
     "scas4d_degraded_frames",
-    "Committed frames whose state is not theirs: held (the state before stands) or in part.",
+    "Committed frames that were rejected (the previous state stays) or fitted in part.",
     ["how"],
     registry=registry,
 )

@@ -75,13 +75,13 @@ def quote(value: object) -> str:
     return text if len(text) <= VALUE_LENGTH else text[: VALUE_LENGTH - 1] + "…"
 
 
-def problem_response(openapi_document: ProblemDetails, headers: Mapping[str, str] | None = None) -> Response:
+def problem_response(document: ProblemDetails, headers: Mapping[str, str] | None = None) -> Response:
     """Returns an HTTP response with the problem document.
 
     The body is escaped to ASCII so that lone surrogates can be quoted, too.
     """
-    body = json.dumps(openapi_document.model_dump(mode="python", exclude_none=True), ensure_ascii=True).encode()
-    return Response(body, openapi_document.status, dict(headers or {}), media_type=MEDIA_TYPE)
+    body = json.dumps(document.model_dump(mode="python", exclude_none=True), ensure_ascii=True).encode()
+    return Response(body, document.status, dict(headers or {}), media_type=MEDIA_TYPE)
 
 
 async def refuse(problem: Problem, scope: Scope, receive: Receive, send: Send) -> None:

@@ -137,12 +137,12 @@ class _record_retries:
         self._lock = threading.Lock()
 
     def __enter__(self) -> None:
-        self._client.on_retry = self._hear
+        self._client.on_retry = self._on_retry
 
     def __exit__(self, *_: object) -> None:
         self._client.on_retry = self._before
 
-    def _hear(self, retry: Retry) -> None:
+    def _on_retry(self, retry: Retry) -> None:
         with self._lock:  # the threads of several cameras may wait at the same time
             if retry.reason == "busy":
                 self._lateness.busy += retry.seconds

@@ -65,7 +65,7 @@ def adapt_intrinsics(
     said = f"camera {camera!r}: calibrated for {calibrated[0]}x{calibrated[1]}, its pictures are {found[0]}x{found[1]}"
     ratio = np.array([found[0] / calibrated[0], found[1] / calibrated[1]])
     k = intrinsics.copy()
-    if _same_shape(calibrated, found) and abs(ratio.mean() - 1) > MIN_RESIZE:
+    if _same_aspect_ratio(calibrated, found) and abs(ratio.mean() - 1) > MIN_RESIZE:
         k[:2] *= ratio[:, None]
         return k, f"{said}: its intrinsics are scaled by {ratio.mean():.4g}"
     if size_mismatch == "stretch":
@@ -85,7 +85,7 @@ def adapt_intrinsics(
     )
 
 
-def _same_shape(calibrated: Size, found: Size) -> bool:
+def _same_aspect_ratio(calibrated: Size, found: Size) -> bool:
     """Returns whether one scale factor maps both sides, up to rounding."""
     lowest = max((side - ROUNDING_PIXELS) / of for side, of in zip(found, calibrated, strict=True))
     highest = min((side + ROUNDING_PIXELS) / of for side, of in zip(found, calibrated, strict=True))

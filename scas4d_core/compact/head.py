@@ -76,7 +76,7 @@ class FileHeader:
             if record["format"] != "scas4d" or not isinstance(version, int):
                 raise ValueError(f"format {record['format']!r}, version {version!r}")
         except (ValueError, KeyError, TypeError, RecursionError) as error:
-            raise FileError(f"{name}: its head is no head of a compact file ({error})") from None
+            raise FileError(f"{name}: not a compact 4D file: invalid header ({error})") from None
         if version != VERSION:
             raise FormatError(
                 f"{name}: a compact 4D file of version {version}; this scas4d reads version {VERSION}: "

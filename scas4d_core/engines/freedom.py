@@ -1,4 +1,4 @@
-"""The parameters of a deformation that are free in an update; all others stay at the identity."""
+"""The free parameters of a deformation; all others stay at the identity."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Freedom:
-    """The free columns of the tables of clusters and of the Gaussians' own deltas. What is not free stays exactly 0.
+    """Which columns of the cluster tables and of the per-Gaussian deltas are free. The others stay exactly 0.
 
     Attributes:
         cluster_rotation, cluster_translation, cluster_scaling: r, t, c and s of the clusters of all layers.
         own_position, own_rotation, own_scale: Δp, ΔR, Δs of each Gaussian.
-        prediction: whether the free ones start from the motion before, else from 0.
+        prediction: whether the free parameters start from the previous motion instead of 0.
 
     >>> Freedom(own_scale=True).clusters
     False

@@ -105,7 +105,7 @@ def export_sequence(
     wanted = format_of(format)
     target = Path(out)
     if wanted.needs_parts and parts is None:
-        raise InputError(f"parts is None, and format {format!r} is made of parts", "give the part of each Gaussian")
+        raise InputError(f"parts is None, but format {format!r} requires parts", "give one label per Gaussian")
     if frames_per_second is not None and not 0 < frames_per_second < float("inf"):
         raise InputError(f"frames_per_second is {frames_per_second!r}", "give a positive number, or None")
     if not wanted.numbered:

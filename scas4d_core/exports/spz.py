@@ -47,10 +47,10 @@ def write_spz(path: Path | str, gaussians: Gaussians, world: WorldFrame, version
 
     >>> write_spz("a.spz", Gaussians.of_points([[0, 0, 2]], radius=0.1), WorldFrame(np.zeros(3)), version=2)
     Traceback (most recent call last):
-    scas4d_core.errors.InputError: version 2 of SPZ is not written; give 3 or 4
+    scas4d_core.errors.InputError: SPZ version 2 is not supported; give 3 or 4
     """
     if version not in VERSIONS:
-        raise InputError(f"version {version} of SPZ is not written", "give 3 or 4")
+        raise InputError(f"SPZ version {version} is not supported", "give 3 or 4")
     gsply = import_optional("gsply", "spz")
     if version == 4:
         import_optional("zstandard", "spz4")

@@ -1,11 +1,11 @@
 """The image loss 0.8 L1 + 0.2 (1 − SSIM) and its gradient, over planes [C, H, W]. Twin: ``losses.image_loss``.
 
 SSIM is that of 3D Gaussian Splatting: 11×11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01², C2 = 0.03². The
-window is separable; passes go along a row, sixteen pixels at a time, and read across rows.
+window is separable: one pass filters along each row, the other across rows. Both process sixteen pixels at a time.
 
-Most of many pictures is black, in the target and in the render. A window that is 0 in both has an SSIM of 1 and no
-gradient: only the columns of each row near other pixels are computed. Where a part of the picture alone is asked for
-(``near``), what is far from it is left out as well, sixteen columns of a row at a time.
+Large parts of many images are black in the target and in the render. A window that is 0 in both has an SSIM of 1 and
+no gradient, so only columns near other pixels are computed. If only a part of the image is requested (``near``), blocks
+of sixteen columns far from it are skipped as well.
 """
 
 from __future__ import annotations

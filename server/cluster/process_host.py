@@ -39,7 +39,7 @@ class UnexpectedExit:
 
 
 @dataclass(frozen=True)
-class ProcessPriority:
+class ProcessScheduling:
     """Thread count and niceness of processes, to be the same on every node as on the machine of the service.
 
     Attributes:
@@ -51,12 +51,12 @@ class ProcessPriority:
     nice: int = 0
 
     @classmethod
-    def current(cls) -> ProcessPriority:
-        """Returns the priority of this process."""
+    def current(cls) -> ProcessScheduling:
+        """Returns the OpenMP thread count and niceness of this process."""
         return cls(os.environ.get("OMP_NUM_THREADS"), os.getpriority(os.PRIO_PROCESS, 0))
 
     def apply(self) -> None:
-        """Applies the priority to this thread and the processes that it starts.
+        """Applies both to this thread and the processes that it starts.
 
         Lowers the niceness only if the user has permission to do so.
         """
@@ -100,7 +100,7 @@ class ProcessHost:
     """
 
     def __init__(
-        self, prepare: Callable[[], None] | None, data: Path, word: str, priority: ProcessPriority | None = None
+        self, prepare: Callable[[], None] | None, data: Path, word: str, priority: ProcessScheduling | None = None
     ) -> None:
         self._priority = priority
         self._placement = Placement(prepare)

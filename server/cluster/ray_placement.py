@@ -23,7 +23,7 @@ from server.cluster.folder_marker import write_marker
 from server.cluster.membership import Membership
 from server.cluster.node_watch import NodeWatch
 from server.cluster.nodes import PlacedProcess, all_nodes, describe_cluster, is_lost
-from server.cluster.process_host import ProcessHost, ProcessPriority, StartResult, UnexpectedExit
+from server.cluster.process_host import ProcessHost, ProcessScheduling, StartResult, UnexpectedExit
 from server.cluster.ray_calls import RayCalls
 from server.cluster.resource_needs import ResourceNeeds, resource_needs
 from server.cluster.service_registry import peer_addresses, register_service
@@ -179,7 +179,7 @@ class RayPlacement(Placement):
         """Returns a new actor for a process. Blocking, since the head registers the actor's name."""
         made: Any = ray.remote(ProcessHost)
         return made.options(name=name, **needs.actor_options()).remote(
-            self.prepare, self._server.data.resolve(), self._token, ProcessPriority.current()
+            self.prepare, self._server.data.resolve(), self._token, ProcessScheduling.current()
         )
 
 

@@ -121,7 +121,7 @@ class Ingest:
         if self._sockets >= MAX_SOCKETS:
             raise Problem(
                 429,
-                f"{count_noun(self._sockets, 'WebSocket')} already send frames to this scene",
+                f"{count_noun(self._sockets, 'WebSocket')} are already sending frames to this scene",
                 field="id",
                 value=self.ledger.scene,
                 remedy="close one of them, or send over HTTP",

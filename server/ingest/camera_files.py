@@ -75,7 +75,7 @@ async def receive_camera(
     def begin(head: FrameHead) -> FrameReceiver:
         check_index(head, index)
         check_files(ingest.rules.rig, head.files, whole=False)
-        names.append(_check_one_camera(head, camera))
+        names.append(_only_camera(head, camera))
         frames.check_head(head, names[0])
         keep = head.index >= ingest.ledger.next_frame
         return frame_receiver(ingest, head.model_copy(update={"single_camera": True}), head.time, keep=keep)
@@ -160,7 +160,7 @@ async def _receive_files(receiving: FrameReceiver, files: Sequence[bytes | bytea
         raise
 
 
-def _check_one_camera(head: FrameHead, camera: str | None) -> str:
+def _only_camera(head: FrameHead, camera: str | None) -> str:
     names = sorted({file.camera for file in head.files})
     if len(names) != 1 or camera not in (None, names[0]):
         raise Problem(

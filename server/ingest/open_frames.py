@@ -136,7 +136,7 @@ class OpenFrames:
     async def _camera_events_of(self, index: int) -> OpenFrame | None:
         """Returns the single-camera uploads of a closed frame, or None if they are unknown."""
         entry = self._ledger.frames[index]
-        known = entry.note.parts
+        known = entry.rare_properties.parts
         if known is None and entry.files:
             parts = OpenFrame(index, entry.time)
             try:
@@ -145,7 +145,7 @@ class OpenFrames:
                     parts.hashes.update(pictures.hashes)
             except FrameDamage:
                 return None
-            self._ledger.frames.note(index).parts = known = parts
+            self._ledger.frames.rare_properties(index).parts = known = parts
         if known is None and entry.receipt is not None:  # its images are deleted, but the journal still has the uploads
             return await asyncio.to_thread(_camera_events_in_journal, self._log.journal.path, index)
         return known

@@ -28,7 +28,7 @@ RESERVE_BYTES = 500_000_000
 log = logging.getLogger("scas4d.exporter")
 
 
-class ShortOfRoomError(RuntimeError):
+class DiskReserveError(RuntimeError):
     """Error raised when an export would use disk space reserved for scenes."""
 
 
@@ -39,7 +39,7 @@ def main(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
     try:
         _export(spec, connection)
     except Exception as error:  # any failure in the core must be reported, and the service must keep running
-        known = isinstance(error, InputError | HistoryError | ShortOfRoomError) or no_room(error)
+        known = isinstance(error, InputError | HistoryError | DiskReserveError) or no_room(error)
         log.warning("scene %s: an export failed: %s", spec.scene.folder.name, error, exc_info=not known)
         fault = explain(error)
     finish_background(connection, ExportEnded(fault))
@@ -51,7 +51,7 @@ def explain(error: Exception) -> str:
     >>> explain(InputError("parts: no Gaussian belongs to one", "ask for the parts"))
     'parts: no Gaussian belongs to one; ask for the parts'
     """
-    if isinstance(error, ShortOfRoomError) or no_room(error):
+    if isinstance(error, DiskReserveError) or no_room(error):
         return f"the disk is full ({message_of(error)}); export fewer frames, or a smaller format"
     if isinstance(error, DamagedFrameError):
         return f"{message_of(error)}; export again later: it is mended if it can be"
@@ -103,7 +103,7 @@ def _export(spec: ExportSpec, connection: Connection[Any, Any]) -> None:
             connection.send(ExportProgressed(done, size_of(folder)))
             twice = size_of(folder) if spec.format == "usd" else 0  # USD is written a second time at the end
             if (free := free_bytes(folder) - twice) < RESERVE_BYTES:
-                raise ShortOfRoomError(
+                raise DiskReserveError(
                     f"{free / 1e6:.0f} MB are free, {RESERVE_BYTES / 1e6:.0f} MB are reserved for frames"
                 )
 

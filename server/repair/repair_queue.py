@@ -154,7 +154,7 @@ class RepairQueue:
         if self.at_work is not None:
             self._deaths[self.at_work] = self._deaths.get(self.at_work, 0) + 1
             if self._deaths[self.at_work] >= MAX_DEATHS:
-                self._give_up(self.at_work, "the worker died each time that it was made again")
+                self._declare_unrecoverable(self.at_work, "the worker died each time that it was made again")
             self.at_work = None
         self._ask(self._requested)
         self.report_damage({frame_file(index): reason for index, reason in damaged.items()})
@@ -182,12 +182,12 @@ class RepairQueue:
         for index in sorted(self.waiting):
             base = self._base(index)
             if base is None:
-                self._give_up(index, "the state before it cannot be read")
+                self._declare_unrecoverable(index, "the state before it cannot be read")
                 continue
             entry = self._ledger.frames[index]
             receipt = entry.receipt
             if receipt is None or not entry.files:
-                self._give_up(index, "its pictures are no longer held")
+                self._declare_unrecoverable(index, "its pictures are no longer held")
                 continue
             frame = FrameReady(index, receipt.time, entry.files, receipt.identity, self._ledger.budget_of(index))
             if self._to_worker(RecomputeState(frame, base)):
@@ -229,7 +229,7 @@ class RepairQueue:
                 )
             case RepairOutcome.LOST:
                 assert index is not None
-                self._give_up(index, message.reason)
+                self._declare_unrecoverable(index, message.reason)
             case RepairOutcome.NO_ROOM:
                 if index is None or index not in self.waiting:
                     self._requested[message.name] = reason
@@ -272,11 +272,11 @@ class RepairQueue:
         self.waiting[index] = reason
         self._ledger.frames.set_unreadable(index, True)
         if not entry.files:
-            self._give_up(index, "its pictures are no longer held")
+            self._declare_unrecoverable(index, "its pictures are no longer held")
         elif degraded is not None:
-            self._give_up(index, f"it was {degraded}")
+            self._declare_unrecoverable(index, f"it was {degraded}")
         elif self._base(index) is None:
-            self._give_up(index, "the state before it cannot be read")
+            self._declare_unrecoverable(index, "the state before it cannot be read")
 
     def _base(self, index: int) -> int | None:
         """Returns the committed frame from which a frame was updated, or None if its state no longer exists."""
@@ -286,7 +286,8 @@ class RepairQueue:
                 return None if entry.deleted else before
         return None
 
-    def _give_up(self, index: int, why: str) -> None:
+    def _declare_unrecoverable(self, index: int, why: str) -> None:
+        """Declares a frame's state deleted because it cannot be recomputed, and records the damage."""
         reason = self.waiting.pop(index, "its state is damaged")
         sentence = f"the state of frame {index} was damaged on disk and cannot be recomputed: {why}"
         self._ledger.frames.set_unreadable(index, False)

@@ -144,7 +144,7 @@ class Scrub:
         for index in await asyncio.to_thread(files.births):
             for copy in (False, True):
                 await self._state(folder / born_file(index, copy), lambda: True)
-        listed = await asyncio.to_thread(_checkpoints, folder)
+        listed = await asyncio.to_thread(_checkpoint_names, folder)
         for name in listed:
             await self._state(folder / name, lambda: False)
         newest = checkpoint_file(ledger.committed[-1])
@@ -207,7 +207,7 @@ class Scrub:
             self._damage.add(DamageKind.FRAME, sentence, lasting=True)
 
 
-def _checkpoints(folder: Path) -> list[str]:
+def _checkpoint_names(folder: Path) -> list[str]:
     try:
         return sorted(entry.name for entry in os.scandir(folder) if checkpoint_of(entry.name) is not None)
     except FileNotFoundError:

@@ -283,7 +283,7 @@ class Scene:
             Problem: 409 for a failed scene; 507 if the disk is full.
         """
 
-        async def change() -> None:
+        async def journal_budget() -> None:
             async with self.log.lock:
                 self.ingest.refuse_if_failed()
                 if self.ledger.budgets[-1][1] == budget:
@@ -291,17 +291,17 @@ class Scene:
                 with self.updates.paused():
                     await self.log.append(BudgetChanged(index=self.ledger.next_to_begin(), budget=budget))
 
-        await shield_and_wait(change())
+        await shield_and_wait(journal_budget())
 
     async def pause(self, paused: bool) -> None:
         """Pauses updates after the current frame, or resumes them; the setting survives a service restart."""
 
-        async def change() -> None:
+        async def journal_pause() -> None:
             async with self.log.lock:
                 if self.ledger.paused != paused:
                     await self.log.append(PauseChanged(paused=paused))
 
-        await shield_and_wait(change())
+        await shield_and_wait(journal_pause())
         self.updates.begin()
 
     async def edit(self, edit: SceneEdit) -> None:

@@ -51,7 +51,7 @@ class Scenes:
         self.asleep: dict[str, SleepingScene] = {}
         self.unreadable: dict[str, str] = {}
         self._data = DataFolder(server.data.resolve())
-        self.recovering = StartupRecovery(self._data, self._restore)
+        self.recovering = StartupRecovery(self._data, self._register_stored)
         self._lock: FolderLock | None = None
         self._promised = 0
         """Number of slots reserved for scenes that are not in `awake` yet."""
@@ -169,7 +169,7 @@ class Scenes:
         self.asleep[status.id] = SleepingScene(status.id, datetime.fromisoformat(status.created), status)
 
     async def _wake(self, id: str) -> None:
-        if not await self._restore(self._data.scene(id), self.asleep[id].status.damage, wake=True):
+        if not await self._register_stored(self._data.scene(id), self.asleep[id].status.damage, wake=True):
             raise sleep.cannot_wake_problem(id, self.unreadable.pop(id))
         del self.asleep[id]
 
@@ -183,8 +183,8 @@ class Scenes:
                 except Exception:  # a failure must not keep other scenes awake
                     log.exception("scene %s did not fall asleep", scene.id)
 
-    async def _restore(self, folder: SceneFolder, said: Sequence[str] = (), *, wake: bool = False) -> bool:
-        """Loads a scene from its folder; returns False and records the reason if it cannot be read.
+    async def _register_stored(self, folder: SceneFolder, said: Sequence[str] = (), *, wake: bool = False) -> bool:
+        """Registers a stored scene, awake or asleep; returns False and records the reason if it cannot be read.
 
         A scene with pending work always gets a slot, even above the limit. A recently used scene gets one if available.
 
@@ -262,7 +262,7 @@ class Scenes:
         try:
             said += await journal_new_reconstruction(folder, beginning)
         finally:
-            if await self._restore(folder, said, wake=True):
+            if await self._register_stored(folder, said, wake=True):
                 self.awake[scene.id].has_place = True
                 self.awake[scene.id].start()
             else:

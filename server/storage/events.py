@@ -191,7 +191,7 @@ class OpenFrame:
 
 
 @dataclass(slots=True)
-class FrameNote:
+class RareProperties:
     """Properties that only a few frames have."""
 
     error: str | None = None

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from client.wire import FINISHED, FrameReceipt, FrameReportModel, FrameState
-from server.storage.events import FrameNote, OpenFrame
+from server.storage.events import OpenFrame, RareProperties
 from server.storage.report_fields import committed_fields
 
 RECORDS_KEPT = 512
@@ -57,7 +57,7 @@ class FrameTable:
         self._identities = bytearray()
         self._skipped_by = array("i")
         self._files: dict[int, tuple[str, ...]] = {}
-        self._notes: dict[int, FrameNote] = {}
+        self._notes: dict[int, RareProperties] = {}
         self._records: OrderedDict[int, Mapping[str, Any]] = OrderedDict()
 
     def __len__(self) -> int:
@@ -117,7 +117,7 @@ class FrameTable:
         if index in self._notes:
             self._notes[index].error = None
         if parts is not None:
-            self.note(index).parts = parts
+            self.rare_properties(index).parts = parts
         self.set_state(index, FrameState.QUEUED)
 
     def set_state(self, index: int, state: FrameState) -> None:
@@ -149,10 +149,10 @@ class FrameTable:
         notes, self._notes = self._notes, {}
         for index, note in notes.items():
             if stay[index] or note.parts is not None:
-                self._notes[index] = FrameNote(note.error if stay[index] else None, parts=note.parts)
+                self._notes[index] = RareProperties(note.error if stay[index] else None, parts=note.parts)
         bare = (states == CODES[FrameState.FAILED]) & self.flagged(RECEIPT)
         for index in (np.flatnonzero(bare[first:]) + first).tolist():
-            self.note(index).error = PICTURES_GONE
+            self.rare_properties(index).error = PICTURES_GONE
 
     def add_committed(self, index: int, time: float | None) -> None:
         """Records a committed state for which no journal event exists."""
@@ -213,12 +213,12 @@ class FrameTable:
         self._files.pop(index, None)
         if (note := self._notes.get(index)) is not None:
             note.parts = None
-            if note == FrameNote():
+            if note == RareProperties():
                 del self._notes[index]
 
-    def note(self, index: int) -> FrameNote:
+    def rare_properties(self, index: int) -> RareProperties:
         """Returns the frame's note for modification and creates it if missing."""
-        return self._notes.setdefault(index, FrameNote())
+        return self._notes.setdefault(index, RareProperties())
 
     def set_record(self, index: int, record: Mapping[str, Any]) -> None:
         """Stores a commit record (`History.report`) and evicts the oldest one if the limit is exceeded."""
@@ -313,14 +313,14 @@ class FrameEntry:
         return self._table._files.get(self.index, ())
 
     @property
-    def note(self) -> FrameNote:
+    def rare_properties(self) -> RareProperties:
         """Rare properties of the frame; treat them as read-only, because changes may be lost."""
-        return self._table._notes.get(self.index) or FrameNote()
+        return self._table._notes.get(self.index) or RareProperties()
 
     @property
     def error(self) -> str | None:
         """Reason why the frame failed, was skipped or is missing, or None."""
-        if (error := self.note.error) is not None:
+        if (error := self.rare_properties.error) is not None:
             return error
         if self.state == FrameState.SKIPPED:
             return f"skipped: frame {self.skipped_by} came and the queue was full"
@@ -340,7 +340,7 @@ class FrameEntry:
 
     def report_with(self, record: Mapping[str, Any] | None) -> FrameReportModel:
         """Returns the API report of the frame with a commit record, or without one if `record` is None."""
-        note = self.note
+        note = self.rare_properties
         return FrameReportModel(
             scene=self._table.scene,
             index=self.index,

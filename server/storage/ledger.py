@@ -116,7 +116,7 @@ class Ledger:
                 self.open.setdefault(event.index, OpenFrame(event.index)).add(event)
             case FrameMissing():
                 self._grow_to(event.index)
-                self.frames.note(event.index).error = event.reason
+                self.frames.rare_properties(event.index).error = event.reason
                 self.set_state(event.index, FrameState.MISSING)
             case FramesSkipped():
                 for index in event.frames:
@@ -124,14 +124,14 @@ class Ledger:
                     self.frames.skip(index, event.by)
             case FrameFailed():
                 self._grow_to(event.index)
-                note = self.frames.note(event.index)
+                note = self.frames.rare_properties(event.index)
                 note.error, note.dropped = event.reason, dict(event.dropped)
                 if event.fatal:
                     self.fatal, self.failed_at = event.reason, event.index
                 self.set_state(event.index, FrameState.FAILED)
             case WorkerDied():
                 self._grow_to(event.index)
-                note = self.frames.note(event.index)
+                note = self.frames.rare_properties(event.index)
                 note.own_deaths += event.own
                 note.other_deaths += not event.own
             case PicturesDeleted():
@@ -143,7 +143,7 @@ class Ledger:
                 self.states_deleted += self.frames.delete_states(event.frames)
                 if event.reason is not None and len(event.frames) < FEW_STATES:
                     for index in event.frames:
-                        self.frames.note(index).error = event.reason
+                        self.frames.rare_properties(index).error = event.reason
             case StateFound():
                 self._grow_to(event.index)
                 self.frames.add_committed(event.index, event.time)
@@ -205,7 +205,7 @@ class Ledger:
         frames.commit_up_to(last)
         lost = readable & (codes == CODES[FrameState.FAILED]) & ~frames.flagged(RECEIPT)
         for index in np.flatnonzero(lost):  # the event is lost, but the state exists
-            frames.note(int(index)).error = None
+            frames.rare_properties(int(index)).error = None
             frames.set_state(int(index), FrameState.COMMITTED)
         unreadable = (frames.states() == CODES[FrameState.COMMITTED]) & ~frames.flagged(DELETED) & ~readable
         gone = tuple(index for index in np.flatnonzero(unreadable).tolist() if index not in recompute)
@@ -238,7 +238,7 @@ class Ledger:
                 indices.append(index)
         return indices[::-1]
 
-    def events_without_first_frame(self) -> list[FrameFailed]:
+    def failures_of_waiting_frames(self) -> list[FrameFailed]:
         """Returns events that fail all waiting frames after a fatal failure; the events are not applied."""
         if self.fatal is None:
             return []

@@ -135,7 +135,7 @@ def recover(folder: SceneFolder, scene: str, definition: Mapping[str, Any] | Non
     if states.newest:
         ledger.frames.set_record(states.last, states.newest)
     for event in (
-        ledger.events_without_first_frame()
+        ledger.failures_of_waiting_frames()
     ):  # the service stopped after the scene failed, before it could fail this frame
         ledger.apply(event)
         events.append(event)

@@ -48,8 +48,8 @@ def events_of(ledger: Ledger) -> Iterator[JournalEvent]:
         entry = ledger.frames[index]
         yield from _of_frame(entry, fatal=index == ledger.failed_at)
         if entry.deleted:
-            if entry.state not in OWN_ERROR and entry.note.error is not None:
-                yield StatesDeleted(frames=(index,), reason=entry.note.error)
+            if entry.state not in OWN_ERROR and entry.rare_properties.error is not None:
+                yield StatesDeleted(frames=(index,), reason=entry.rare_properties.error)
             else:
                 deleted.append(index)
         if not entry.files and (entry.identity is not None or index == count - 1):
@@ -70,7 +70,7 @@ def events_of(ledger: Ledger) -> Iterator[JournalEvent]:
 
 
 def _of_frame(entry: FrameEntry, *, fatal: bool) -> Iterator[JournalEvent]:
-    index, note, receipt = entry.index, entry.note, entry.receipt
+    index, note, receipt = entry.index, entry.rare_properties, entry.receipt
     if receipt is not None:
         if note.parts is not None:
             yield from _camera_events(note.parts)

@@ -118,7 +118,10 @@ class Updates:
 
     @property
     def has_work(self) -> bool:
-        """Whether a frame is being updated or waiting, or a repair is running or pending."""
+        """Whether work is in progress or pending: a frame, repair, retention rule, worker restart or hold of updates.
+
+        Waiting frames of a paused or failed scene do not count.
+        """
         mending = self._repair_queue.at_work is not None or self._repair_queue.current_repair is not None
         waits = bool(self._pauses or self._waiting()) or self._rule is not None or self.worker.starts_again
         return self._index is not None or waits or mending
@@ -277,7 +280,7 @@ class Updates:
         await self._make_room()
 
     async def _fail_waiting(self) -> None:
-        events = self._ledger.events_without_first_frame()
+        events = self._ledger.failures_of_waiting_frames()
         if events:
             await self._log.write(*events)
         for event in events:

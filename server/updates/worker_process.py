@@ -78,7 +78,7 @@ class WorkerDeaths:
 
 def give_up_event(entry: FrameEntry, death: WorkerDied) -> FrameFailed | None:
     """Returns the event that fails the frame after a crash that is already counted, or None to retry the frame."""
-    own, other = entry.note.own_deaths, entry.note.other_deaths
+    own, other = entry.rare_properties.own_deaths, entry.rare_properties.other_deaths
     if own >= OWN_DEATHS:
         reason = f"the worker died {own} times while it reconstructed this frame: {death.reason}"
     elif other >= OTHER_DEATHS:

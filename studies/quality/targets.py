@@ -66,20 +66,20 @@ TARGETS: tuple[Target, ...] = (
     Target("updates", "scas4d", "psnr", ("robot",), "≥", 31.0),
     Target("updates", "scas4d", "psnr", OBJECT_CAPTURES, "≥", 30.5, mean=True),
     Target("updates (room, shadows)", "scas4d", "psnr", ("stage",), "≥", 27.0),
-    Target("scas4d over dynamic3dgs, both at 100", "scas4d", "psnr", ("robot",), "≥", 8.0, over=("dynamic3dgs",)),
+    Target("scas4d − dynamic3dgs, 100 iterations", "scas4d", "psnr", ("robot",), "≥", 8.0, over=("dynamic3dgs",)),
     Target(
-        "scas4d over dynamic3dgs, both at 100",
+        "scas4d − dynamic3dgs, 100 iterations",
         "scas4d", "psnr", ("wheel", "pendulums", "cloth", "spring", "stage", "basketball"), ">", 0.0,
         over=("dynamic3dgs",),
     ),
     Target(
-        "scas4d at 100 over dynamic3dgs at 2000", "scas4d", "psnr", ("robot",), ">", 0.0, over=("dynamic3dgs-2000",),
+        "scas4d, 100 iterations − dynamic3dgs, 2000", "scas4d", "psnr", ("robot",), ">", 0.0, over=("dynamic3dgs-2000",),
     ),
     Target(
-        "scas4d at 100 over dynamic3dgs at 2000",
+        "scas4d, 100 iterations − dynamic3dgs, 2000",
         "scas4d", "psnr", OBJECT_CAPTURES, "≥", -0.5, over=("dynamic3dgs-2000",), mean=True,
     ),
-    Target("dynamic3dgs at 2000", "dynamic3dgs-2000", "psnr", ("robot",), "≥", 28.5),
+    Target("dynamic3dgs, 2000 iterations", "dynamic3dgs-2000", "psnr", ("robot",), "≥", 28.5),
     Target(
         "three layers over the best single one (64, 320, 1280)", "scas4d", "psnr", OBJECT_CAPTURES, ">", 0.0, over=K1,
     ),
@@ -101,11 +101,11 @@ TARGETS: tuple[Target, ...] = (
     ),
     Target("parts, adjusted Rand index", "scas4d", "parts_ari", ("robot", "pendulums"), "≥", 0.7, ""),
     Target(
-        "parts over dynamic3dgs at 100",
+        "parts − those of dynamic3dgs, 100 iterations",
         "scas4d", "parts_ari", ("robot", "pendulums"), ">", 0.0, "", ("dynamic3dgs",),
     ),
     Target(
-        "parts over dynamic3dgs at 2000",
+        "parts − those of dynamic3dgs, 2000 iterations",
         "scas4d", "parts_ari", ("robot", "pendulums"), ">", 0.0, "", ("dynamic3dgs-2000",),
     ),
     Target("rasterizer over its arithmetic, on frame 0", KERNELS, "ratio_rasterizer", ("robot",), "≤", 2.0, "×"),
@@ -254,7 +254,7 @@ scripts/bench table out/quality --out docs/quality.md
 - Code: {f"{len(cores)} state(s) of the core's sources ({', '.join(cores)})" if cores else "–"}.
 
 An iteration is one forward and backward render of one training view. Figures are means over updates and test cameras;
-"updates" names the measured updates. A difference is taken over the updates that both sides have. Definitions
+"updates" names the measured updates. Differences are computed over common updates. Definitions
 of the metrics: `scas4d_core/metrics/`.
 
 ## Targets

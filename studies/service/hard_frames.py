@@ -193,8 +193,8 @@ def _push(service: Service, footage: AnyFootage, sent: Sequence[Sent], echo: Ech
         faults.append(f"the worker died: its processes were {pids}")
     for index in range(status.next_frame):
         report = service.frame(scene, index)
-        if report.state != FrameState.COMMITTED or report.attempts:
-            faults.append(f"frame {index} is {report.state} after {report.attempts} deaths: {report.error}")
+        if report.state != FrameState.COMMITTED or report.worker_deaths:
+            faults.append(f"frame {index} is {report.state} after {report.worker_deaths} deaths: {report.error}")
     echo(f"scene {scene}: {status.next_frame} frames, {len(faults)} faults")
     history = History.load(DataFolder(service.data).scene(scene).states)
     world = footage.rig.world_frame(footage.settings.scene.metres_per_unit)

@@ -67,7 +67,7 @@ def test_a_data_folder_in_use_is_one_line(tmp_path):
     lock = FolderLock(tmp_path / "service.lock", wait=False)
     said = refused(tmp_path, 0)
     lock.release()
-    assert f"another service is at work in {tmp_path}" in said
+    assert f"another service uses {tmp_path}" in said
     assert "--data" in said
 
 

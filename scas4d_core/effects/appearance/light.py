@@ -96,8 +96,7 @@ class Light(Effect):
 EFFECT = Light(
     name="light",
     group=EffectGroup.APPEARANCE,
-    description="While the light changes, colours follow faster, those of moving Gaussians as fast as those of "
-    "static ones.",
+    description="While the light changes, all colours adapt faster, those of moving Gaussians as fast as static ones.",
     disambiguation="Colours hold the light of their frame; differences between cameras, and flicker, are gains.",
     cost="none that can be measured",
     auto=True,

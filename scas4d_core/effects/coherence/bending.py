@@ -117,7 +117,7 @@ class Bending(Effect):
 EFFECT = Bending(
     name="bending",
     group=EffectGroup.COHERENCE,
-    description="Neighbours rotate each in their own way, as in cloth: the term rotation is left out.",
+    description="Neighbours rotate each in their own way, as in cloth: rotation is off, and rigidity fades to 0.",
     disambiguation="Rotations of patches beyond the rest of their motion; joints between rigid parts are too few to "
     "count.",
     cost="1 % of an update: the rotations of 400 patches per frame",

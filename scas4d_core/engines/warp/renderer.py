@@ -68,7 +68,7 @@ class WarpRenderer:
         drawn = []
         for group in range(0, shown.shape[1], CHANNELS):
             channels = slice(group, group + CHANNELS)
-            self._draw(cameras, shown[:, channels], background[channels])
+            self._rasterize(cameras, shown[:, channels], background[channels])
             drawn.append(self._rasterizer.planes.numpy()[:, : camera.height, : camera.width].copy())
         return Picture(np.concatenate([planes[:CHANNELS] for planes in drawn]), drawn[0][CHANNELS])
 
@@ -76,7 +76,7 @@ class WarpRenderer:
         """See ``Renderer.compare``."""
         shown = features_seen(state, view.camera) if features is None else features
         cameras = self._projected(state, view.camera, shown)
-        self._draw(cameras, shown, self._background)
+        self._rasterize(cameras, shown, self._background)
         self._loss.load([view])
         self._loss.measure(self._first, self._first, self._rasterizer, self._behind, self._log)
         log = self._log.numpy()[0].astype(float)
@@ -89,7 +89,7 @@ class WarpRenderer:
         """See ``Renderer.gather``: the gradient of a weighted sum of the pixels by the features."""
         features = np.zeros((len(state), CHANNELS), np.float32)
         cameras = self._projected(state, camera, features)
-        on_device = self._draw(cameras, features, np.zeros(CHANNELS, np.float32))
+        on_device = self._rasterize(cameras, features, np.zeros(CHANNELS, np.float32))
         rasterizer = self._rasterizer
         given = np.zeros(rasterizer.g_planes.shape, np.float32)
         given[: len(planes), : camera.height, : camera.width] = planes
@@ -139,8 +139,8 @@ class WarpRenderer:
             self._rasterizer.project(*given)
         return cameras
 
-    def _draw(self, cameras: wp.array, features: Array, background: Array) -> wp.array:
-        """Draw four features [N, 4] of what was projected; returns them on the device."""
+    def _rasterize(self, cameras: wp.array, features: Array, background: Array) -> wp.array:
+        """Rasterizes features [N, 4] of the projected Gaussians; returns the uploaded features."""
         on_device = wp.array(np.ascontiguousarray(features, np.float32), dtype=wp.vec4, device=self._device)
         self._behind.assign(background[None])
         self._rasterizer.draw(cameras, self._first, on_device, self._behind)

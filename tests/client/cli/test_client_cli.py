@@ -272,7 +272,7 @@ def test_serve_refuses_to_listen_beyond_this_machine():
         (("push", "TINY", "--set", "iterations"), "update.iterations=200"),
         (("push", "TINY", "--node", "stage-a"), "write it as rig=stage-a"),
         (("push", "TINY", "--node", "rig=a", "--node", "rig=b"), "'rig' has two values"),
-        (("push", "TINY", "--node", "rig=a", "--scene", "x"), "--node is for a new scene"),
+        (("push", "TINY", "--node", "rig=a", "--scene", "x"), "--node is only for new scenes"),
     ],
 )
 def test_what_a_user_can_mend_is_one_line(capture_folder, arguments, said):

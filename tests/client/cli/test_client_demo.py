@@ -114,7 +114,7 @@ def test_a_service_that_ends_is_told_with_its_reason(capture_folder, tmp_path):
     ended = demo(capture_folder, tmp_path / "out")
     lock.release()
     assert ended.returncode == 1
-    assert ended.stderr.startswith("scas4d: the service has ended: another service is at work in ")
+    assert ended.stderr.startswith("scas4d: the service has ended: another service uses ")
     assert ended.stderr.count("\n") == 1
 
 

@@ -135,7 +135,7 @@ def test_where_it_fails_the_scene_is_not_kept_from_starting(there, monkeypatch, 
     monkeypatch.setattr(subprocess, "Popen", popen)
     with caplog.at_level(logging.WARNING):
         assert not compile_pool.wait_for_kernels([KernelGroup.UPDATE])
-    assert "could not be compiled beforehand" in caplog.text
+    assert "could not be compiled in advance" in caplog.text
     assert there.missing([ONE, TWO, THREE]) == ([TWO] if popen is Started else [ONE, TWO, THREE])
 
 

@@ -153,7 +153,7 @@ def test_what_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"format 'obj' is not known; give one of ply, splat, spz, .*poses"):
         exported(tmp_path, "obj")
     for format in ("glb-parts", "poses"):
-        with pytest.raises(InputError, match=f"parts is None, and format '{format}' is made of parts; give the part"):
+        with pytest.raises(InputError, match=f"parts is None, but format '{format}' requires parts; give one label"):
             export_sequence(states(), format, tmp_path / "a.glb", world=corner.WORLD)
     with pytest.raises(InputError, match=r"out '.*a\.glb' is no name of a file for format 'usd'; let it end in \.usdc"):
         exported(tmp_path / "a.glb", "usd")

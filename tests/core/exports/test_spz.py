@@ -117,5 +117,5 @@ def test_what_cannot_be_read(tmp_path):
     (tmp_path / "a.spz").write_bytes(b"hello")
     with pytest.raises(InputError, match=r"a\.spz: not an SPZ file"):
         read_spz(tmp_path / "a.spz")
-    with pytest.raises(InputError, match="version 2 of SPZ is not written; give 3 or 4"):
+    with pytest.raises(InputError, match="SPZ version 2 is not supported; give 3 or 4"):
         write_spz(tmp_path / "b.spz", corner.state(), corner.WORLD, version=2)

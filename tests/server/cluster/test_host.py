@@ -13,7 +13,7 @@ import pytest
 from waiting import HANG_S
 
 from server.cluster import folder_marker, process_host
-from server.cluster.process_host import ProcessHost, ProcessPriority
+from server.cluster.process_host import ProcessHost, ProcessScheduling
 from server.messages import Stop
 
 
@@ -36,7 +36,7 @@ def test_a_process_runs_as_on_the_machine_of_its_service(tmp_path: Path, monkeyp
 
     async def run() -> Any:
         os.setpriority(os.PRIO_PROCESS, 0, nice + 3)  # of this thread alone
-        actor = ProcessHost(None, tmp_path, "mine", ProcessPriority("2", nice))
+        actor = ProcessHost(None, tmp_path, "mine", ProcessScheduling("2", nice))
         await actor.start(manner, "scene")
         found = await asyncio.wait_for(actor.receive(), HANG_S)
         await actor.stop(5)

@@ -106,7 +106,7 @@ def test_ready_says_how_long_the_kernels_took(tmp_path, monkeypatch):
     try:
         assert httpx.get(f"{running.url}/health/live", timeout=HANG_S).json()["status"] == "live"
         early = httpx.get(f"{running.url}/health/ready", timeout=HANG_S)
-        assert "being warmed up" in problem(early, 503)["detail"]
+        assert "being loaded" in problem(early, 503)["detail"]
         assert early.headers["retry-after"] == "1"
         while "kernels" not in early.json():  # until the process beside has told how far it is
             early = httpx.get(f"{running.url}/health/ready", timeout=HANG_S)

@@ -79,7 +79,7 @@ def test_what_needs_no_process_is_answered_without_a_place(tmp_path):
             next(iter(stream))
             refused = problem(view(http, first), 429)
             assert refused["field"] == "SCAS4D_MAX_SCENES"
-            assert "none of them is idle" in refused["detail"]
+            assert "none is idle" in refused["detail"]
             assert http.get(f"/v1/scenes/{first}/frames/1").json()["state"] == "committed"
             assert http.get(f"/v1/scenes/{first}/rig").status_code == 200
             assert sdk.edit_scene(first, name="other").name == "other"
