@@ -47,13 +47,13 @@ class ServerSettings(BaseSettings):
 
     data: Path = Field(default=Path("data"), description="Folder of the scenes; created if missing.")
 
-    host: str = Field(default="127.0.0.1", description="Address to listen at. Other than loopback only with a token.")
+    host: str = Field(default="127.0.0.1", description="Address to listen at. Any but loopback needs a token.")
     port: int = Field(default=8000, ge=0, le=65535, description="Port to listen at; 0: any free port.")
     token: SecretStr | None = Field(
         default=None,
         description=(
-            "Token of every request (Authorization: Bearer), except for /health, the viewer's files "
-            "and the API description. None: every user of this machine may do everything."
+            "Token that every request must send (Authorization: Bearer), except for /health, the viewer's "
+            "files and the API description. None: every user of this machine has full access."
         ),
     )
     token_file: Path | None = Field(
@@ -135,7 +135,7 @@ class ServerSettings(BaseSettings):
         ),
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
-        default="info", description="info logs a line per request."
+        default="info", description="Minimum level. info logs a line per request."
     )
 
     placement: str = Field(

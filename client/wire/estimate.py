@@ -23,7 +23,5 @@ class SceneEstimate(Model):
     readers_mb: float = Field(description="Memory of the two reader processes, without queries over many frames.")
     memory_mb: float = Field(description="Memory of all processes of the scene.")
     limit_mb: float = Field(description="Memory limit per scene on this service.")
-    state_mb: float = Field(
-        description="Disk space per exact state. Older states take a twentieth (docs/operations.md)."
-    )
+    state_mb: float = Field(description="Disk space per exact state; older states take a twentieth.")
     history_mb: float = Field(description="Memory of a reader per frame of a query over all Gaussians.")

@@ -1,4 +1,4 @@
-"""The engine of a device. Engines are imported when they are asked for: each brings its own libraries."""
+"""Selection of the engine for a device. Engines are imported lazily, because each one needs its own libraries."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from scas4d_core.engines.renderer import Renderer
 
 
 def engine_of(device: str) -> UpdateEngine:
-    """A new engine.
+    """Returns a new update engine for a device.
 
     Args:
-        device: as in the settings; the only one so far is "cpu".
+        device: device name from the settings; only "cpu" is supported so far.
 
     Raises:
-        ValueError: there is no engine for the device.
+            ValueError: if no engine supports the device.
 
     >>> engine_of("cpu").name
     'cpu'
@@ -28,13 +28,13 @@ def engine_of(device: str) -> UpdateEngine:
 
 
 def renderer_of(device: str, background: tuple[float, float, float], limits: Limits) -> Renderer:
-    """A new renderer of whole pictures.
+    """Returns a new full-image renderer for a device.
 
     Args:
-        device: see ``engine_of``. background: RGB in 0…1. limits: constants of the rasterizer.
+            device: see ``engine_of``. background: RGB in 0…1. limits: constants of the rasterizer.
 
     Raises:
-        ValueError: there is no renderer for the device.
+            ValueError: if no renderer supports the device.
     """
     if device == "cpu":
         from scas4d_core.engines.cpu.renderer import CpuRenderer
@@ -44,13 +44,13 @@ def renderer_of(device: str, background: tuple[float, float, float], limits: Lim
 
 
 def fit_engine_of(renderer: Renderer, mask_weight: float = 0.0) -> FitEngine:
-    """A new engine for one fit, with the device, background and limits of a renderer, and buffers of its own.
+    """Returns a new engine for one fit, with the renderer's device, background and limits but its own buffers.
 
     Args:
-        mask_weight: of the mask loss beside the image loss; it teaches the labels alone.
+        mask_weight: weight of the mask loss, which is added to the image loss and only affects the labels.
 
     Raises:
-        ValueError: the device of the renderer has no engine for fits.
+            ValueError: if the renderer's device has no engine for fits.
     """
     from scas4d_core.engines.cpu.fit import CpuFitEngine
     from scas4d_core.engines.cpu.renderer import CpuRenderer

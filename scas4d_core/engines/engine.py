@@ -1,20 +1,20 @@
-"""The interface between the loop of an update and the device that computes it, and the values that cross it.
+"""Interface between the update loop and the device that computes it, and the values that cross it.
 
-The loop (``update.frame_update``) decides; an engine computes. The calls of one attempt at a frame, in order::
+The loop (``update.frame_update``) decides, an engine computes. The calls of one attempt at a frame, in order::
 
-    engine.bind(plan, structure)            # once per hierarchy: allocate, compile, capture graphs
-    engine.load_views(views, probes)        # images of the frame
-    engine.load_state(previous)             # Θ_{t−1}, no motion
-    engine.set_tables(tables)               # initial motion: none, or that of the previous frame
-    engine.probe(...)                       # image losses of the candidates on a few views
-    engine.begin(start)                     # zero moments
-    engine.iterate(views, step)             # deform, render, compare, backward, Adam: once per iteration
-    engine.log(), engine.leave_out(views)   # once every camera was rendered: exclude outlying cameras
-    engine.probe(...)                       # for the stopping rule, and at the end
-    engine.state(learnt=True)               # Θ_t
+        engine.bind(plan, structure)            # once per hierarchy: allocate, compile, capture graphs
+        engine.load_views(views, probes)        # images of the frame
+        engine.load_state(previous)             # Θ_{t−1} without motion
+        engine.set_tables(tables)               # initial motion: none, or the motion of the previous frame
+        engine.probe(...)                       # image losses of the candidates on a few views
+        engine.begin(start)                     # reset the Adam moments to zero
+        engine.iterate(views, step)             # deform, render, compare, backward, Adam: once per iteration
+        engine.log(), engine.leave_out(views)   # after every camera was rendered: exclude outlier cameras
+        engine.probe(...)                       # for the stopping rule, and at the end
+        engine.state(learnt=True)               # Θ_t
 
-Only ``probe``, ``log``, ``tables``, ``state``, ``exposures`` and ``gains`` make the host wait for the device: about ten
-calls per frame, and none during an iteration.
+Only ``probe``, ``log``, ``tables``, ``state``, ``exposures`` and ``gains`` make the host wait for the device. That is
+about ten synchronizations per frame, and none during an iteration.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ KEPT_ROWS = 128
 class EngineError(ValueError):
     """The engine does not support what a plan requires.
 
-    Only ``UpdateEngine.bind`` and ``FitEngine.load_table`` raise it.
+    Raised only by ``UpdateEngine.bind`` and ``FitEngine.load_table``.
 
     Args:
         engine: name of the engine. asked: the unsupported fields of the plan.
@@ -63,13 +63,11 @@ class EngineError(ValueError):
 
 @dataclass(eq=False)
 class Tables:
-    """The parameters of a deformation, on the host.
+    """The parameters of a deformation, on the host. All zeros means no motion.
 
     Attributes:
-        clusters: for each layer, coarse to fine, [K, 10] float32, columns r, t, c, s of equation (6).
+        clusters: one table per layer, coarse to fine: [K, 10] float32, columns r, t, c, s of equation (6).
         deltas: [M, 9] float32, columns Δp, ΔR, Δs of equation (7).
-
-    All zeros is no motion.
     """
 
     clusters: list[Array]
@@ -88,17 +86,17 @@ class Tables:
 
 @dataclass(frozen=True, eq=False)
 class AttemptStart:
-    """Constants of the iterations of one attempt. A parameter with rate 0 is not updated.
+    """Constants of the iterations of one attempt. A parameter with learning rate 0 is not updated.
 
     Attributes:
-        layers: Adam's rates (r, t in metres, c and s) of each layer, coarse to fine.
-        position, rotation, scale: rates of Δp (metres), ΔR, Δs.
-        colour, static_colour: rates of RGB of moving and of static Gaussians.
-        beta1, beta2: Adam's decays.
-        samples: samples of entries in the hierarchy's order, [S] int64 each; ``StepScalars.sample`` selects one.
-        gains: [cameras, 3] initial gains of the cameras, in the plan's order; None: gains are not estimated.
-        curve: whether to compute terms that only the reported loss needs; they do not change the state.
-        lap: called with the name of each finished stage, by engines that wait for each stage.
+            layers: Adam learning rates of each layer (r, t in metres, c and s), coarse to fine.
+            position, rotation, scale: learning rates of Δp (metres), ΔR, Δs.
+            colour, static_colour: learning rates of the RGB colours of moving and of static Gaussians.
+            beta1, beta2: Adam's decay rates.
+            samples: samples of entries in the hierarchy's order, [S] int64 each; ``StepScalars.sample`` selects one.
+            gains: [cameras, 3] initial camera gains, in the plan's order; None: gains are not estimated.
+            curve: whether to compute terms that only affect the reported loss, not the state.
+            lap: callback that receives the name of each finished stage, from engines that synchronize after each stage.
     """
 
     layers: tuple[tuple[float, float, float], ...]
@@ -121,10 +119,10 @@ class StepScalars:
 
     Attributes:
         frozen: number of frozen layers, starting with the coarsest.
-        layers: factor on the rates of each layer; 0: the layer is not updated.
-        own: factor on the rates of Δp, ΔR, Δs. colour: on those of the colours. gloss: on those of the gloss.
-        smooth_gloss: whether the changes of the gloss are averaged over neighbours after this step.
-        rigidity: weight of rigidity in this iteration.
+            layers: factor on the learning rates of each layer; 0: the layer is not updated.
+            own: factor on the learning rates of Δp, ΔR, Δs. colour, gloss: factors on those of colours and gloss.
+            smooth_gloss: whether the updates of the gloss are averaged over neighbours after this step.
+            rigidity: weight of the rigidity loss in this iteration.
         sample: index of the attempt's sample whose neighbours are compared.
         keep_pictures: whether the log keeps the rendering of this iteration.
     """
@@ -162,8 +160,8 @@ class ViewRecord(NamedTuple):
     """The log entry of one rendering of a training view.
 
     Attributes:
-        view: index of the view. psnr: dB. colour_shift: [3] mean of the picture minus mean of the rendering, RGB in
-            0…1, the camera's exposure included.
+            view: index of the view. psnr: dB. colour_shift: [3] mean of the picture minus mean of the rendering, RGB in
+                0…1, with the camera's exposure applied.
     """
 
     view: int
@@ -176,9 +174,9 @@ class IterationLog:
     """The log of the iterations since ``begin``.
 
     Attributes:
-        losses: weighted sum of the terms of each iteration. rendered: all renderings, in order.
-        pictures: the kept renderings by index of the view, oldest first.
-        guards: number of times that each guard acted (``guards.GUARDS``).
+            losses: weighted sum of the loss terms, per iteration. rendered: records of all renderings, in order.
+            pictures: the kept renderings by view index, oldest first.
+            guards: number of times that each guard was triggered (``guards.GUARDS``).
     """
 
     losses: list[float] = field(default_factory=list)
@@ -195,7 +193,7 @@ class IterationLog:
 
 
 class UpdateEngine(Protocol):
-    """Computes the updates of one scene on one device, and owns their memory.
+    """Computes the updates of one scene on one device and owns the memory that they use.
 
     Attributes:
         name: name of the engine, for messages.
@@ -205,13 +203,13 @@ class UpdateEngine(Protocol):
 
     @property
     def renderer(self) -> Renderer:
-        """The renderer of states, with the background and limits of the plan."""
+        """Returns the renderer of states, with the background and limits of the plan."""
 
     def bind(self, plan: UpdatePlan, structure: Structure) -> None:
-        """Prepares for the updates of a plan: allocates and compiles.
+        """Allocates buffers and compiles kernels for the updates of a plan.
 
         Raises:
-            EngineError: the engine does not support what the plan requires.
+                EngineError: if the engine does not support what the plan requires.
         """
 
     def load_views(self, views: Sequence[TrainingView], probes: Sequence[TrainingView]) -> None:
@@ -223,33 +221,33 @@ class UpdateEngine(Protocol):
         """
 
     def load_state(self, previous: Gaussians) -> None:
-        """Loads Θ_{t−1}, without motion or learnt colours."""
+        """Loads Θ_{t−1} without motion or learned colours."""
 
     def set_tables(self, tables: Tables) -> None:
         """Sets the parameters of the deformation."""
 
     def begin(self, start: AttemptStart) -> None:
-        """Starts the iterations of an attempt, with zero moments and an empty log."""
+        """Starts the iterations of an attempt, with zero Adam moments and an empty log."""
 
     def iterate(self, views: Sequence[int], step: StepScalars) -> None:
-        """Runs one iteration: deform, render, compare, backward, step.
+        """Runs one iteration: deform, render, compare, backward, Adam step.
 
         Args:
-            views: indices of the views; the image and mask losses are their mean.
+                views: indices of the views; the image and mask losses are averaged over them.
         """
 
     def leave_out(self, views: Sequence[int]) -> None:
-        """Excludes views, by index, from the rest of the attempt; their cameras' gains stay unchanged."""
+        """Excludes views, by index, from the rest of the attempt; the gains of their cameras stay unchanged."""
 
     def wait(self, iteration: int) -> None:
-        """Waits until the device is close to an iteration, so that the host's clock measures its work."""
+        """Waits until the device is close to an iteration, so that host timings reflect the device's work."""
 
     def probe(self, which: Sequence[int], *, moved: bool, learnt: bool) -> list[float]:
         """Returns the image losses of a state on some of the probe views.
 
         Args:
-            which: indices of the views. moved: whether Θ_{t−1} is deformed by the tables.
-            learnt: whether to use the learnt colours, gloss and environment instead of those of Θ_{t−1}.
+                which: indices of the views. moved: whether Θ_{t−1} is deformed by the tables.
+                learnt: whether to use the learned colours, gloss and environment instead of those of Θ_{t−1}.
         """
 
     def tables(self) -> Tables:
@@ -262,18 +260,18 @@ class UpdateEngine(Protocol):
         """Returns Θ_{t−1} deformed by the tables, with accumulated material rotations.
 
         Args:
-            learnt: whether to use the learnt colours, gloss and environment instead of those of Θ_{t−1}.
+                learnt: whether to use the learned colours, gloss and environment instead of those of Θ_{t−1}.
         """
 
     def gradients(self) -> dict[str, Array]:
-        """Returns the gradients of the last iteration's loss, for tests, before anything else is rendered.
+        """Returns the gradients of the last iteration's loss, for tests; call it before anything else is rendered.
 
-        Keys are "cluster 0" … [K, 10] and "deltas" [M, 9], with the columns of ``Tables``; if they are learnt, also
-        "colours" [N, 3], "gloss" [M, 3] and "environment".
+        The keys are "cluster 0" … [K, 10] and "deltas" [M, 9], with the columns of ``Tables``. If they are learned,
+        "colours" [N, 3], "gloss" [M, 3] and "environment" are included.
         """
 
     def exposures(self) -> Mapping[str, Array]:
-        """Returns the current [C, 2] gain and offset of each camera with views, by name."""
+        """Returns the current [C, 2] gain and offset of each camera with views, by camera name."""
 
     def gains(self) -> Array:
         """Returns the [cameras, 3] gains, updated with the renderings since the last round."""

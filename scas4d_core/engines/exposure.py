@@ -1,8 +1,8 @@
-"""Gains of cameras, and the exposures that they are: one number a channel, applied to light before the sRGB curve.
+"""Camera gains and the exposures they imply: one factor per channel, applied to linear light before the sRGB curve.
 
-On the curve's power part, s = 1.055 L^(1/2.4) − 0.055, a gain γ of light makes of a value s the value
-a s + 0.055 (a − 1) with a = γ^(1/2.4): s + 0.055 is multiplied by a. So a camera's a is read off its picture: the
-median over pixels of (picture + 0.055) / (rendering + 0.055).
+On the power segment of the sRGB curve, s = 1.055 L^(1/2.4) − 0.055, scaling the light by γ maps a value s to
+a s + 0.055 (a − 1) with a = γ^(1/2.4). In other words, s + 0.055 is multiplied by a. The gain a of a camera is
+therefore the median over pixels of (picture + 0.055) / (rendering + 0.055).
 """
 
 from __future__ import annotations
@@ -15,28 +15,28 @@ from numpy.typing import NDArray
 Array = NDArray[np.float32]
 
 FOOT = np.float32(0.055)
-"""Of the sRGB curve, see above."""
+"""Offset of the sRGB curve's power segment, see above."""
 MIDDLE = np.float32(0.5)
-"""Value, 0…1, at which a gain and an offset, as frame 0 has them, are taken for one number."""
+"""Value in 0…1 at which a gain and offset, as estimated in frame 0, are converted to a single gain."""
 LOOKED_AT = 4096
-"""Pixels of a picture that are looked at, about: rows and columns apart; the median of more is the same."""
+"""Approximate number of pixels sampled per picture on a regular grid; more pixels do not change the median."""
 DARK, SATURATED = 0.05, 0.985
-"""Values, 0…1, between which a pixel measures a gain: darker ones are on the curve's straight part, and noise."""
+"""Range of values in 0…1 that are used for measuring a gain; darker pixels are noisy and on the linear segment."""
 PIXELS = 100
-"""Such pixels, at least; else the camera's gain stays."""
+"""Minimum number of usable pixels per channel; with fewer, the camera's gain is left unchanged."""
 SHARE = 0.5
-"""Of the way to what a round over the cameras measures, that the gains take: an update of 100 iterations has three to
-eight rounds, so they have followed a drift at its end, and a round that measures something that moved does little."""
+"""Fraction of the difference to the measured gains that is applied per round over the cameras. An update of 100
+iterations has three to eight rounds, enough to follow a drift, while a single outlier round has little effect."""
 LARGEST = 2.0
-"""Of a gain's a, and the inverse the smallest: 5 times the light; more is a camera that shows something else."""
+"""Upper bound of a gain a, and inverse of the lower bound; 2 corresponds to 5 times the light."""
 CAMERAS = 4
-"""Cameras at least, for gains that differ from colours which few cameras see."""
+"""Minimum number of measured cameras; with fewer, gains cannot be told apart from colours that few cameras see."""
 ENOUGH = 0.5
-"""Share of the rig's cameras from which a frame teaches gains: between a few, each one's faults pass for gains."""
+"""Minimum share of the rig's cameras in a frame for updating gains; with few cameras, local errors bias the gains."""
 
 
 def gain_to_exposure(gain: Array) -> Array:
-    """[3, 2] gain and offset of a picture's values, for the a of each channel [3].
+    """Converts a gain per channel [3] to the gain and offset [3, 2] of a picture's values.
 
     >>> gain_to_exposure(np.ones(3, np.float32))[0]
     array([1., 0.], dtype=float32)
@@ -45,13 +45,13 @@ def gain_to_exposure(gain: Array) -> Array:
 
 
 def exposure_to_gain(exposure: Array) -> Array:
-    """[3] the a that does to the middle value what a gain and an offset [3 or more, 2] do."""
+    """Returns the gain [3] that has the same effect on ``MIDDLE`` as a gain and offset [3 or more, 2]."""
     gain: Array = (exposure[:3, 0] * MIDDLE + exposure[:3, 1] + FOOT) / (MIDDLE + FOOT)
     return gain
 
 
 def measured_gain(picture: Array, shown: Array) -> Array:
-    """[3] the a of each channel of a picture against its rendering without exposure, both [3, H, W]; NaN: unknown."""
+    """Returns the gain [3] of a picture relative to its rendering without exposure, both [3, H, W]; NaN if unknown."""
     gain = np.full(3, np.nan, np.float32)
     every = max(1, int(sqrt(picture[0].size / LOOKED_AT)))
     for channel in range(3):
@@ -63,12 +63,13 @@ def measured_gain(picture: Array, shown: Array) -> Array:
 
 
 def update_gains(gains: Array, measured: dict[int, Array], cameras: int) -> Array | None:
-    """The gains after a round over the cameras; None: the round teaches nothing.
+    """Returns the gains after a round over the cameras, or None if the round has too few measurements.
 
-    They take ``SHARE`` of the way. Their mean logarithm stays: what all cameras share is light.
+    The gains move by ``SHARE`` of the measured difference. Their mean logarithm is preserved, because a change that
+    all cameras share is a change of the light.
 
     Args:
-        gains: [cameras of the rig, 3]. measured: by row of ``gains``, see ``measured_gain``.
+        gains: [cameras of the rig, 3]. measured: result of ``measured_gain`` by row of ``gains``.
         cameras: number of cameras that take part in the frame.
     """
     rows = [row for row, gain in measured.items() if np.isfinite(gain).all()]

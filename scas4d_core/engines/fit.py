@@ -1,11 +1,11 @@
-"""The interface between the loop of a fit and the device that computes it, and the values that cross it.
+"""Interface between the loop of a fit and the device that computes it, and the values that cross it.
 
-The loop (``fit.gaussian_fit``) decides; an engine computes. ``choose.fit_engine_of`` makes an engine::
+The loop (``fit.gaussian_fit``) decides, an engine computes. ``choose.fit_engine_of`` creates an engine::
 
-    engine.load_views(views, fixed)      # pictures, and the Gaussians that stay fixed in each
-    engine.load_table(table)             # parameters and moments; again whenever the host has changed them
-    engine.iterate(view, scalars)        # activate, render, compare, backward, Adam: once an iteration
-    engine.table(), engine.state()       # what was fitted
+        engine.load_views(views, fixed)      # pictures, and the Gaussians that stay fixed in each
+        engine.load_table(table)             # parameters and moments; repeat whenever the host has changed them
+        engine.iterate(view, scalars)        # activate, render, compare, backward, Adam: once per iteration
+        engine.table(), engine.state()       # the fitted parameters and Gaussians
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ Array = NDArray[np.float32]
 MEAN, QUATERNION, SCALE, OPACITY, COLOUR, LABEL = (
     slice(0, 3), slice(3, 7), slice(7, 10), slice(10, 11), slice(11, 14), slice(14, 15)
 )  # fmt: skip
-"""Columns of the table of parameters: metres, quaternion, log metres, logit, RGB in 0…1, logit."""
+"""Columns of the parameter table: metres, quaternion, log metres, logit, RGB in 0…1, logit."""
 COLUMNS = 15
 
 
 @dataclass(eq=False)
 class RenderingStatistics:
-    """Sums over the renderings since the last change of rows, for each Gaussian; density control reads them.
+    """Per-Gaussian sums over the renderings since rows last changed, used for density control.
 
     Attributes:
-        screen_gradients: [N] sum of the lengths of the screen gradients, per half picture. rendered: [N] times it was
-            in a picture.
-        factors: [N, 3, 3] as the last iteration rendered them, before its step.
+        screen_gradients: [N] sum of the norms of the screen-space gradients, in units of half the picture's size.
+        rendered: [N] number of renderings that contained the Gaussian.
+        factors: [N, 3, 3] as rendered by the last iteration, before its step.
     """
 
     screen_gradients: NDArray[np.float64]
@@ -46,32 +46,32 @@ class RenderingStatistics:
 
     @classmethod
     def empty(cls, count: int) -> RenderingStatistics:
-        """Before any rendering."""
+        """Returns zero statistics for a number of Gaussians."""
         return cls(np.zeros(count), np.zeros(count, np.int64), np.zeros((count, 3, 3), np.float32))
 
 
 class FitGloss(Protocol):
-    """Gloss of the fitted Gaussians and their environment, as one kind of engine learns them.
+    """Gloss and environment of the fitted Gaussians, as learned by one type of engine.
 
     Attributes:
-        gloss: [N, 3] normals times strengths. environment: see ``Gaussians``.
+            gloss: [N, 3] normals times strengths. environment: see ``Gaussians``.
     """
 
     gloss: Array
     environment: Array
 
     def select_rows(self, rows: NDArray[np.int64], parents: NDArray[np.int64]) -> Self:
-        """The same for some rows, with their moments, and for further ones like their parents, without."""
+        """Returns the gloss of some rows with their moments, then copies of the parents' rows with zero moments."""
 
 
 @dataclass(eq=False)
 class FitTable:
-    """The parameters of a fit with their Adam moments.
+    """The parameters of a fit and their Adam moments.
 
     Attributes:
-        parameters, first, second: [N, 15] float32, columns as above. steps: of Adam so far.
-        beta1, beta2: Adam's decays. statistics: None where nobody reads them.
-        gloss: by which colours depend on direction, learnt as well; None: they do not.
+            parameters, first, second: [N, 15] float32, columns as above. steps: number of Adam steps so far.
+            beta1, beta2: Adam's decay rates. statistics: None if they are not needed.
+            gloss: learned direction-dependent part of the colours; None: colours do not depend on direction.
     """
 
     parameters: Array
@@ -85,11 +85,11 @@ class FitTable:
 
 
 class FitScalars(NamedTuple):
-    """Rates of one iteration, and the figures that are asked of it.
+    """Learning rates and options of one iteration.
 
     Attributes:
-        rates: [15] float32, Adam's of each column; a column whose rate is 0 stays.
-        gloss: factor on the rates of the gloss. colour_shift: whether it is measured.
+            rates: [15] float32, Adam learning rate of each column; a column with rate 0 is not updated.
+            gloss: factor on the learning rates of the gloss. colour_shift: whether to measure the colour shift.
     """
 
     rates: Array
@@ -98,12 +98,13 @@ class FitScalars(NamedTuple):
 
 
 class FitLoss(NamedTuple):
-    """The picture of one iteration, before its step.
+    """Losses of the rendering of one iteration, before its step.
 
     Attributes:
-        view: index of the view. loss: weighted sum of image and mask loss. psnr: dB.
-        exposure_gradient: [C, 2] of the loss with respect to the camera's gain and offset; valid until the next one.
-        colour_shift: [3] mean of the picture minus mean of the rendering; None where it was not asked for.
+            view: index of the view. loss: weighted sum of image and mask loss. psnr: dB.
+            exposure_gradient: [C, 2] gradient of the loss with respect to the camera's gain and offset; valid until the
+                next iteration.
+            colour_shift: [3] mean of the picture minus mean of the rendering; None if it was not requested.
     """
 
     view: int
@@ -118,27 +119,27 @@ class FitEngine(Protocol):
 
     @property
     def renderer(self) -> Renderer:
-        """Draws states in the buffers of the iterations."""
+        """Returns the renderer of states, which shares its buffers with the iterations."""
 
     def load_views(self, views: Sequence[TrainingView], fixed: Sequence[Gaussians] = ()) -> None:
-        """Take the pictures of the fit. An iteration reads the exposure that its view has then.
+        """Loads the pictures of the fit. Each iteration reads the current exposure of its view.
 
         Args:
-            fixed: for each view, Gaussians that are drawn with the fitted ones and stay as they are; empty: none.
+            fixed: for each view, Gaussians that are rendered with the fitted ones but not updated; empty: none.
         """
 
     def load_table(self, table: FitTable) -> None:
-        """Take parameters, moments, statistics and gloss.
+        """Loads parameters, moments, statistics and gloss.
 
         Raises:
-            EngineError: the engine cannot learn this gloss.
+                EngineError: if the engine cannot learn this kind of gloss.
         """
 
     def iterate(self, view: int, scalars: FitScalars) -> FitLoss:
-        """One iteration: render a view, compare it with its picture, carry the gradient back, step Adam."""
+        """Runs one iteration: renders a view, compares it with its picture, backpropagates the loss and steps Adam."""
 
     def table(self) -> FitTable:
-        """The table as it is now."""
+        """Returns the current parameter table."""
 
     def state(self) -> Gaussians:
-        """The fitted Gaussians, without the fixed ones; their labels are between 0 and 1."""
+        """Returns the fitted Gaussians without the fixed ones; their labels are between 0 and 1."""

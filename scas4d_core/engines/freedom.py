@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Freedom:
-    """Which columns of the cluster tables and of the per-Gaussian deltas are free. The others stay exactly 0.
+    """Flags for the free columns of the cluster tables and per-Gaussian deltas. All other columns stay exactly 0.
 
     Attributes:
-        cluster_rotation, cluster_translation, cluster_scaling: r, t, c and s of the clusters of all layers.
-        own_position, own_rotation, own_scale: Δp, ΔR, Δs of each Gaussian.
-        prediction: whether the free parameters start from the previous motion instead of 0.
+            cluster_rotation, cluster_translation, cluster_scaling: r, t, and c with s of the clusters of all layers.
+            own_position, own_rotation, own_scale: Δp, ΔR, Δs of each Gaussian.
+            prediction: whether the free parameters are initialized with the previous motion instead of 0.
 
     >>> Freedom(own_scale=True).clusters
     False
@@ -28,5 +28,5 @@ class Freedom:
 
     @property
     def clusters(self) -> bool:
-        """True where anything of the clusters is free."""
+        """Whether any cluster parameter is free."""
         return self.cluster_rotation or self.cluster_translation or self.cluster_scaling

@@ -1,4 +1,4 @@
-"""Gains of the cameras, followed while an update runs: each round over the cameras measures each gain once."""
+"""Estimation of camera gains during an update: each round over the cameras measures every gain once."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ Array = NDArray[np.float32]
 
 
 class GainEstimator:
-    """The gains of an attempt; the views have them as their exposure.
+    """Estimates the camera gains of an attempt and applies them to the exposures of the views.
 
     Args:
-        gains: [cameras, 3] at the start. rows: row of each camera, by name. views: whose exposures are set in place.
+        gains: [cameras, 3] initial gains. rows: row of each camera, by name. views: views whose exposures are set in
+            place.
     """
 
     def __init__(self, gains: Array, rows: Mapping[str, int], views: Sequence[TrainingView]) -> None:
@@ -27,11 +28,11 @@ class GainEstimator:
         self._expose()
 
     def leave_out(self, views: Sequence[TrainingView]) -> None:
-        """These views take no part any more; their exposures stay."""
+        """Excludes views from further rounds; their exposures stay unchanged."""
         self._views = [view for view in self._views if view not in views]
 
     def record_rendering(self, view: TrainingView, shown: Array) -> None:
-        """Measure a camera's gain in its rendering; a camera's second rendering begins a new round.
+        """Measures a camera's gain in its rendering; the second rendering of a camera starts a new round.
 
         Args:
             shown: [3, H, W] rendering without exposure.
@@ -42,7 +43,7 @@ class GainEstimator:
         self._measured[row] = measured_gain(view.target, shown)
 
     def finish_round(self) -> None:
-        """End a round: gains and exposures follow what it measured."""
+        """Ends a round and updates gains and exposures with its measurements."""
         settled = update_gains(self.gains, self._measured, len(self._views))
         if settled is not None:
             self.gains = settled

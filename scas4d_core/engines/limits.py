@@ -1,4 +1,4 @@
-"""Constants of a rasterizer: the end of a Gaussian's support, and the transmittance at which a pixel is finished."""
+"""Constants of a rasterizer: the alpha that bounds a Gaussian's support, and the transmittance that ends a pixel."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from scas4d_core.cameras import Camera, WorldFrame, rig_inside
 
 
 class Limits(NamedTuple):
-    """Constants that two rasterizers must share to agree.
+    """Constants that must be equal for two rasterizers to agree.
 
     Attributes:
-        alpha_floor: a Gaussian covers exactly the pixels where its alpha is at least this; below, 8-bit pictures
-            cannot show it. Culling by this support is exact.
-        alpha_cap: no single Gaussian is opaque; bounds 1/(1 − alpha) in the backward pass.
-        transmittance_stop: a pixel is finished once less light than this would pass.
-        low_pass: pixels², added to the diagonal of the projected covariance: a Gaussian is at least a pixel wide.
-        near: metres; nearer Gaussians are culled.
-        tangent_margin: in units of half the picture's width (height), how far beyond the border x/z (y/z) may lie
-            before the projection's Jacobian is evaluated at the clamped place instead.
+            alpha_floor: a Gaussian covers exactly the pixels where its alpha is at least this value. Smaller alphas are
+                invisible in 8-bit pictures. Culling by this support is exact.
+            alpha_cap: upper bound of a Gaussian's alpha; it bounds 1/(1 − alpha) in the backward pass.
+            transmittance_stop: a pixel is finished when its transmittance would fall below this value.
+            low_pass: pixels², added to the diagonal of the projected covariance, so that a Gaussian covers a pixel.
+            near: metres; Gaussians closer than this are culled.
+            tangent_margin: how far x/z (y/z) may lie beyond the picture's border before the projection's Jacobian is
+                evaluated at a clamped position; in units of half the picture's width (height).
     """
 
     alpha_floor: float = guards.ALPHA_FLOOR
@@ -32,11 +32,11 @@ class Limits(NamedTuple):
 
 
 NEAR_SHARE = 0.1
-"""Near plane as a share of the rig's radius, where the scene gives none."""
+"""Near plane as a share of the rig's radius, used if the scene does not define one."""
 
 
 def scene_limits(near: float | str, rig_radius: float) -> Limits:
-    """The rasterizer's constants for one scene.
+    """Returns the rasterizer constants for one scene.
 
     Args:
         near: metres, or "auto" for ``NEAR_SHARE`` of the rig's radius.
@@ -54,7 +54,7 @@ def scene_limits(near: float | str, rig_radius: float) -> Limits:
 
 
 def rig_limits(near: float | str, world: WorldFrame, cameras: Sequence[Camera]) -> Limits:
-    """The rasterizer's constants for a scene, by its cameras in the user's world; see ``scene_limits``.
+    """Returns the rasterizer constants for a scene from its cameras in the user's world; see ``scene_limits``.
 
     >>> import numpy as np
     >>> camera = Camera("front", [[100, 0, 32], [0, 100, 24], [0, 0, 1]], np.eye(4), 64, 48)

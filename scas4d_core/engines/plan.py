@@ -1,4 +1,4 @@
-"""The plan of a scene's updates: values alone, filled in by the effects when they register."""
+"""Plan of a scene's updates: plain values that the effects fill in when they register."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ Array = NDArray[np.float32]
 Plane = tuple[float, float, float, float]
 
 MAX_SCALE = 0.02
-"""Metres; a longer axis is limited to its length in frame 0 (paper, scale loss)."""
+"""Metres; the scale loss limits axes longer than this to their length in frame 0 (paper, scale loss)."""
 
 
 @dataclass(eq=False)
 class ColourPlan:
-    """The colours that an update learns.
+    """Selects which colours an update learns.
 
     Attributes:
-        moving: colours of the moving Gaussians are free. static: those of the static ones are free.
-        changing_light: the light changes, so colours learn faster (``effects.appearance.light``).
+            moving, static: whether the colours of the moving and of the static Gaussians are free.
+            changing_light: whether the light changes, so that colours learn faster (``effects.appearance.light``).
     """
 
     moving: bool = False
@@ -38,28 +38,29 @@ class ColourPlan:
 
 @dataclass(eq=False)
 class UpdatePlan:
-    """The terms, parameters and options of a scene's updates.
+    """The loss terms, parameters and options of a scene's updates.
 
-    A term that no effect asked for does not exist in the engine: its weight is 0, its value None.
+    A term that no effect requests is not computed: its weight is 0 or its value is None.
 
     Attributes:
-        cameras: names of the rig's cameras, in the rig's order.
-        background: RGB in 0…1 behind every Gaussian. limits: constants of the rasterizer.
-        cluster_map, covariance: forms of equations (6) and (5), see ``engines.torch.deformation``.
-        image, soft_colour: weights of the image loss and of the mean absolute change of colours.
-        mask: weight of the mask loss. axis_length: weight of the limit of axis lengths, equation (8).
-        neighbour_terms: whether any effect asked for terms between neighbours.
-        rigidity, isometry, rotation: weights of these terms.
-        rigidity_fades: whether the weight of rigidity falls to 0 along an update (``effects.coherence.bending``).
-        floor: plane (a, b, c, d) in metres of the inside world; a·x + b·y + c·z + d > 0 is below the floor.
-        floor_weight: weight of the mean depth below it.
-        freedom: the parameters of the deformation that are free.
-        colours: the colours that are learnt; None: none.
-        gloss: whether gloss and environment are learnt (``effects.appearance.direction``).
-        camera_gains: whether gains of the cameras are followed (``effects.appearance.camera_gain``).
-        full_images: whether every pixel can change; else only pixels that moving Gaussians reach.
-        disables_skip: whether an effect learns from frames that Θ_{t−1} already shows well enough.
-        learns_labels: whether moving Gaussians are found from motion where no masks are given.
+            cameras: names of the rig's cameras, in the rig's order.
+            background: RGB in 0…1 behind all Gaussians. limits: constants of the rasterizer.
+            cluster_map, covariance: variants of equations (6) and (5), see ``engines.torch.deformation``.
+            image, soft_colour: weights of the image loss and of the mean absolute change of colours.
+            mask: weight of the mask loss. axis_length: weight of the scale loss, equation (8).
+            neighbour_terms: whether any effect requests terms between neighbours.
+            rigidity, isometry, rotation: weights of the neighbour terms.
+            rigidity_fades: whether the weight of rigidity decays to 0 during an update (``effects.coherence.bending``).
+            floor: plane (a, b, c, d) in metres of the internal world; a·x + b·y + c·z + d > 0 is below the floor.
+            floor_weight: weight of the mean depth below the floor.
+            freedom: the free parameters of the deformation.
+            colours: the colours to learn; None: none.
+            gloss: whether gloss and environment are learned (``effects.appearance.direction``).
+            camera_gains: whether camera gains are estimated (``effects.appearance.camera_gain``).
+            full_images: whether every pixel can change; otherwise only pixels that moving Gaussians reach.
+            disables_skip: whether frames that Θ_{t−1} already reproduces well are updated too, because an effect learns
+                from them.
+            learns_labels: whether moving Gaussians are detected from motion if no masks are given.
     """
 
     cameras: tuple[str, ...]
@@ -87,7 +88,7 @@ class UpdatePlan:
     learns_labels: bool = False
 
     def learns_colours(self) -> ColourPlan:
-        """The plan of the colours; made with the first effect that asks for it."""
+        """Returns the plan of the colours, and creates it on the first call."""
         if self.colours is None:
             self.colours = ColourPlan()
         return self.colours
@@ -95,12 +96,12 @@ class UpdatePlan:
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """What an update deforms: the clusters and neighbours of the moving Gaussians.
+    """The clusters and neighbours of the moving Gaussians, which an update deforms.
 
     Attributes:
-        hierarchy: clusters of the M moving Gaussians. neighbours: graph over them; None: no term needs one.
-        roots: [N, 3] metres, places of all Gaussians in frame 0.
-        first_lengths: [M, 3] metres, axis lengths of the moving Gaussians in frame 0.
+            hierarchy: clusters of the M moving Gaussians. neighbours: neighbour graph; None if no term needs it.
+            roots: [N, 3] metres, positions of all Gaussians in frame 0.
+            first_lengths: [M, 3] metres, axis lengths of the moving Gaussians in frame 0.
     """
 
     hierarchy: Hierarchy
@@ -110,6 +111,6 @@ class Structure:
 
     @property
     def length_bounds(self) -> Array:
-        """[M, 3] metres, the length that each axis may have before the scale loss acts."""
+        """[M, 3] metres, the length above which the scale loss penalizes each axis."""
         bounds: Array = np.maximum(self.first_lengths, np.float32(MAX_SCALE))
         return bounds

@@ -1,4 +1,4 @@
-"""The interface of everything that draws a state outside an iteration: checks, births, frame 0, views of clients."""
+"""Interface for all rendering outside an iteration: checks, births, frame 0 and client views."""
 
 from __future__ import annotations
 
@@ -14,16 +14,17 @@ Array = NDArray[np.float32]
 
 
 CHANNELS = 4
-"""Red, green, blue, label; features are drawn so many at a time."""
+"""Number of features rendered per pass: red, green, blue, label."""
 BLOCK = 4
-"""Pixels of the side of a block, see ``Renderer.reached``."""
+"""Side of a block in pixels, see ``Renderer.reached``."""
 
 
 class Picture(NamedTuple):
-    """A rendered picture; it may lie in a buffer of the renderer, valid until its next call.
+    """A rendered picture. It may share a buffer of the renderer, which the next call overwrites.
 
     Attributes:
-        features: [C, H, W] float32, before the camera's exposure. transmittance: [H, W] float32, transmittance left.
+            features: [C, H, W] float32, before the camera's exposure.
+        transmittance: [H, W] float32, remaining transmittance.
     """
 
     features: Array
@@ -31,11 +32,11 @@ class Picture(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """A state compared with the picture of a view.
+    """Comparison of a rendered state with the picture of a view.
 
     Attributes:
         psnr: dB. image_loss: 0.8 L1 + 0.2 (1 − SSIM), weighted.
-        colour_shift: [3] mean of the picture minus mean of the rendering, RGB in 0…1, exposure included.
+            colour_shift: [3] mean of the picture minus mean of the rendering, RGB in 0…1, with exposure applied.
     """
 
     psnr: float
@@ -44,11 +45,11 @@ class Comparison(NamedTuple):
 
 
 class Gradients(NamedTuple):
-    """Gradients of a loss with respect to what was drawn; buffers of the renderer, valid until its next call.
+    """Gradients of a loss with respect to the renderer's inputs; the next call overwrites these buffers.
 
     Attributes:
-        means: [N, 3]. factors: [N, 3, 3]. opacities: [N]. features: [N, C]. screen: [N, 2] of the projected means.
-            Gaussians that are not drawn have 0.
+            means: [N, 3]. factors: [N, 3, 3]. opacities: [N]. features: [N, C]. screen: [N, 2] for the projected means.
+                Gaussians that are not rendered have gradient 0.
     """
 
     means: Array
@@ -59,10 +60,10 @@ class Gradients(NamedTuple):
 
 
 class Renderer(Protocol):
-    """Draws states of one scene, with its background and limits.
+    """Renders states of one scene, with its background and limits.
 
-    Colours are those that the camera sees: gloss is part of a state. ``features`` [N, C], where given, are drawn
-    instead; C is a multiple of ``CHANNELS``.
+    Colours are those that the camera sees, gloss included. If ``features`` [N, C] are given, they are rendered instead;
+    C is a multiple of ``CHANNELS``.
     """
 
     def render(
@@ -74,34 +75,35 @@ class Renderer(Protocol):
         depth_channel: int = -1,
         background: Array | None = None,
     ) -> Picture:
-        """RGB and label of a state as a camera sees it, without the camera's exposure.
+        """Renders RGB and label of a state as a camera sees it, without the camera's exposure.
 
         Args:
-            features: [N, C] drawn instead of RGB and label.
-            depth_channel: channel of ``features`` that is filled with the depth of the centres (metres along z).
-            background: [C] float32 behind every Gaussian; None: the scene's, and 0 in further channels.
+                features: [N, C] features to render instead of RGB and label.
+                depth_channel: channel of ``features`` to overwrite with the depth of the centres (metres along z).
+                background: [C] float32 behind all Gaussians; None: the scene's background, and 0 in further channels.
         """
 
     def compare(self, state: Gaussians, view: TrainingView, features: Array | None = None) -> Comparison:
-        """The state beside the picture of a view; see ``render``."""
+        """Renders a state and compares it with the picture of a view; see ``render``."""
 
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
-        """[N, P] sums of planes [P, H, W], P up to 4, over the pixels, by each Gaussian's blending weight.
+        """Returns the [N, P] sums over pixels of planes [P, H, W], weighted by each Gaussian's blending weights; P ≤ 4.
 
-        A plane of ones gives the pixels' worth that each Gaussian covers.
+        A plane of ones gives the number of pixels that each Gaussian covers.
         """
 
     def residuals(
         self, state: Gaussians, view: TrainingView, learnt: NDArray[np.uint8], most: float
     ) -> tuple[Array, Array]:
-        """Sums over the pixels of picture minus rendering, and of 1, by each Gaussian's blending weight.
+        """Returns the residual (picture minus rendering) summed over pixels with each Gaussian's blending weights.
 
         Args:
-            learnt: [N] 1 for the Gaussians whose sums are asked for. most: RGB in 0…1 to which a pixel is clipped.
+            learnt: [N] 1 for the Gaussians whose sums are needed.
+            most: limit to which residuals are clipped, RGB in 0…1.
 
         Returns:
-            [N, 3] RGB in pixels' worth, without the camera's exposure, and [N] pixels' worth.
+            [N, 3] weighted RGB sums without the camera's exposure, and [N] sums of the weights (pixels).
         """
 
     def reached(self, state: Gaussians, rows: NDArray[np.int64], camera: CameraArrays) -> NDArray[np.bool_]:
-        """[h, w] bool, blocks of ``BLOCK`` pixels a side that the supports of some Gaussians meet; padded."""
+        """Returns a padded [h, w] bool grid of the ``BLOCK``-pixel blocks that the rows' supports intersect."""

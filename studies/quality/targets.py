@@ -73,7 +73,8 @@ TARGETS: tuple[Target, ...] = (
         over=("dynamic3dgs",),
     ),
     Target(
-        "scas4d, 100 iterations − dynamic3dgs, 2000", "scas4d", "psnr", ("robot",), ">", 0.0, over=("dynamic3dgs-2000",),
+        "scas4d, 100 iterations − dynamic3dgs, 2000",
+        "scas4d", "psnr", ("robot",), ">", 0.0, over=("dynamic3dgs-2000",),
     ),
     Target(
         "scas4d, 100 iterations − dynamic3dgs, 2000",

@@ -124,7 +124,7 @@ def test_a_gaussian_is_followed_and_trails_are_drawn(offline, player):
     assert differ(before, after)
     assert (canvas(offline, "overlay")[..., 3] > 0).sum() > 50  # its track
     offline.mouse.click(box["x"] + 4, box["y"] + 4)
-    until(offline, "document.getElementById('note').innerText.includes('nothing at that place')")
+    until(offline, "document.getElementById('note').innerText.includes('nothing at that point')")
     offline.focus("#overlay")
     offline.keyboard.press("Escape")
     assert offline.locator("#followed").is_hidden()

@@ -17,7 +17,7 @@ GROUPED = """async () => {
   const points = [[90, 1000, 3], [110, 1010, 4], [200, 2000, 2]].map(([iterations, milliseconds, frames]) =>
     ({ ...point, iterations, milliseconds, frames }));
   const effective = { iterations: 100, budget_ms: 1000 };
-  panel.show({ points, model: null, replay: { state: "none" } }, { asked: effective, effective, since: 1 });
+  panel.show({ points, model: null, replay: { state: "none" } }, { requested: effective, effective, since: 1 });
 }"""
 """Draws points that a fake cannot have run: of two that took as long, and one that took longer."""
 
@@ -64,7 +64,7 @@ def test_a_budget_that_is_moved_holds_from_the_next_frame_on(page, service, ran)
     page.focus("#budget")
     page.keyboard.press("End")
     until(page, "document.getElementById('budget-words').innerText.includes('1000 iterations a frame, from frame 9')")
-    assert sdk.budget(id).asked == Budget(iterations=1000)
+    assert sdk.budget(id).requested == Budget(iterations=1000)
     assert text(page, "budget-effect").startswith("No frame since")
     push(sdk, id, 9)
     until(page, "document.querySelectorAll('#seconds .change').length === 2")
@@ -73,10 +73,10 @@ def test_a_budget_that_is_moved_holds_from_the_next_frame_on(page, service, ran)
     page.focus("#budget")
     page.keyboard.press("Home")
     until(page, "document.getElementById('budget-words').innerText.includes('as fit into 20 ms')")
-    assert sdk.budget(id).asked == Budget(budget_ms=20)
+    assert sdk.budget(id).requested == Budget(budget_ms=20)
     page.select_option("#budget-kind", "")
     until(page, "document.getElementById('budget-words').innerText.includes('as the scene was created')")
-    assert sdk.budget(id).asked == Budget()
+    assert sdk.budget(id).requested == Budget()
     assert page.faults == []
 
 

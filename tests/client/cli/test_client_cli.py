@@ -100,7 +100,7 @@ def test_a_link_is_printed(tmp_path):
         reader = scas4d(*given, "--only-token").stdout.strip()
         with Client(running.url, token=reader) as client:
             assert client.scenes() == []
-            with pytest.raises(ServiceError, match="may only read"):
+            with pytest.raises(ServiceError, match="is read-only"):
                 client.create_scene(make_rig())
     finally:
         running.stop()
