@@ -141,8 +141,8 @@ def _still(source: Path, name: str, views: Sequence[CalibratedImage]) -> LensCam
             if old.shape != new.shape or np.abs(new - old).max() > STATIC_TOLERANCE * max(1.0, np.abs(old).max()):
                 raise CaptureError(
                     f"{source}: camera {name!r} has another {field} in {view.path} than in {views[0].path}; a rig's "
-                    "cameras must stand still: calibrate with one picture a camera, or put each camera's pictures "
-                    "into a folder of its own"
+                    "cameras must not move: calibrate with one picture per camera, or put each camera's pictures into "
+                    "a separate folder"
                 )
     return LensCamera(
         name, first.model, first.intrinsics, first.distortion, first.world_to_camera, first.width, first.height

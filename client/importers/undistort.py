@@ -170,9 +170,8 @@ def _within(lens: LensCamera, curve: DistortionCurve, k: Float) -> _View:
         k[0, 0], k[1, 1] = NARROWING * k[0, 0], NARROWING * k[1, 1]
     if kept < LEAST_KEPT:
         raise CaptureError(
-            f"camera {lens.name!r}: its distortion ({_listed(lens)}) turns back within the picture, and no more than "
-            f"{kept:.0%} of the picture could be undone; calibrate with points out to the corners, or with another "
-            "model"
+            f"camera {lens.name!r}: its distortion ({_listed(lens)}) folds within the picture, and only {kept:.0%} "
+            "of the picture could be undistorted; calibrate with points up to the corners, or with another model"
         )
     return _View(k, kept)
 

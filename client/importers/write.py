@@ -87,8 +87,8 @@ def _rate(source: Capture, count: int) -> float:
     off = np.abs(times - times[0] - np.arange(count) / fps) * fps
     if off.max() > UNEVEN:
         raise CaptureError(
-            f"{source.name}: frame {int(off.argmax())} is {off.max():.2g} frames off an even rate of {fps:.5g} a "
-            "second, and this layout has no times; leave import out: every command reads the capture as it is"
+            f"{source.name}: frame {int(off.argmax())} is {off.max():.2g} frames off a constant rate of {fps:.5g} "
+            "per second, and this layout has no times; skip the import: every command reads the original capture"
         )
     return fps
 

@@ -32,8 +32,8 @@ def check_labels(labels: dict[str, str]) -> dict[str, str]:
             if re.fullmatch(pattern, text) is None:
                 raise InputError(
                     f"{text[:80]!r} cannot be the {what} of a node's label",
-                    "write names and values of 1 to 63 letters, digits, dots, dashes and underscores, of which the "
-                    "first and the last are letters or digits; a name may have one slash, as studio.example/rig",
+                    "write names and values of 1 to 63 letters, digits, dots, dashes and underscores, starting and "
+                    "ending with a letter or digit; a name may have one slash, such as studio.example/rig",
                 )
     return labels
 

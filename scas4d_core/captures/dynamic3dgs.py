@@ -248,7 +248,7 @@ def _read_points(path: Path) -> InitialPoints | None:
     if shown.min() < -1e-3 or shown.max() > 1 + 1e-3:
         raise CaptureError(
             f"{path}: colours and foreground must be in 0…1; found {shown.min():g}…{shown.max():g}; "
-            "divide by 255 what is in 0…255"
+            "divide values in 0…255 by 255"
         )
     shown = np.clip(shown, 0, 1).astype(np.float32)
     foreground = shown[:, 3] if shown.shape[1] == 4 else None

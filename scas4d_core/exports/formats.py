@@ -206,11 +206,11 @@ def check_suffix(path: Path, format: Format) -> None:
 
     >>> check_suffix(Path("a.txt"), FORMATS["tracks"])
     Traceback (most recent call last):
-    scas4d_core.errors.InputError: out 'a.txt' is no name of a file for format 'tracks'; let it end in .csv
+    scas4d_core.errors.InputError: out 'a.txt' is not a file name for format 'tracks'; let it end in .csv
     """
     if path.suffix.lower() not in format.suffixes:
         raise InputError(
-            f"out {str(path)!r} is no name of a file for format {format.name!r}",
+            f"out {str(path)!r} is not a file name for format {format.name!r}",
             f"let it end in {' or '.join(format.suffixes)}",
         )
 

@@ -70,8 +70,8 @@ class Membership:
                 if self._address is None:
                     raise _no_cluster_error("on this machine", error) from None
                 raise RuntimeError(
-                    f"the Ray cluster at {self._address} cannot be joined ({error}); this machine needs a node of it "
-                    "(`ray start --address`), and, where it asks for a token, RAY_AUTH_MODE=token and that token"
+                    f"the Ray cluster at {self._address} cannot be joined ({error}); start a node on this machine "
+                    "(`ray start --address`) and, if the cluster uses a token, set RAY_AUTH_MODE=token"
                 ) from None
 
     async def watch(self, on_loss: Callable[[], Awaitable[None]], on_return: Callable[[], Awaitable[None]]) -> None:
@@ -120,8 +120,8 @@ class Membership:
             if not self._silent:
                 self._silent = True
                 log.warning(
-                    "the head of the Ray cluster is silent: frames go on, and nothing is placed; if Redis does not "
-                    "keep what it knew, Ray ends this process after a minute"
+                    "the head of the Ray cluster does not respond: frames continue, but no process is placed; without "
+                    "Redis, Ray ends this process after a minute"
                 )
             await asyncio.wait({answer})  # at most one pending request
         if answer.exception() is not None:

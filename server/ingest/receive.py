@@ -176,7 +176,7 @@ async def read_framed(
                 receiving = begin(head)
             if len(view) > receiving.missing:
                 over = len(view) - receiving.missing
-                raise FramingError(f"goes on for {over} or more bytes after its files", "send none there")
+                raise FramingError(f"continues for {over} or more bytes after its files", "send none there")
             await receiving.take(view)
         if head is None or receiving is None:
             raise FramingError(f"ends after {len(start)} bytes, within its head", "send the whole frame")

@@ -175,7 +175,7 @@ def test_a_lens_that_rises_everywhere_is_not_cut(model):
     ("model", "changes"), [("SIMPLE_RADIAL", {"k1": -0.9}), ("FULL_OPENCV", {"k4": 9.0, "k5": 40.0})]
 )
 def test_a_lens_of_which_little_is_left_is_refused(model, changes):
-    with pytest.raises(CaptureError, match=r"'c0': its distortion .* turns back .* no more than \d+% .* calibrate"):
+    with pytest.raises(CaptureError, match=r"'c0': its distortion .* folds .* only \d+% .* calibrate"):
         _ = Undistorter(camera(model, **changes)).camera
 
 

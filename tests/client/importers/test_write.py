@@ -136,7 +136,7 @@ def test_times_become_the_rate_or_are_refused(tmp_path, times, fps):
             Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "studio/images" / name / f"{t}.png")
     source = open_source(tmp_path / "studio")
     if fps is None:
-        with pytest.raises(CaptureError, match=r"frame 1 is .* off an even rate"):
+        with pytest.raises(CaptureError, match=r"frame 1 is .* off a constant rate"):
             write_dynamic3dgs(source, tmp_path / "out")
         assert not (tmp_path / "out").exists()
     else:

@@ -155,7 +155,7 @@ def test_what_is_refused(tmp_path):
     for format in ("glb-parts", "poses"):
         with pytest.raises(InputError, match=f"parts is None, but format '{format}' requires parts; give one label"):
             export_sequence(states(), format, tmp_path / "a.glb", world=corner.WORLD)
-    with pytest.raises(InputError, match=r"out '.*a\.glb' is no name of a file for format 'usd'; let it end in \.usdc"):
+    with pytest.raises(InputError, match=r"out '.*a\.glb' is not a file name for format 'usd'; let it end in \.usdc"):
         exported(tmp_path / "a.glb", "usd")
     with pytest.raises(InputError, match=r"frames_per_second is 0; give a positive number, or None"):
         exported(tmp_path / "a.usda", "usd", frames_per_second=0)

@@ -127,5 +127,5 @@ def test_a_camera_of_several_pictures_must_stand_still(tmp_path):
     rig = lenses()
     moved = {f"cam1/{name}": lens for name, lens in rig.items()} | {"cam2/a": rig["cam2"]}
     model(moved, tmp_path, "OPENCV", True)
-    with pytest.raises(CaptureError, match=r"camera 'cam1' has another world_to_camera.*one picture a camera"):
+    with pytest.raises(CaptureError, match=r"camera 'cam1' has another world_to_camera.*one picture per camera"):
         read_colmap(tmp_path)
