@@ -14,7 +14,7 @@ MAX_CAMERAS = 512
 MAX_PIXELS_A_SIDE = 16_384
 MAX_LABELS = 16
 LABEL_WORD = r"[A-Za-z0-9](?:[A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?"
-"""The value of a label, and each side of the slash in its name, as Ray and Kubernetes take them."""
+"""Pattern of a label's value and of both parts of its name around the slash, as accepted by Ray and Kubernetes."""
 
 CameraName = Annotated[
     str,
@@ -26,7 +26,7 @@ CameraName = Annotated[
 
 
 def check_labels(labels: dict[str, str]) -> dict[str, str]:
-    """Raises an InputError for an invalid node label."""
+    """Raises an `InputError` for an invalid node label; otherwise returns the labels."""
     for name, value in labels.items():
         for what, text, pattern in (("name", name, f"(?:{LABEL_WORD}/)?{LABEL_WORD}"), ("value", value, LABEL_WORD)):
             if re.fullmatch(pattern, text) is None:
@@ -39,13 +39,13 @@ def check_labels(labels: dict[str, str]) -> dict[str, str]:
 
 
 Labels = Annotated[dict[str, str], Field(max_length=MAX_LABELS), AfterValidator(check_labels)]
-"""Labels of nodes, by name."""
+"""Node labels: values by name."""
 Row3 = Annotated[list[FiniteFloat], Field(min_length=3, max_length=3)]
 Row4 = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
 Pixel = Annotated[list[FiniteFloat], Field(min_length=2, max_length=2)]
 
 
 class Model(BaseModel):
-    """Base of the wire models. Unknown fields are errors, so that misspelt ones are noticed."""
+    """Base of the wire models. Unknown fields are errors, so that misspelled names are detected."""
 
     model_config = ConfigDict(extra="forbid")

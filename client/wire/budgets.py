@@ -15,7 +15,7 @@ Iterations = Annotated[int, Field(strict=True, ge=1, le=MOST_ITERATIONS)]
 
 
 class Budget(Model):
-    """Limits of a scene's updates. Null fields take the scene's settings."""
+    """Limits of a scene's updates. Null fields default to the scene's settings."""
 
     iterations: Iterations | None = Field(
         default=None, description="Iterations per frame; see the setting `update.iterations`."
@@ -55,7 +55,7 @@ class Budget(Model):
 
 
 class BudgetFields(TypedDict, total=False):
-    """Fields of `Budget` as keyword arguments. Omitted fields take the scene's settings."""
+    """Fields of `Budget` as keyword arguments. Omitted fields default to the scene's settings."""
 
     iterations: int | None
     budget_ms: float | None

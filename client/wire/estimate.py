@@ -1,4 +1,4 @@
-"""Estimated memory and disk of a scene."""
+"""Wire model of a scene's estimated memory and disk usage."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from client.wire.base import Model
 
 
 class SceneEstimate(Model):
-    """Estimated memory and disk in MB (10⁶ bytes); `docs/operations.md` has the formula."""
+    """Estimated memory and disk usage in MB (10⁶ bytes); `docs/operations.md` documents the formula."""
 
     pixels: int = Field(description="Pixels of all cameras together, as sent.")
     scaled_pixels: int = Field(description="Pixels of all cameras after `settings.scene.image_scale`.")

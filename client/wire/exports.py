@@ -16,7 +16,7 @@ LARGEST_ID = 2**63 - 1
 LAST_FRAME = 1_000_000_000
 
 ExportFormat = Literal["ply", "splat", "spz", "spz4", "glb", "glb-parts", "usd", "tracks", "poses", "s4d"]
-"""Names of `scas4d_core.exports.FORMATS`, which neither the service nor the page imports."""
+"""Names of the formats in `scas4d_core.exports.FORMATS`, repeated here to avoid that import."""
 SUFFIXES: Mapping[str, str] = MappingProxyType(
     {
         **dict.fromkeys(("ply", "splat", "spz", "spz4", "glb"), ".zip"),
@@ -27,7 +27,7 @@ SUFFIXES: Mapping[str, str] = MappingProxyType(
         "s4d": ".s4d",
     }
 )
-"""Suffix of the file by format; numbered files come in one .zip."""
+"""File suffix of each format; numbered files are packed into one .zip."""
 FrameNumber = Annotated[int, Field(strict=True, ge=0, le=LAST_FRAME)]
 
 
@@ -42,7 +42,7 @@ class ExportState(StrEnum):
 
 
 class ExportRequest(Model):
-    """A request to export a range of committed frames (docs/exports.md)."""
+    """A request to export a range of committed frames (see docs/exports.md)."""
 
     format: ExportFormat = Field(description="The format; docs/exports.md lists what each contains and loses.")
     first: FrameNumber | None = Field(default=None, description="First frame; null: the first committed frame.")
@@ -53,7 +53,7 @@ class ExportRequest(Model):
 
 
 class ExportModel(Model):
-    """An export. The service keeps it until it is removed, it expires, or the service stops."""
+    """An export. The service keeps it until it is deleted, it expires, or the service stops."""
 
     id: str
     scene: str

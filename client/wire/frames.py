@@ -22,7 +22,7 @@ class FrameReceipt(Model):
 
 
 class CameraReceipt(Model):
-    """Confirms that one camera's files are on disk. Repeating them returns it with the current cameras."""
+    """Confirms that one camera's files are on disk. Repeating the request returns it with the current cameras."""
 
     scene: str
     index: int
@@ -33,7 +33,7 @@ class CameraReceipt(Model):
 
 
 class FrameState(StrEnum):
-    """The state of a frame. The last four are final."""
+    """The state of a frame. The last four states are final."""
 
     OPEN = "open"
     QUEUED = "queued"
@@ -45,17 +45,17 @@ class FrameState(StrEnum):
 
 
 FINISHED = frozenset({FrameState.COMMITTED, FrameState.FAILED, FrameState.MISSING, FrameState.SKIPPED})
-"""Nothing more happens to a frame in one of these."""
+"""The final states, after which a frame no longer changes."""
 
 
 class MissingRequest(Model):
-    """A request to declare a frame missing, permanently."""
+    """A request to declare a frame permanently missing."""
 
     reason: str = Field(default="", max_length=500, description="Reason, for people.")
 
 
 class CameraFitModel(Model):
-    """How well one camera's picture fits the render. Moved or changed cameras stand out."""
+    """Fit of one camera's picture to the rendering; it exposes cameras that moved or changed."""
 
     psnr: float | None = Field(description="PSNR in dB.")
     colour_shift: tuple[float, float, float] | None = Field(
@@ -70,7 +70,7 @@ class CameraFitModel(Model):
 
 
 class AlarmModel(Model):
-    """An alarm: something that needs a person's attention."""
+    """An alarm about a condition that requires an operator's attention."""
 
     kind: AlarmKind = Field(
         description=(
@@ -104,7 +104,7 @@ class CurvePointModel(Model):
 
 
 class EffectModel(Model):
-    """The switch of one effect."""
+    """On/off switch of one effect."""
 
     on: bool = Field(description="The effect takes part in updates.")
     since: int = Field(description="Frame after which it was last switched on or off.")
@@ -159,7 +159,7 @@ class RefinedCameraModel(Model):
 
 
 class RefinementModel(Model):
-    """Outcome of refining a calibration."""
+    """Result of refining a calibration."""
 
     accepted: bool = Field(description="The scene uses the refined rig.")
     text: str = Field(description="Outcome with figures, for people.")
@@ -174,7 +174,7 @@ class RefinementModel(Model):
 
 
 class CalibrationModel(Model):
-    """The calibration compared with the pictures of frame 0."""
+    """Comparison of the calibration with the pictures of frame 0."""
 
     cameras: dict[str, CameraResidualModel] = Field(description="Residuals by camera, before refinement.")
     miscalibrated: list[str] = Field(description="Cameras that clearly disagree with their calibration.")

@@ -1,14 +1,14 @@
 """The binary frame format: `S4DF`, a little-endian uint32 length, a JSON header, then the files.
 
-As the body of `PUT /v1/scenes/{id}/frames/{n}` its content type is `FRAME_MEDIA_TYPE`; over `WS …/ingest` it is one
-binary message. The head says which file is how long, and the files follow one after the other in that order, so
-that neither side has to look for boundaries:
+As the body of `PUT /v1/scenes/{id}/frames/{n}`, its content type is `FRAME_MEDIA_TYPE`. Over `WS …/ingest`, it is one
+binary message. The header lists the files and their sizes, and the files follow in that order, so neither side has to
+search for boundaries:
 
-    offset  bytes  what
+    offset  bytes  content
     0       4      magic, the ASCII letters S4DF
-    4       4      length of the head, uint32, little-endian, at most `MAX_HEAD`
-    8       …      the head, `FrameHead` as UTF-8 JSON
-    …       …      the files' bytes, `size` each, nothing between or behind them
+    4       4      length of the header, uint32, little-endian, at most `MAX_HEAD`
+    8       …      the header, `FrameHead` as UTF-8 JSON
+    …       …      the bytes of the files, `size` bytes each, without separators or trailing data
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ FRAME_MEDIA_TYPE = "application/vnd.scas4d.frame"
 MAGIC = b"S4DF"
 PREFIX = struct.Struct("<4sI")
 MAX_HEAD = 1 << 20
-"""Bytes; a head of 512 cameras with masks has some 100 kB."""
+"""Maximum header size in bytes; a header for 512 cameras with masks takes about 100 kB."""
 MAX_INDEX = 1_000_000_000
 
 
 class FramingError(InputError):
-    """Invalid frame bytes. The message names the fault and the remedy."""
+    """Raised for invalid frame bytes. The message names the fault and the remedy."""
 
 
 class FileKind(StrEnum):
@@ -89,11 +89,11 @@ def frame_chunks(
     """Yields the bytes of a frame without copying files: prefix with header, then each file.
 
     Args:
-        index: of the frame.
-        images: encoded, by camera.
-        masks: encoded, by camera; none where left out.
-        time: seconds; None leaves it to the scene's frame rate.
-        part: of one camera only.
+        index: index of the frame.
+        images: encoded images by camera.
+        masks: encoded masks by camera; cameras may be omitted.
+        time: seconds; None: derived from the scene's frame rate.
+        part: whether the frame contains only one camera's files.
     """
     kinds = ((FileKind.IMAGE, images), (FileKind.MASK, masks or {}))
     named = [(camera, kind, data) for kind, files in kinds for camera, data in files.items()]
@@ -106,7 +106,7 @@ def head_length(prefix: bytes | bytearray | memoryview) -> int:
     """Returns the size of the header in bytes, read from the first `PREFIX.size` bytes.
 
     Raises:
-        FramingError: they are not those of a frame.
+        FramingError: if the bytes are not the start of a frame.
     """
     if len(prefix) < PREFIX.size:
         raise FramingError(f"ends after {len(prefix)} bytes, within its prefix", "send the whole frame")
@@ -124,7 +124,7 @@ def parse_head(data: bytes | bytearray | memoryview) -> FrameHead:
     """Parses the JSON header.
 
     Raises:
-        FramingError: no JSON, or not of the fields that a head has.
+        FramingError: if the header is not valid JSON or has invalid fields.
     """
     try:
         return FrameHead.model_validate_json(bytes(data))
@@ -135,10 +135,10 @@ def parse_head(data: bytes | bytearray | memoryview) -> FrameHead:
 
 
 def parse_frame(data: bytes | bytearray | memoryview) -> tuple[FrameHead, list[memoryview]]:
-    """Returns the header and views of the bytes of each file.
+    """Returns the header and zero-copy views of each file's bytes.
 
     Raises:
-        FramingError: truncated, longer than the head says, or no frame.
+        FramingError: if the data is not a frame, is truncated, or is longer than the header states.
     """
     view = memoryview(data)
     at = PREFIX.size + head_length(view[: PREFIX.size])

@@ -1,4 +1,4 @@
-"""Wire models of the part segmentation."""
+"""Wire models of the segmentation into parts."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pydantic import Field
 from client.wire.base import Model
 
 GOLDEN = 0.618033988749895
-"""Hues this far apart on the circle stay apart however many there are."""
+"""Hue step between parts (golden ratio), which keeps any number of hues well separated."""
 
 
 class PartsModel(Model):
-    """A part label for every Gaussian. Parts keep their labels and colours across frames."""
+    """Part labels for all Gaussians. Parts keep their labels and colours across frames."""
 
     count: int = Field(description="Number of parts.")
     frame: int = Field(description="The newest frame used to find the parts.")
@@ -29,7 +29,7 @@ class PartsModel(Model):
 
 
 def part_colour(label: int) -> tuple[int, int, int]:
-    """Returns the RGB colour, 0…255, of a part."""
+    """Returns the RGB colour of a part, 0…255."""
     red, green, blue = colorsys.hsv_to_rgb(
         (0.58 + label * GOLDEN) % 1, (0.65, 0.45, 0.85)[label % 3], (0.95, 0.8)[label % 2]
     )
@@ -37,7 +37,7 @@ def part_colour(label: int) -> tuple[int, int, int]:
 
 
 def parts_model(labels: NDArray[np.int64], ids: NDArray[np.int64], frame: int) -> PartsModel:
-    """Converts labels [N] of Gaussians [N] to the wire model."""
+    """Converts the labels [N] of Gaussians with ids [N] to the wire model."""
     return PartsModel(
         count=len(np.unique(labels[labels >= 0])),
         frame=frame,

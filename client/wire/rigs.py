@@ -33,7 +33,7 @@ class CameraModel(Model):
         return self
 
     def camera(self) -> Camera:
-        """Converts to the core's camera."""
+        """Converts the wire model to a core `Camera`."""
         return Camera(
             self.name, np.array(self.intrinsics), np.array(self.world_to_camera), width=self.width, height=self.height
         )
@@ -66,7 +66,7 @@ class RigModel(Model):
         return self
 
     def rig(self) -> Rig:
-        """Converts to the core's rig."""
+        """Converts the wire model to a core `Rig`."""
         return Rig(tuple(camera.camera() for camera in self.cameras))
 
     @classmethod

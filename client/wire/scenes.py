@@ -15,7 +15,7 @@ from scas4d_core.errors import InputError
 
 
 class Retention(Model):
-    """A retention rule for per-frame data: keep all, the last N frames, or the newest bytes."""
+    """A retention rule for per-frame data: keep all frames, the last N frames, or the newest bytes."""
 
     last: int | None = Field(
         default=None, ge=0, description="Number of newest frames to keep. Not together with `bytes`."
@@ -32,7 +32,7 @@ class Retention(Model):
 
 
 class StateBounds(Model):
-    """Error bounds of states in compact files (docs/format.md)."""
+    """Error bounds of states in compact files (see docs/format.md)."""
 
     position: float = Field(
         default=0.04, ge=1e-6, le=1, description="Error of the centre, relative to the Gaussian's size."
@@ -47,7 +47,7 @@ class StateBounds(Model):
 
 
 class IngestSettings(Model):
-    """Rules for the frames of a scene: queue, incomplete frames, and retention."""
+    """Ingest rules of a scene: queue limits, incomplete frames, and retention."""
 
     queue_frames: int | None = Field(
         default=None,
@@ -95,7 +95,7 @@ class IngestSettings(Model):
 
 
 class SceneCreate(Model):
-    """A request to create a scene: the rig and the settings."""
+    """A request to create a scene from a rig and settings."""
 
     rig: RigModel
     name: str = Field(default="", max_length=200, description="Name for people; the service generates the id.")
@@ -200,7 +200,7 @@ class ProgressModel(Model):
 
 
 class EffectStatus(EffectModel):
-    """The switch of one effect in a scene's status, with a description."""
+    """Switch and description of one effect in a scene's status."""
 
     group: str = Field(description="motion, coherence, appearance, cameras or presence.")
     description: str = Field(description="A sentence that describes the effect.")

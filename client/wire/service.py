@@ -24,7 +24,7 @@ class Health(Model):
 
 
 class Ticket(Model):
-    """A ticket that opens one WebSocket from a browser, which cannot send a bearer token."""
+    """A single-use ticket that opens one WebSocket from a browser, which cannot send a bearer token."""
 
     ticket: str
     subprotocol: str = Field(description="Offer it in Sec-WebSocket-Protocol, in addition to the stream's protocol.")
@@ -32,7 +32,7 @@ class Ticket(Model):
 
 
 class ProblemDetails(BaseModel):
-    """A problem document (RFC 9457), extended by `field`, `value` and `remedy`."""
+    """A problem document (RFC 9457) with the extension members `field`, `value` and `remedy`."""
 
     model_config = ConfigDict(extra="allow")
 
@@ -57,7 +57,7 @@ class ShareRequest(Model):
 
 
 class Share(Model):
-    """A read-only token, and the viewer's address with it."""
+    """A read-only token and the URL of the viewer that contains it."""
 
     token: str = Field(description="For `Authorization: Bearer`.")
     scene: str | None
@@ -98,7 +98,7 @@ class WaitingProcess(Model):
 
 
 class Cluster(Model):
-    """The machines of the service and the processes that wait for them."""
+    """The machines of the service and the processes that wait for resources."""
 
     placement: Literal["local", "ray"]
     nodes: list[Node]

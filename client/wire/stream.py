@@ -1,7 +1,7 @@
 """Wire models of subscriptions, protocol `scas4d.stream.v1` (docs/stream.md).
 
-A client sends text messages, `ClientMessage`. The service sends text messages, and binary ones for bulk: the magic
-`S4DS`, the length of a JSON head as uint32 little-endian, the head, and the bytes that it describes.
+A client sends text messages, `ClientMessage`. The service sends text messages, and binary messages for bulk data. A
+binary message has the magic `S4DS`, the header length as little-endian uint32, a JSON header, and the data.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from client.wire.tracks import TracksRequest
 from client.wire.views import RenderRequest
 
 STREAM_PROTOCOL = "scas4d.stream.v1"
-"""Offered as a WebSocket subprotocol; another version is another name."""
+"""Name of the WebSocket subprotocol; it includes the protocol version."""
 
 MAGIC = b"S4DS"
 _PREFIX = struct.Struct("<4sI")
@@ -28,9 +28,9 @@ _PREFIX = struct.Struct("<4sI")
 SCENE_GONE = 4404
 """Close code: the scene was deleted."""
 SCENE_RESTARTS = 1012
-"""Close code: the scene's reconstruction is begun anew, or the service restarts; connect again."""
+"""Close code: the scene's reconstruction or the service restarts, and the client should reconnect."""
 TOO_BIG = 1009
-"""Close code: a message larger than `StreamLimits.message_bytes`."""
+"""Close code: a message was larger than `StreamLimits.message_bytes`."""
 
 SubscriptionId = Annotated[
     str, Field(min_length=1, max_length=64, description="Name of the subscription, chosen by the client.")
@@ -52,7 +52,7 @@ class Topic(StrEnum):
 
 
 class NoRequest(Model):
-    """The request of topics without options."""
+    """The empty request of topics without options."""
 
 
 class PartsSubscription(Model):
@@ -76,10 +76,10 @@ REQUESTS: dict[Topic, type[Model]] = {
     Topic.TRACKS: TracksRequest,
     Topic.PARTS: PartsSubscription,
 }
-"""What `request` is, by topic. `frame` null in a render follows the newest frame."""
+"""Request model of each topic. In a render request, a null `frame` follows the newest frame."""
 
 
-# From the client.
+# Messages from the client.
 
 
 class Subscribe(Model):
@@ -93,7 +93,7 @@ class Subscribe(Model):
 
 
 class Update(Model):
-    """Changes members of a subscription's request, for example when the camera moves."""
+    """Changes some members of a subscription's request, for example when the camera moves."""
 
     type: Literal["update"] = "update"
     id: SubscriptionId
@@ -112,7 +112,7 @@ ClientMessage = Annotated[Subscribe | Update | Unsubscribe, Field(discriminator=
 CLIENT_MESSAGE: TypeAdapter[Subscribe | Update | Unsubscribe] = TypeAdapter(ClientMessage)
 
 
-# From the service, as text.
+# Text messages from the service.
 
 
 class StreamLimits(Model):
@@ -125,7 +125,7 @@ class StreamLimits(Model):
 
 
 class Hello(Model):
-    """The first message."""
+    """The first message from the service."""
 
     type: Literal["hello"] = "hello"
     protocol: str
@@ -148,7 +148,7 @@ class Unsubscribed(Model):
 
 
 class StreamProblem(Model):
-    """A refusal. With an id, the subscription remains and waits for its next `update` or frame."""
+    """A rejected request or update. If it has an id, that subscription remains active."""
 
     type: Literal["error"] = "error"
     id: SubscriptionId | None = None
@@ -175,7 +175,7 @@ class FrameMessage(Model):
 
 
 class SceneGone(Model):
-    """The scene was deleted; the service then closes the WebSocket with 4404."""
+    """Reports that the scene was deleted; the service then closes the WebSocket with code 4404."""
 
     type: Literal["gone"] = "gone"
     reason: str
@@ -190,11 +190,11 @@ SERVER_MESSAGE: TypeAdapter[
 ] = TypeAdapter(ServerMessage)
 
 
-# From the service, as the head of a binary message.
+# Headers of binary messages from the service.
 
 
 class BinaryHead(Model):
-    """The header of a binary message, which describes the bytes after it."""
+    """The header of a binary message, which describes the data after it."""
 
     type: Literal["render", "tracks", "parts"]
     id: SubscriptionId
@@ -220,7 +220,7 @@ def unpack(message: bytes) -> tuple[BinaryHead, bytes]:
     """Splits a binary message into its header and body.
 
     Raises:
-        ValueError: not one of ours.
+        ValueError: if the message is not in this format.
     """
     if len(message) < _PREFIX.size:
         raise ValueError(f"a binary message of {len(message)} bytes has no room for its head")

@@ -14,7 +14,7 @@ from client.wire.rigs import CameraModel
 
 
 class TracksRequest(Model):
-    """A request for trajectories of ids, pixels or points: exactly one of them."""
+    """A request for trajectories of ids, pixels or points; exactly one of them is given."""
 
     ids: Annotated[list[int], Field(min_length=1)] | None = Field(default=None, description="Ids of Gaussians.")
     pixels: Annotated[list[Pixel], Field(min_length=1)] | None = Field(
@@ -40,7 +40,7 @@ class TracksRequest(Model):
 
 
 class TracksModel(Model):
-    """Trajectories of Q points over T frames, in the rig's world and units."""
+    """Trajectories of Q points over T frames, in the rig's world frame and units."""
 
     frames: list[int] = Field(description="[T] indices of frames.")
     times: list[float] = Field(description="[T] seconds.")

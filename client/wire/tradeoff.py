@@ -1,4 +1,4 @@
-"""Wire models of accuracy against time."""
+"""Wire models of the trade-off between accuracy and time."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class TradeoffPoint(Model):
 
 
 class CurveMean(Model):
-    """Mean progress of updates after a number of their iterations."""
+    """Mean convergence of updates after a given number of iterations."""
 
     planned: int = Field(description="Total iterations of the update.")
     iterations: int
@@ -58,7 +58,7 @@ class CurveMean(Model):
 
 
 class TimeModel(Model):
-    """milliseconds = fixed + per_iteration x iterations, medians over the newest frames."""
+    """Linear time model: milliseconds = fixed + per_iteration × iterations, medians over the newest frames."""
 
     fixed: float
     per_iteration: float
@@ -75,7 +75,7 @@ class ReplayState(StrEnum):
 
 
 class ReplayStatus(Model):
-    """The latest replay. It is kept in memory until the service stops."""
+    """The latest replay, kept in memory until the service stops."""
 
     state: ReplayState = ReplayState.NONE
     iterations: list[int] = Field(
@@ -90,7 +90,7 @@ class ReplayStatus(Model):
 
 
 class TradeoffModel(Model):
-    """Accuracy against time for this scene on this machine."""
+    """Accuracy versus time for this scene on this machine."""
 
     scene: str
     points: list[TradeoffPoint] = Field(description="Points by kind, then by iterations.")
@@ -101,7 +101,7 @@ class TradeoffModel(Model):
 
 
 class ReplayRequest(Model):
-    """A request to measure other numbers of iterations."""
+    """A request to replay frames with other numbers of iterations."""
 
     iterations: Annotated[list[Iterations], Field(min_length=1, max_length=MOST_BUDGETS)] = Field(
         default=[25, 50, 200],

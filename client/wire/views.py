@@ -12,7 +12,7 @@ from client.wire.rigs import CameraModel
 
 
 class RenderKind(StrEnum):
-    """The kind of a render."""
+    """The type of image that a render request returns."""
 
     COLOUR = "colour"
     DEPTH = "depth"
@@ -21,7 +21,7 @@ class RenderKind(StrEnum):
 
 
 class RenderFormat(StrEnum):
-    """The encoding of a render."""
+    """The image encoding of a render."""
 
     PNG = "png"
     JPEG = "jpeg"

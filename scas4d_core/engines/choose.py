@@ -15,7 +15,7 @@ def engine_of(device: str) -> UpdateEngine:
         device: device name from the settings; only "cpu" is supported so far.
 
     Raises:
-            ValueError: if no engine supports the device.
+        ValueError: if no engine supports the device.
 
     >>> engine_of("cpu").name
     'cpu'
@@ -31,10 +31,10 @@ def renderer_of(device: str, background: tuple[float, float, float], limits: Lim
     """Returns a new full-image renderer for a device.
 
     Args:
-            device: see ``engine_of``. background: RGB in 0…1. limits: constants of the rasterizer.
+        device: see ``engine_of``. background: RGB in 0…1. limits: constants of the rasterizer.
 
     Raises:
-            ValueError: if no renderer supports the device.
+        ValueError: if no renderer supports the device.
     """
     if device == "cpu":
         from scas4d_core.engines.cpu.renderer import CpuRenderer
@@ -50,7 +50,7 @@ def fit_engine_of(renderer: Renderer, mask_weight: float = 0.0) -> FitEngine:
         mask_weight: weight of the mask loss, which is added to the image loss and only affects the labels.
 
     Raises:
-            ValueError: if the renderer's device has no engine for fits.
+        ValueError: if the renderer's device has no engine for fits.
     """
     from scas4d_core.engines.cpu.fit import CpuFitEngine
     from scas4d_core.engines.cpu.renderer import CpuRenderer

@@ -2,16 +2,16 @@
 
 The loop (``update.frame_update``) decides, an engine computes. The calls of one attempt at a frame, in order::
 
-        engine.bind(plan, structure)            # once per hierarchy: allocate, compile, capture graphs
-        engine.load_views(views, probes)        # images of the frame
-        engine.load_state(previous)             # Θ_{t−1} without motion
-        engine.set_tables(tables)               # initial motion: none, or the motion of the previous frame
-        engine.probe(...)                       # image losses of the candidates on a few views
-        engine.begin(start)                     # reset the Adam moments to zero
-        engine.iterate(views, step)             # deform, render, compare, backward, Adam: once per iteration
-        engine.log(), engine.leave_out(views)   # after every camera was rendered: exclude outlier cameras
-        engine.probe(...)                       # for the stopping rule, and at the end
-        engine.state(learnt=True)               # Θ_t
+    engine.bind(plan, structure)            # once per hierarchy: allocate, compile, capture graphs
+    engine.load_views(views, probes)        # images of the frame
+    engine.load_state(previous)             # Θ_{t−1} without motion
+    engine.set_tables(tables)               # initial motion: none, or the motion of the previous frame
+    engine.probe(...)                       # image losses of the candidates on a few views
+    engine.begin(start)                     # reset the Adam moments to zero
+    engine.iterate(views, step)             # deform, render, compare, backward, Adam: once per iteration
+    engine.log(), engine.leave_out(views)   # after every camera was rendered: exclude outlier cameras
+    engine.probe(...)                       # for the stopping rule, and at the end
+    engine.state(learnt=True)               # Θ_t
 
 Only ``probe``, ``log``, ``tables``, ``state``, ``exposures`` and ``gains`` make the host wait for the device. That is
 about ten synchronizations per frame, and none during an iteration.
@@ -89,14 +89,14 @@ class AttemptStart:
     """Constants of the iterations of one attempt. A parameter with learning rate 0 is not updated.
 
     Attributes:
-            layers: Adam learning rates of each layer (r, t in metres, c and s), coarse to fine.
-            position, rotation, scale: learning rates of Δp (metres), ΔR, Δs.
-            colour, static_colour: learning rates of the RGB colours of moving and of static Gaussians.
-            beta1, beta2: Adam's decay rates.
-            samples: samples of entries in the hierarchy's order, [S] int64 each; ``StepScalars.sample`` selects one.
-            gains: [cameras, 3] initial camera gains, in the plan's order; None: gains are not estimated.
-            curve: whether to compute terms that only affect the reported loss, not the state.
-            lap: callback that receives the name of each finished stage, from engines that synchronize after each stage.
+        layers: Adam learning rates of each layer (r, t in metres, c and s), coarse to fine.
+        position, rotation, scale: learning rates of Δp (metres), ΔR, Δs.
+        colour, static_colour: learning rates of the RGB colours of moving and of static Gaussians.
+        beta1, beta2: Adam's decay rates.
+        samples: samples of entries in the hierarchy's order, [S] int64 each; ``StepScalars.sample`` selects one.
+        gains: [cameras, 3] initial camera gains, in the plan's order; None: gains are not estimated.
+        curve: whether to compute terms that only affect the reported loss, not the state.
+        lap: callback that receives the name of each finished stage, from engines that synchronize after each stage.
     """
 
     layers: tuple[tuple[float, float, float], ...]
@@ -119,10 +119,10 @@ class StepScalars:
 
     Attributes:
         frozen: number of frozen layers, starting with the coarsest.
-            layers: factor on the learning rates of each layer; 0: the layer is not updated.
-            own: factor on the learning rates of Δp, ΔR, Δs. colour, gloss: factors on those of colours and gloss.
-            smooth_gloss: whether the updates of the gloss are averaged over neighbours after this step.
-            rigidity: weight of the rigidity loss in this iteration.
+        layers: factor on the learning rates of each layer; 0: the layer is not updated.
+        own: factor on the learning rates of Δp, ΔR, Δs. colour, gloss: factors on those of colours and gloss.
+        smooth_gloss: whether the updates of the gloss are averaged over neighbours after this step.
+        rigidity: weight of the rigidity loss in this iteration.
         sample: index of the attempt's sample whose neighbours are compared.
         keep_pictures: whether the log keeps the rendering of this iteration.
     """
@@ -160,8 +160,8 @@ class ViewRecord(NamedTuple):
     """The log entry of one rendering of a training view.
 
     Attributes:
-            view: index of the view. psnr: dB. colour_shift: [3] mean of the picture minus mean of the rendering, RGB in
-                0…1, with the camera's exposure applied.
+        view: index of the view. psnr: dB. colour_shift: [3] mean of the picture minus mean of the rendering, RGB in
+            0…1, with the camera's exposure applied.
     """
 
     view: int
@@ -174,9 +174,9 @@ class IterationLog:
     """The log of the iterations since ``begin``.
 
     Attributes:
-            losses: weighted sum of the loss terms, per iteration. rendered: records of all renderings, in order.
-            pictures: the kept renderings by view index, oldest first.
-            guards: number of times that each guard was triggered (``guards.GUARDS``).
+        losses: weighted sum of the loss terms, per iteration. rendered: records of all renderings, in order.
+        pictures: the kept renderings by view index, oldest first.
+        guards: number of times that each guard was triggered (``guards.GUARDS``).
     """
 
     losses: list[float] = field(default_factory=list)
@@ -209,7 +209,7 @@ class UpdateEngine(Protocol):
         """Allocates buffers and compiles kernels for the updates of a plan.
 
         Raises:
-                EngineError: if the engine does not support what the plan requires.
+            EngineError: if the engine does not support what the plan requires.
         """
 
     def load_views(self, views: Sequence[TrainingView], probes: Sequence[TrainingView]) -> None:
@@ -233,7 +233,7 @@ class UpdateEngine(Protocol):
         """Runs one iteration: deform, render, compare, backward, Adam step.
 
         Args:
-                views: indices of the views; the image and mask losses are averaged over them.
+            views: indices of the views; the image and mask losses are averaged over them.
         """
 
     def leave_out(self, views: Sequence[int]) -> None:
@@ -246,8 +246,8 @@ class UpdateEngine(Protocol):
         """Returns the image losses of a state on some of the probe views.
 
         Args:
-                which: indices of the views. moved: whether Θ_{t−1} is deformed by the tables.
-                learnt: whether to use the learned colours, gloss and environment instead of those of Θ_{t−1}.
+            which: indices of the views. moved: whether Θ_{t−1} is deformed by the tables.
+            learnt: whether to use the learned colours, gloss and environment instead of those of Θ_{t−1}.
         """
 
     def tables(self) -> Tables:
@@ -260,7 +260,7 @@ class UpdateEngine(Protocol):
         """Returns Θ_{t−1} deformed by the tables, with accumulated material rotations.
 
         Args:
-                learnt: whether to use the learned colours, gloss and environment instead of those of Θ_{t−1}.
+            learnt: whether to use the learned colours, gloss and environment instead of those of Θ_{t−1}.
         """
 
     def gradients(self) -> dict[str, Array]:

@@ -2,10 +2,10 @@
 
 The loop (``fit.gaussian_fit``) decides, an engine computes. ``choose.fit_engine_of`` creates an engine::
 
-        engine.load_views(views, fixed)      # pictures, and the Gaussians that stay fixed in each
-        engine.load_table(table)             # parameters and moments; repeat whenever the host has changed them
-        engine.iterate(view, scalars)        # activate, render, compare, backward, Adam: once per iteration
-        engine.table(), engine.state()       # the fitted parameters and Gaussians
+    engine.load_views(views, fixed)      # pictures, and the Gaussians that stay fixed in each
+    engine.load_table(table)             # parameters and moments; repeat whenever the host has changed them
+    engine.iterate(view, scalars)        # activate, render, compare, backward, Adam: once per iteration
+    engine.table(), engine.state()       # the fitted parameters and Gaussians
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class FitGloss(Protocol):
     """Gloss and environment of the fitted Gaussians, as learned by one type of engine.
 
     Attributes:
-            gloss: [N, 3] normals times strengths. environment: see ``Gaussians``.
+        gloss: [N, 3] normals times strengths. environment: see ``Gaussians``.
     """
 
     gloss: Array
@@ -69,9 +69,9 @@ class FitTable:
     """The parameters of a fit and their Adam moments.
 
     Attributes:
-            parameters, first, second: [N, 15] float32, columns as above. steps: number of Adam steps so far.
-            beta1, beta2: Adam's decay rates. statistics: None if they are not needed.
-            gloss: learned direction-dependent part of the colours; None: colours do not depend on direction.
+        parameters, first, second: [N, 15] float32, columns as above. steps: number of Adam steps so far.
+        beta1, beta2: Adam's decay rates. statistics: None if they are not needed.
+        gloss: learned direction-dependent part of the colours; None: colours do not depend on direction.
     """
 
     parameters: Array
@@ -88,8 +88,8 @@ class FitScalars(NamedTuple):
     """Learning rates and options of one iteration.
 
     Attributes:
-            rates: [15] float32, Adam learning rate of each column; a column with rate 0 is not updated.
-            gloss: factor on the learning rates of the gloss. colour_shift: whether to measure the colour shift.
+        rates: [15] float32, Adam learning rate of each column; a column with rate 0 is not updated.
+        gloss: factor on the learning rates of the gloss. colour_shift: whether to measure the colour shift.
     """
 
     rates: Array
@@ -101,10 +101,10 @@ class FitLoss(NamedTuple):
     """Losses of the rendering of one iteration, before its step.
 
     Attributes:
-            view: index of the view. loss: weighted sum of image and mask loss. psnr: dB.
-            exposure_gradient: [C, 2] gradient of the loss with respect to the camera's gain and offset; valid until the
-                next iteration.
-            colour_shift: [3] mean of the picture minus mean of the rendering; None if it was not requested.
+        view: index of the view. loss: weighted sum of image and mask loss. psnr: dB.
+        exposure_gradient: [C, 2] gradient of the loss with respect to the camera's gain and offset; valid until the
+            next iteration.
+        colour_shift: [3] mean of the picture minus mean of the rendering; None if it was not requested.
     """
 
     view: int
@@ -132,7 +132,7 @@ class FitEngine(Protocol):
         """Loads parameters, moments, statistics and gloss.
 
         Raises:
-                EngineError: if the engine cannot learn this kind of gloss.
+            EngineError: if the engine cannot learn this kind of gloss.
         """
 
     def iterate(self, view: int, scalars: FitScalars) -> FitLoss:

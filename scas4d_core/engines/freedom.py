@@ -10,9 +10,9 @@ class Freedom:
     """Flags for the free columns of the cluster tables and per-Gaussian deltas. All other columns stay exactly 0.
 
     Attributes:
-            cluster_rotation, cluster_translation, cluster_scaling: r, t, and c with s of the clusters of all layers.
-            own_position, own_rotation, own_scale: Δp, ΔR, Δs of each Gaussian.
-            prediction: whether the free parameters are initialized with the previous motion instead of 0.
+        cluster_rotation, cluster_translation, cluster_scaling: r, t, and c with s of the clusters of all layers.
+        own_position, own_rotation, own_scale: Δp, ΔR, Δs of each Gaussian.
+        prediction: whether the free parameters are initialized with the previous motion instead of 0.
 
     >>> Freedom(own_scale=True).clusters
     False

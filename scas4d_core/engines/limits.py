@@ -13,14 +13,14 @@ class Limits(NamedTuple):
     """Constants that must be equal for two rasterizers to agree.
 
     Attributes:
-            alpha_floor: a Gaussian covers exactly the pixels where its alpha is at least this value. Smaller alphas are
-                invisible in 8-bit pictures. Culling by this support is exact.
-            alpha_cap: upper bound of a Gaussian's alpha; it bounds 1/(1 − alpha) in the backward pass.
-            transmittance_stop: a pixel is finished when its transmittance would fall below this value.
+        alpha_floor: a Gaussian covers exactly the pixels where its alpha is at least this value. Smaller alphas are
+            invisible in 8-bit pictures. Culling by this support is exact.
+        alpha_cap: upper bound of a Gaussian's alpha; it bounds 1/(1 − alpha) in the backward pass.
+        transmittance_stop: a pixel is finished when its transmittance would fall below this value.
             low_pass: pixels², added to the diagonal of the projected covariance, so that a Gaussian covers a pixel.
-            near: metres; Gaussians closer than this are culled.
-            tangent_margin: how far x/z (y/z) may lie beyond the picture's border before the projection's Jacobian is
-                evaluated at a clamped position; in units of half the picture's width (height).
+        near: metres; Gaussians closer than this are culled.
+        tangent_margin: how far x/z (y/z) may lie beyond the picture's border before the projection's Jacobian is
+            evaluated at a clamped position; in units of half the picture's width (height).
     """
 
     alpha_floor: float = guards.ALPHA_FLOOR

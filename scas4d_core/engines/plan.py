@@ -27,8 +27,8 @@ class ColourPlan:
     """Selects which colours an update learns.
 
     Attributes:
-            moving, static: whether the colours of the moving and of the static Gaussians are free.
-            changing_light: whether the light changes, so that colours learn faster (``effects.appearance.light``).
+        moving, static: whether the colours of the moving and of the static Gaussians are free.
+        changing_light: whether the light changes, so that colours learn faster (``effects.appearance.light``).
     """
 
     moving: bool = False
@@ -43,24 +43,24 @@ class UpdatePlan:
     A term that no effect requests is not computed: its weight is 0 or its value is None.
 
     Attributes:
-            cameras: names of the rig's cameras, in the rig's order.
-            background: RGB in 0…1 behind all Gaussians. limits: constants of the rasterizer.
-            cluster_map, covariance: variants of equations (6) and (5), see ``engines.torch.deformation``.
-            image, soft_colour: weights of the image loss and of the mean absolute change of colours.
-            mask: weight of the mask loss. axis_length: weight of the scale loss, equation (8).
-            neighbour_terms: whether any effect requests terms between neighbours.
-            rigidity, isometry, rotation: weights of the neighbour terms.
-            rigidity_fades: whether the weight of rigidity decays to 0 during an update (``effects.coherence.bending``).
-            floor: plane (a, b, c, d) in metres of the internal world; a·x + b·y + c·z + d > 0 is below the floor.
-            floor_weight: weight of the mean depth below the floor.
-            freedom: the free parameters of the deformation.
-            colours: the colours to learn; None: none.
-            gloss: whether gloss and environment are learned (``effects.appearance.direction``).
-            camera_gains: whether camera gains are estimated (``effects.appearance.camera_gain``).
-            full_images: whether every pixel can change; otherwise only pixels that moving Gaussians reach.
-            disables_skip: whether frames that Θ_{t−1} already reproduces well are updated too, because an effect learns
-                from them.
-            learns_labels: whether moving Gaussians are detected from motion if no masks are given.
+        cameras: names of the rig's cameras, in the rig's order.
+        background: RGB in 0…1 behind all Gaussians. limits: constants of the rasterizer.
+        cluster_map, covariance: variants of equations (6) and (5), see ``engines.torch.deformation``.
+        image, soft_colour: weights of the image loss and of the mean absolute change of colours.
+        mask: weight of the mask loss. axis_length: weight of the scale loss, equation (8).
+        neighbour_terms: whether any effect requests terms between neighbours.
+        rigidity, isometry, rotation: weights of the neighbour terms.
+        rigidity_fades: whether the weight of rigidity decays to 0 during an update (``effects.coherence.bending``).
+        floor: plane (a, b, c, d) in metres of the internal world; a·x + b·y + c·z + d > 0 is below the floor.
+        floor_weight: weight of the mean depth below the floor.
+        freedom: the free parameters of the deformation.
+        colours: the colours to learn; None: none.
+        gloss: whether gloss and environment are learned (``effects.appearance.direction``).
+        camera_gains: whether camera gains are estimated (``effects.appearance.camera_gain``).
+        full_images: whether every pixel can change; otherwise only pixels that moving Gaussians reach.
+        disables_skip: whether frames that Θ_{t−1} already reproduces well are updated too, because an effect learns
+            from them.
+        learns_labels: whether moving Gaussians are detected from motion if no masks are given.
     """
 
     cameras: tuple[str, ...]
@@ -99,9 +99,9 @@ class Structure:
     """The clusters and neighbours of the moving Gaussians, which an update deforms.
 
     Attributes:
-            hierarchy: clusters of the M moving Gaussians. neighbours: neighbour graph; None if no term needs it.
-            roots: [N, 3] metres, positions of all Gaussians in frame 0.
-            first_lengths: [M, 3] metres, axis lengths of the moving Gaussians in frame 0.
+        hierarchy: clusters of the M moving Gaussians. neighbours: neighbour graph; None if no term needs it.
+        roots: [N, 3] metres, positions of all Gaussians in frame 0.
+        first_lengths: [M, 3] metres, axis lengths of the moving Gaussians in frame 0.
     """
 
     hierarchy: Hierarchy

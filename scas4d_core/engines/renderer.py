@@ -36,7 +36,7 @@ class Comparison(NamedTuple):
 
     Attributes:
         psnr: dB. image_loss: 0.8 L1 + 0.2 (1 − SSIM), weighted.
-            colour_shift: [3] mean of the picture minus mean of the rendering, RGB in 0…1, with exposure applied.
+        colour_shift: [3] mean of the picture minus mean of the rendering, RGB in 0…1, with exposure applied.
     """
 
     psnr: float
@@ -48,8 +48,8 @@ class Gradients(NamedTuple):
     """Gradients of a loss with respect to the renderer's inputs; the next call overwrites these buffers.
 
     Attributes:
-            means: [N, 3]. factors: [N, 3, 3]. opacities: [N]. features: [N, C]. screen: [N, 2] for the projected means.
-                Gaussians that are not rendered have gradient 0.
+        means: [N, 3]. factors: [N, 3, 3]. opacities: [N]. features: [N, C]. screen: [N, 2] for the projected means.
+            Gaussians that are not rendered have gradient 0.
     """
 
     means: Array
@@ -78,9 +78,9 @@ class Renderer(Protocol):
         """Renders RGB and label of a state as a camera sees it, without the camera's exposure.
 
         Args:
-                features: [N, C] features to render instead of RGB and label.
-                depth_channel: channel of ``features`` to overwrite with the depth of the centres (metres along z).
-                background: [C] float32 behind all Gaussians; None: the scene's background, and 0 in further channels.
+            features: [N, C] features to render instead of RGB and label.
+            depth_channel: channel of ``features`` to overwrite with the depth of the centres (metres along z).
+            background: [C] float32 behind all Gaussians; None: the scene's background, and 0 in further channels.
         """
 
     def compare(self, state: Gaussians, view: TrainingView, features: Array | None = None) -> Comparison:

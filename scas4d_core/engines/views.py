@@ -46,9 +46,9 @@ class TrainingView:
     """The pictures of one camera in one frame.
 
     Attributes:
-            name: name of the camera. camera: the camera in kernel format.
-            target: [C, H, W] float32, RGB in 0…1, followed by the mask if the frame has one; C is 3 or 4.
-            exposure: [C, 2] gain and offset of the camera; those of the label are 1 and 0.
+        name: name of the camera. camera: the camera in kernel format.
+        target: [C, H, W] float32, RGB in 0…1, followed by the mask if the frame has one; C is 3 or 4.
+        exposure: [C, 2] gain and offset of the camera; those of the label are 1 and 0.
     """
 
     name: str

@@ -1,6 +1,6 @@
-"""The CPU engine: Numba kernels in float32, with the same bits for any number of threads.
+"""CPU engine: Numba kernels in float32 whose results are bit-identical for any number of threads.
 
-``engine`` has an iteration in the order of algorithm 1; each stage is a file: ``deformation`` (cascade, own deltas,
-neighbour terms), ``renderer`` and ``changed_pixels`` (render and compare, whole pictures or only changed pixels),
-``rasterizer``, ``gloss``, ``colours``, ``floor``, ``gains``, ``adam``.
+``engine`` runs an iteration in the order of algorithm 1. Each stage has its own module: ``deformation`` (cascade,
+per-Gaussian deltas, neighbour terms), ``renderer`` and ``changed_pixels`` (render and compare full pictures or only
+changed pixels), ``rasterizer``, ``gloss``, ``colours``, ``floor``, ``gains``, ``adam``.
 """

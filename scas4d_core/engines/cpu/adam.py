@@ -1,4 +1,4 @@
-"""Adam over the parameters of an update: one table of them, or the free columns of one."""
+"""Adam over the parameters of an update: one whole table, or the free columns of a table."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ Array = NDArray[np.float32]
 
 
 class Adam:
-    """Adam over one table of parameters, with a rate for each column, times one for each row where given.
+    """Adam over one parameter table, with a learning rate per column and an optional factor per row.
 
     Args:
-        parameters: [n, columns] float32; stepped in place. columns: rate of each column.
-        betas: decays of the two moments, which start at zero. by_row: [n] factor on the rates of each row.
+        parameters: [n, columns] float32; updated in place. columns: learning rate of each column.
+        betas: decay rates of the two moments, which start at zero. by_row: [n] factor on the rates of each row.
 
     Attributes:
-        guards: how often each guard of a step acted.
+        guards: number of times that each guard was triggered.
     """
 
     def __init__(
@@ -36,10 +36,10 @@ class Adam:
         self.guards = GuardCounts(*COUNTED_GUARDS)
 
     def step(self, gradients: Array, factor: float) -> None:
-        """Take a step.
+        """Performs one optimization step.
 
         Args:
-            gradients: [n, columns]. factor: on all rates; 0 takes no step and leaves the moments.
+            gradients: [n, columns]. factor: factor on all rates; 0 skips the step and leaves the moments unchanged.
         """
         if factor == 0:
             return
@@ -52,23 +52,23 @@ class Adam:
 
 
 class AdamColumns:
-    """Adam over the columns of a table whose rate is above 0; the others have no moments and stay as they are.
+    """Adam over the columns of a table whose learning rate is positive; the other columns are not updated.
 
     Args:
-        table: [n, columns]; the table is stepped in place, and by nobody else. columns: rate of each column, one of
-            them above 0. betas: see ``Adam``.
+        table: [n, columns]; updated in place, and only by this object. columns: learning rate of each column; at least
+            one is positive. betas: see ``Adam``.
     """
 
     def __init__(self, table: Array, columns: Sequence[float], betas: tuple[float, float]) -> None:
         self._table = table
         self._free = np.flatnonzero(columns)
-        # The kernel is compiled for contiguous rows, so some columns are stepped in a copy.
+        # The kernel is compiled for contiguous rows, so a subset of the columns is updated in a copy.
         self._values = table if len(self._free) == len(columns) else np.take(table, self._free, axis=1)
         self._adam = Adam(self._values, [rate for rate in columns if rate], betas)
         self.guards: GuardCounts = self._adam.guards
 
     def step(self, gradients: Array, factor: float) -> None:
-        """Take a step; see ``Adam.step``."""
+        """Performs one optimization step; see ``Adam.step``."""
         if self._values is self._table:
             self._adam.step(gradients, factor)
             return

@@ -1,11 +1,13 @@
-"""The picture loss of the pixels that moving Gaussians reach, where what stands is not learnt: the rest stays as it is.
+"""Picture loss on the pixels that moving Gaussians reach, for updates in which static Gaussians do not learn.
 
-What moves changes the blocks (4×4 pixels) that its supports meet. There, the moving Gaussians and those of the standing
-that meet these blocks are drawn, in the order of the whole picture, so that each pixel and each gradient has the bits
-that it has there. All other pixels show what stands alone: they were rendered once, when that last changed.
+Moving Gaussians only change the blocks (4×4 pixels) that their supports intersect. In these blocks, the moving and
+the intersecting static Gaussians are rendered in the same order as in the full picture, so that pixels and gradients
+are bit-identical to a full rendering. All other pixels show static Gaussians only and are rendered once, when the
+static Gaussians last changed.
 
-The standing Gaussians to draw from are found once a frame and view, around where what moves is then; the blocks that
-are drawn, in each iteration. The image loss is computed near all that may be drawn; the rest is a number a frame.
+The candidate static Gaussians are determined once per frame and view, around the current moving Gaussians; the
+rendered blocks are determined in every iteration. The image loss is evaluated near all candidate blocks. The loss of
+the rest of the picture is constant during a frame.
 """
 
 from __future__ import annotations
@@ -32,28 +34,27 @@ Array = NDArray[np.float32]
 State = tuple[Array, Array, Array, Array]
 
 MARGIN = 2
-"""Blocks by which what is drawn reaches further than what moves at the start: it will move on."""
+"""Blocks by which the region exceeds the initial extent of the moving Gaussians, which will move further."""
 REACH = 2 * image_loss.REACH
-"""Pixels around what is drawn that its gradient depends on: a window of SSIM has windows of pixels."""
+"""Distance in pixels within which the gradient depends on the picture: SSIM windows of pixels in an SSIM window."""
 MOST = 0.6
-"""Share of moving Gaussians above which whole pictures are cheaper: little of them stands."""
+"""Share of moving Gaussians above which full pictures are cheaper, because few Gaussians are static."""
 
 
 @dataclass(eq=False)
 class Region:
-    """Part of one camera's pictures that may be drawn in a frame.
+    """The part of one camera's pictures that may be rendered in a frame.
 
     Attributes:
-        blocks: [tiles] uint64; each time those of them are drawn that what moves reaches then.
-        rows: [R] int64, the Gaussians drawn, ascending. learnt: [R] uint8, 1 for the moving. moving: [M] int64, which
-            of the R these are.
-        box: rows and columns of the picture that hold the blocks and ``REACH`` around.
-        near: [h, columns] uint8, where in the box the losses can change, see ``image_loss.near``: elsewhere they are
-            in ``outside_losses``.
-        view: whose pictures the following belong to; None: nobody's yet.
-        target: [C, h, w], moments: twice the same, of the view in the box. outside_losses: image loss, mask loss and
-            squared
-            error of the view where they cannot change.
+        blocks: [tiles] uint64 candidate blocks; each rendering draws those that moving Gaussians reach.
+        rows: [R] int64 ascending rows of the rendered Gaussians. learnt: [R] uint8, 1 for the moving ones.
+        moving: [M] int64 indices of the moving Gaussians in ``rows``.
+        box: rows and columns of the picture that contain the blocks and a margin of ``REACH``.
+        near: [h, columns] uint8 flags of the losses in the box that can change, see ``image_loss.near``; all other
+            losses are part of ``outside_losses``.
+        view: view to which the following fields belong; None: not loaded yet.
+        target: [C, h, w] crop of the view's target. moments: crops of the target's two SSIM moments, same shape.
+        outside_losses: image loss, mask loss and squared error of the constant part of the picture.
     """
 
     blocks: NDArray[np.uint64]
@@ -69,12 +70,12 @@ class Region:
 
 
 class ChangedPixels(CpuRenderer):
-    """A ``CpuRenderer`` for states of which nothing but the moving Gaussians changes between two ``load_state``.
+    """A ``CpuRenderer`` for states in which only the moving Gaussians change between two calls of ``load_state``.
 
-    The gradients of standing Gaussians are 0.
+    The gradients of static Gaussians are 0.
 
     Args:
-        moving: [M] int64 rows that move. count: N. The others are those of ``CpuRenderer``.
+        moving: [M] int64 rows of the moving Gaussians. count: N. See ``CpuRenderer`` for the others.
     """
 
     def __init__(
@@ -102,7 +103,7 @@ class ChangedPixels(CpuRenderer):
         self._shown_mean = np.zeros(3)
 
     def load_state(self, previous: Gaussians) -> None:
-        """Take the state that a frame starts from; static Gaussians that differ from those before are drawn anew."""
+        """Loads the initial state of a frame; the static background is rendered again if static Gaussians changed."""
         features = previous.features(previous.colours)
         state = take_rows((previous.means, previous.factors, previous.opacities, features), self._static_rows)
         if self._static_state is None or not all(map(np.array_equal, state, self._static_state)):
@@ -119,7 +120,7 @@ class ChangedPixels(CpuRenderer):
         view: TrainingView,
         lap: Callable[[str], None] = no_lap,
     ) -> Gradients:
-        """Renders what changed; sets the losses and ``psnr`` of the whole picture; see ``CpuRenderer``."""
+        """Renders the changed pixels; sets losses and ``psnr`` of the full picture; see ``CpuRenderer``."""
         region = self._render_region((means, factors, opacities, features), view)
         lap("render")
         self._compare_box(region, view)
@@ -134,14 +135,14 @@ class ChangedPixels(CpuRenderer):
         return self._gradients
 
     def forward(self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView) -> None:
-        """As ``forward_backward``, without gradients."""
+        """Same as ``forward_backward``, without gradients."""
         region = self._render_region((means, factors, opacities, features), view)
         self._compare_box(region, view)
 
     def residuals(
         self, state: Gaussians, view: TrainingView, learnt: NDArray[np.uint8], most: float
     ) -> tuple[Array, Array]:
-        """See ``Renderer.residuals``; of moving Gaussians, from the pixels alone that they reach."""
+        """See ``Renderer.residuals``; for moving Gaussians, only the pixels that they reach are summed."""
         if not np.array_equal(learnt, self._is_moving):
             return super().residuals(state, view, learnt, most)
         count, shown = len(state), features_seen(state, view.camera)
@@ -168,11 +169,11 @@ class ChangedPixels(CpuRenderer):
         return red, green, blue
 
     def _render_region(self, state: State, view: TrainingView) -> Region:
-        """Renders the region of a view; widens it until it holds all that moves."""
+        """Renders the region of a view, and enlarges it until it contains all moving Gaussians."""
         key = _key(view)
         region = self._regions.get(key)
         if region is None or region.view is not view:
-            # Made anew in each frame: a replay has no frames before, and figures hang on the box by their rounding.
+            # Rebuilt in every frame: a replay lacks the earlier frames, and rounding errors depend on the box.
             region = self._regions[key] = self._make_region(self._moving_blocks(state, view.camera), view)
         while True:
             part = take_rows(state, region.rows)
@@ -188,7 +189,7 @@ class ChangedPixels(CpuRenderer):
         return blocks_of(self.rasterizer, *take_rows(state, self._moving), camera)
 
     def _make_region(self, marks: NDArray[np.uint64], view: TrainingView) -> Region:
-        """A region around marks, with those of the standing Gaussians that meet it."""
+        """Builds a region around marked blocks that includes the intersecting static Gaussians."""
         assert self._static_state is not None
         blocks, camera = widened(marks, view.camera, MARGIN), view.camera
         splats, rects, _ = self.rasterizer.project(*self._static_state, camera)
@@ -202,7 +203,7 @@ class ChangedPixels(CpuRenderer):
         return region
 
     def _load_view(self, region: Region, view: TrainingView) -> None:
-        """Takes the pictures of a view: its box, and what the rest of the picture adds to the losses."""
+        """Loads the crops of a view's pictures, and computes the losses of the rest of the picture."""
         base = self._static_background(view)
         where = (slice(None), *region.box)
         region.view, region.target = view, np.ascontiguousarray(view.target[where])
@@ -210,10 +211,10 @@ class ChangedPixels(CpuRenderer):
         region.moments = np.ascontiguousarray(whole[0][where]), np.ascontiguousarray(whole[1][where])
         wanted = _outside_region(region.box, region.near, view.camera.height, view.camera.width)
         region.outside_losses = self._losses(base, view, view.target, whole, wanted, base)
-        forget_moments(view)  # those of the box are kept, and nobody needs both
+        forget_moments(view)  # the region keeps its own crop of them
 
     def _static_background(self, view: TrainingView) -> Array:
-        """[4, H, W] of what stands alone."""
+        """Returns the rendering [4, H, W] of the static Gaussians alone."""
         key = _key(view)
         if key not in self._static_planes or not np.array_equal(self._poses[key], view.camera.pose):
             assert self._static_state is not None
@@ -227,7 +228,7 @@ class ChangedPixels(CpuRenderer):
         return self._static_planes[key]
 
     def _compare_box(self, region: Region, view: TrainingView) -> None:
-        """Fills the losses of what was rendered, and the gradient of what is drawn."""
+        """Sets the losses of the rendering, and fills the gradient of the rendered blocks."""
         base, (rows, columns) = self._static_background(view), region.box
         box = (rows.start, rows.stop, columns.start, columns.stop)
         part, g_part = self._part(len(base), box)
@@ -243,7 +244,7 @@ class ChangedPixels(CpuRenderer):
         self._shown_mean = self._static_means[_key(view)] + shifts[:3] / pixels
 
     def _part(self, channels: int, box: tuple[int, int, int, int]) -> tuple[Array, Array]:
-        """[C, h, w] twice, of a box: buffers for what it shows and for the gradient of that."""
+        """Returns two [C, h, w] buffers for a box: one for its rendering, one for the gradient."""
         shape = (2, channels, box[1] - box[0], box[3] - box[2])
         if self._planes.size < (size := int(np.prod(shape))):
             self._planes = np.empty(size + size // 4, np.float32)
@@ -259,9 +260,9 @@ class ChangedPixels(CpuRenderer):
         near: NDArray[np.uint8],
         gradient: Array,
     ) -> NDArray[np.float64]:
-        """Image loss, mask loss and squared error of a part of a view's picture; its gradient is filled where wanted.
+        """Returns image loss, mask loss and squared error of a part of a picture, and fills the requested gradients.
 
-        Without ``image_loss.GRADIENT`` it may be the picture itself, which stays as it is.
+        Without ``image_loss.GRADIENT``, ``gradient`` may be ``planes`` itself, which is not changed.
         """
         channels, height, width = target.shape
         rows, g_exposure = np.empty((channels, height, 2), np.float32), np.empty((channels, height, 2), np.float32)
@@ -275,7 +276,7 @@ class ChangedPixels(CpuRenderer):
         return np.array([sums[:3, 0].sum(), sums[LABEL:, 0].sum(), sums[:3, 1].sum()])
 
     def _cleared(self, channels: int, height: int, width: int) -> Array:
-        """Scratch of the image loss for a box, its border 0."""
+        """Returns the scratch buffer of the image loss for a box, with zeros in its border rows."""
         shape = (6, channels, height + 2 * image_loss.REACH, image_loss.stride(width))
         size = int(np.prod(shape))
         if self._box_scratch.size < size:
@@ -287,20 +288,20 @@ class ChangedPixels(CpuRenderer):
 
 
 def take_rows(state: State, rows: NDArray[np.int64]) -> State:
-    """The rows of a state's arrays."""
+    """Returns the given rows of a state's arrays."""
     one, two, three, four = (np.take(array, rows, axis=0) for array in state)
     return one, two, three, four
 
 
 def _key(view: TrainingView) -> tuple[str, int, int]:
-    """The camera and the size of its pictures: probe views are of the same cameras, and smaller."""
+    """Returns camera name and picture size, since probe views use the same cameras at lower resolution."""
     return view.name, view.camera.width, view.camera.height
 
 
 def _box(shown: NDArray[np.bool_]) -> tuple[slice, slice]:
-    """Box around what is shown that has the windows of all losses which that changes; of nothing a corner.
+    """Returns the box around some pixels with the windows of all losses they affect, or one pixel if there are none.
 
-    Its first column is one of the sixteens of the picture, so that those of ``image_loss.near`` are the picture's.
+    The first column is a multiple of sixteen, so that the flags of ``image_loss.near`` align with those of the picture.
     """
     rows, columns = np.flatnonzero(shown.any(axis=1)), np.flatnonzero(shown.any(axis=0))
     if len(rows) == 0:
@@ -317,10 +318,10 @@ def _box(shown: NDArray[np.bool_]) -> tuple[slice, slice]:
 
 
 def _outside_region(box: tuple[slice, slice], near: NDArray[np.uint8], height: int, width: int) -> NDArray[np.uint8]:
-    """[height, columns] uint8, see ``image_loss.image_loss``: the losses of a picture that a part does not have.
+    """Returns [height, columns] uint8 flags of the losses that lie outside a region, see ``image_loss.image_loss``.
 
     Args:
-        box, near: of the part, see ``Region``.
+        box, near: fields of the ``Region``.
     """
     wanted = np.full((height, image_loss.stride(width) // lanes.COUNT), image_loss.LOSSES)
     rows, first = box[0], box[1].start // lanes.COUNT

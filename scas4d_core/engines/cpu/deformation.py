@@ -1,9 +1,9 @@
-"""D_t on the CPU: the parameters of one frame's deformation, and the fused kernels that apply and differentiate it.
+"""Deformation D_t on the CPU: the parameters of one frame, and fused kernels for its forward and backward pass.
 
 Reference: ``engines.torch.deformation``. Buffers are allocated once per hierarchy.
 
-A Gaussian that is not finite when an update starts is held back: it stays as it is, weighs nothing in the pivots of its
-clusters and in the neighbour terms, and is counted.
+A Gaussian that is not finite when an update starts is held back: it stays unchanged, has no weight in cluster pivots
+and neighbour terms, and is counted.
 """
 
 from __future__ import annotations
@@ -27,21 +27,20 @@ Array = NDArray[np.float32]
 
 
 class CpuDeformation:
-    """The cascade of a hierarchy, what each Gaussian adds, and the terms that tie neighbours together.
+    """The cluster cascade of a hierarchy, the per-Gaussian deltas, and the neighbour terms.
 
     Args:
-        bounds: [M, 3] metres, see ``Structure.length_bounds``. cluster_map, covariance: see
-            ``engines.torch.deformation``.
+        bounds: [M, 3] metres, see ``Structure.length_bounds``.
+        cluster_map, covariance: see ``engines.torch.deformation``.
 
     Attributes:
-        clusters: per layer [K, 10], columns r, t, c, s. deltas: [M, 9], columns Δp, Δr, Δs.
-        cluster_gradients, delta_gradients: the same shapes, filled by ``backward``.
-        means [N, 3], factors [N, 3, 3]: of all Gaussians, filled by ``forward``.
-        turns: [M, 4], rotation since the frame before, filled by ``forward``.
-        held_back: [held] int64, rows of Θ_{t−1} that are not finite, found by ``start``.
-        guards: how often each guard acted since the last ``reset`` of the counts: those of ``cascade.COUNTED_GUARDS``
-            each
-            ``forward``, in layers that do not rest; the others each ``start``.
+        clusters: [K, 10] per layer, columns r, t, c, s. deltas: [M, 9], columns Δp, Δr, Δs.
+        cluster_gradients, delta_gradients: gradients of the same shapes, filled by ``backward``.
+        means [N, 3], factors [N, 3, 3]: all Gaussians, filled by ``forward``.
+        turns: [M, 4] rotations since the previous frame, filled by ``forward``.
+        held_back: [held] int64 rows of Θ_{t−1} that are not finite, found by ``start``.
+        guards: number of times that each guard was triggered since the last ``reset``. ``forward`` counts those of
+            ``cascade.COUNTED_GUARDS`` in layers that are not frozen; ``start`` counts the others.
     """
 
     def __init__(
@@ -77,7 +76,7 @@ class CpuDeformation:
         self._points = np.zeros((max(layers, 1), held, 3, COUNT), np.float32)
         self._sums = np.zeros((max(layers, 1), held, 3), np.float32)
         self._before, self._entering = (np.zeros((held, CARRIED), np.float32) for _ in range(2))
-        self._before[:, 9 * COUNT : 10 * COUNT] = 1  # no turn
+        self._before[:, 9 * COUNT : 10 * COUNT] = 1  # identity quaternion
         self._frozen = 0
         self._records = np.zeros((held, layers, RECORD), np.float32)
         self._excess = np.zeros(held, np.float32)
@@ -94,7 +93,7 @@ class CpuDeformation:
         self._held: tuple[Array, Array] = self.means, self.factors
 
     def start(self, previous: Gaussians) -> None:
-        """Take Θ_{t−1} to deform; standing Gaussians stay as they are in it."""
+        """Loads the state Θ_{t−1} to deform; its static Gaussians stay unchanged."""
         moving = self.hierarchy.rows
         held = np.concatenate([previous.means[moving], previous.factors[moving].reshape(-1, 9)], axis=1)
         sound: NDArray[np.bool_] = np.isfinite(held).all(axis=1)
@@ -116,7 +115,7 @@ class CpuDeformation:
         self.factors = previous.factors.copy()
 
     def _hold_back(self, sound: NDArray[np.bool_]) -> None:
-        """Pivots and neighbour terms without the entries [M] that are not sound; count them."""
+        """Excludes entries [M] that are not sound from pivots and neighbour terms, and counts them."""
         self._present, self._ranges = self._all_present, self._all_ranges
         if self.neighbours is not None:
             self._weights = self.neighbours.weights
@@ -133,12 +132,12 @@ class CpuDeformation:
         self.guards.add(("held_back", "empty_cluster"), np.array([len(self.held_back), empty]))
 
     def freeze_layers(self, layers: int) -> None:
-        """Let the first so many layers rest, as they are set now: they are applied once, and get no gradient.
+        """Freezes the first ``layers`` layers with their current parameters: they are applied once and get no gradient.
 
-        ``forward`` gives the same bits. Unfreeze all layers (``rest(0)``) before setting the parameters of one.
+        ``forward`` gives bit-identical results. Call ``freeze_layers(0)`` before changing the parameters.
 
         Raises:
-            ValueError: the last layer cannot.
+            ValueError: if the last layer would be frozen.
         """
         if layers and layers >= len(self.clusters):
             raise ValueError(f"{layers} of {len(self.clusters)} layers cannot be frozen: the last one always continues")
@@ -155,7 +154,7 @@ class CpuDeformation:
         self._entering[:], self._frozen = self._before, 0
 
     def forward(self) -> None:
-        """Equations (5) to (7): fill ``means``, ``factors`` and ``turns``."""
+        """Evaluates equations (5) to (7); fills ``means``, ``factors`` and ``turns``."""
         deform(
             self._frozen, self._parameters, self._offsets, self._ranges, self._clusters_of, self._entries, self._rows,
             self._present, self._entering, self.deltas, self._about_origin, self._separate, self._points, self._sums,
@@ -165,10 +164,10 @@ class CpuDeformation:
         self.guards.add(COUNTED_GUARDS, self._guard_counts)
 
     def neighbour_losses(self, sample: NDArray[np.int64], weights: tuple[float, float, float]) -> Array:
-        """Means over the sampled pairs of rigidity, isometry and rotation; ``backward`` adds their gradients.
+        """Returns the mean rigidity, isometry and rotation losses of the sampled pairs; ``backward`` adds gradients.
 
         Args:
-            sample: [S] entries of the hierarchy's order. weights: of the three terms.
+            sample: [S] entries of the hierarchy's order. weights: weights of the three terms.
         """
         if self.neighbours is None or len(sample) == 0:
             self._tied[:] = 0
@@ -182,12 +181,12 @@ class CpuDeformation:
         return means
 
     def backward(self, g_means: Array, g_factors: Array, scale_weight: float) -> float:
-        """Fill ``cluster_gradients``, but of layers that rest, and ``delta_gradients``.
+        """Fills ``delta_gradients``, and ``cluster_gradients`` of the layers that are not frozen.
 
         Returns the scale loss (metres, mean over axes).
 
         Args:
-            g_means [N, 3], g_factors [N, 3, 3]: gradients of what ``forward`` filled.
+            g_means [N, 3], g_factors [N, 3, 3]: gradients of the outputs of ``forward``.
         """
         axes = max(1, 3 * len(self.hierarchy.rows))
         deform_backward(
@@ -200,21 +199,21 @@ class CpuDeformation:
 
 
 def cache_lines(count: int) -> Array:
-    """[count, 16] zeros, each row a cache line of 64 bytes."""
+    """Returns zeros [count, 16], one 64-byte cache line per row."""
     flat = np.zeros((count + 1) * STATE, np.float32)
     first = -(flat.ctypes.data // 4) % STATE
     return flat[first : first + count * STATE].reshape(count, STATE)
 
 
 class Blocks(NamedTuple):
-    """The Gaussians of a hierarchy sixteen at a time, each block of one cluster in every layer: B blocks.
+    """The Gaussians of a hierarchy in B blocks of sixteen; in every layer, a block belongs to a single cluster.
 
     Attributes:
-        entries: [B, 16] int64 entries of the hierarchy's order; a block that is not full repeats its last.
-        present: [B, 16] float32, 0 where an entry is repeated, else 1.
-        clusters: [B, L] int64, the clusters of each block, numbered through all layers.
-        offsets: [L + 1] int64, the number of each layer's first cluster.
-        ranges: [clusters of all layers, 3] int64, each one's first block, its last and one more, and its entries.
+        entries: [B, 16] int64 entries of the hierarchy's order; an incomplete block repeats its last entry.
+        present: [B, 16] float32, 0 for repeated entries, else 1.
+        clusters: [B, L] int64 cluster of each block in each layer, numbered across all layers.
+        offsets: [L + 1] int64 number of the first cluster of each layer.
+        ranges: [clusters of all layers, 3] int64: first block, last block + 1, and number of entries of each cluster.
     """
 
     entries: NDArray[np.int64]
@@ -225,7 +224,7 @@ class Blocks(NamedTuple):
 
     @classmethod
     def of(cls, hierarchy: Hierarchy) -> Blocks:
-        """The blocks of a hierarchy."""
+        """Builds the blocks of a hierarchy."""
         count, layers = len(hierarchy.rows), len(hierarchy.sizes)
         finest = hierarchy.starts[-1] if layers else np.array([0, count])
         per_cluster = -(-np.diff(finest) // COUNT)

@@ -1,4 +1,4 @@
-"""The engine of the CPU: one iteration of an update, in the order of algorithm 1."""
+"""CPU engine: one iteration of an update, in the order of algorithm 1."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ Array = NDArray[np.float32]
 
 
 class CpuEngine:
-    """The ``UpdateEngine`` of the CPU. Buffers are allocated once a hierarchy and kept from frame to frame.
+    """The ``UpdateEngine`` of the CPU. Buffers are allocated once per hierarchy and reused for every frame.
 
     Attributes:
-        renderer: draws states with the background, limits and weights of the plan.
+        renderer: renderer of states with the background, limits and weights of the plan.
     """
 
     name = "cpu"
     renderer: CpuRenderer
 
     def bind(self, plan: UpdatePlan, structure: Structure) -> None:
-        """See ``UpdateEngine.bind``; this engine does all that a plan can ask for."""
+        """See ``UpdateEngine.bind``; this engine supports all options of a plan."""
         hierarchy, count = structure.hierarchy, len(structure.roots)
         self._plan, self._structure, self._rows = plan, structure, hierarchy.rows
         given = (plan.background, plan.image, plan.mask)
@@ -53,9 +53,9 @@ class CpuEngine:
         self._probes: list[TrainingView] = []
 
     def load_views(self, views: Sequence[TrainingView], probes: Sequence[TrainingView]) -> None:
-        """See ``UpdateEngine.load_views``; where gains are followed, the views get exposures of their own."""
+        """See ``UpdateEngine.load_views``; if gains are estimated, the views get their own copies of the exposures."""
         self._views, self._probes = list(views), list(probes)
-        if self._plan.camera_gains:  # another attempt at the frame starts from the exposures that it came with
+        if self._plan.camera_gains:  # another attempt must start from the original exposures
             exposures = {view.name: view.exposure.copy() for view in views}
             self._views = [replace(view, exposure=exposures[view.name]) for view in views]
             self._probes = [replace(view, exposure=exposures[view.name]) for view in probes]
@@ -129,7 +129,7 @@ class CpuEngine:
         lap(REPORT)
 
     def _pictures(self, views: Sequence[int], step: StepScalars) -> tuple[float, Gradients]:
-        """Image and mask loss, the mean over the views, and its gradients (of a single view the renderer's buffers)."""
+        """Returns the mean image and mask loss over the views, with gradients (the renderer's buffers for one view)."""
         loss, total = 0.0, None
         for index in views:
             view_loss, gradients = self._picture(index, step)
@@ -141,14 +141,14 @@ class CpuEngine:
             else:
                 for array, more in zip(total, gradients, strict=True):
                     array += more
-        assert total is not None  # an iteration has a view
+        assert total is not None  # an iteration has at least one view
         for array in total:
             array /= len(views)
         self._start.lap("render backward")
         return loss / len(views), total
 
     def _picture(self, index: int, step: StepScalars) -> tuple[float, Gradients]:
-        """Render a view, compare it, and carry its losses back; the log takes how well it was met."""
+        """Renders a view, compares it with its picture and backpropagates the loss; logs the result."""
         view, deformation, renderer, lap = self._views[index], self._deformation, self.renderer, self._start.lap
         if self._gloss is not None:
             self._gloss.shade(deformation.means, deformation.turns, self._colours, view.camera, self._features)
@@ -168,7 +168,7 @@ class CpuEngine:
         return loss, gradients
 
     def _terms(self, gradients: Gradients, step: StepScalars) -> float:
-        """The weighted terms beside those of pictures; their gradients are added or kept for the cascade."""
+        """Computes the weighted terms other than picture losses; adds their gradients or keeps them for the cascade."""
         plan, deformation, loss = self._plan, self._deformation, 0.0
         if plan.neighbour_terms:
             weights = (step.rigidity, plan.isometry, plan.rotation)
@@ -181,7 +181,7 @@ class CpuEngine:
         return loss
 
     def _step(self, gradients: Gradients, step: StepScalars) -> None:
-        """Adam over all that is free."""
+        """Steps Adam for all free parameters."""
         deformation = self._deformation
         for columns, gradient, factor in zip(
             self._layer_columns, deformation.cluster_gradients, step.layers, strict=True
@@ -201,7 +201,7 @@ class CpuEngine:
             self._gains.leave_out([self._views[index] for index in views])
 
     def wait(self, iteration: int) -> None:
-        """See ``UpdateEngine.wait``: here the host does the work itself."""
+        """See ``UpdateEngine.wait``; does nothing, because the host does the work itself."""
 
     def probe(self, which: Sequence[int], *, moved: bool, learnt: bool) -> list[float]:
         """See ``UpdateEngine.probe``."""
@@ -263,7 +263,7 @@ class CpuEngine:
         return self._gains.gains.copy()
 
     def gradients(self) -> dict[str, Array]:
-        """See ``UpdateEngine.gradients``; those of resting layers are not up to date."""
+        """See ``UpdateEngine.gradients``; those of frozen layers are not up to date."""
         deformation = self._deformation
         tables = {f"cluster {layer}": g.copy() for layer, g in enumerate(deformation.cluster_gradients)}
         tables["deltas"] = deformation.delta_gradients.copy()
@@ -274,13 +274,13 @@ class CpuEngine:
         return tables
 
     def _forward(self) -> None:
-        """Bring the deformed Gaussians up to date with the tables."""
+        """Updates the deformed Gaussians from the tables."""
         if not self._deformed:
             self._deformation.forward()
             self._deformed = True
 
     def _with_looks(self, state: Gaussians) -> Gaussians:
-        """A state with the colours, gloss and environment learnt so far."""
+        """Returns a state with the colours, gloss and environment learned so far."""
         if self._gloss is None:
             return state.replace(colours=self._colours)
         return state.replace(colours=self._colours, gloss=self._gloss.gloss, environment=self._gloss.environment)

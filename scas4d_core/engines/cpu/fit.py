@@ -1,4 +1,4 @@
-"""The engine of fits on the CPU: one iteration of 3D Gaussian Splatting."""
+"""CPU engine for fits: one iteration of 3D Gaussian Splatting."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Array = NDArray[np.float32]
 
 
 class _Shapes(NamedTuple):
-    """Arrays that are rendered for a view: the fixed Gaussians, then the fitted ones."""
+    """Arrays that are rendered for a view: the fixed Gaussians, followed by the fitted ones."""
 
     means: Array
     factors: Array
@@ -36,22 +36,22 @@ class _Shapes(NamedTuple):
 
     @classmethod
     def beside(cls, fixed: Gaussians, camera: CameraArrays, count: int) -> _Shapes:
-        """With room for fitted Gaussians after the fixed ones, which have the colours that the camera sees."""
+        """Returns arrays of the fixed Gaussians, as the camera sees them, with space for ``count`` fitted ones."""
         made, rows = cls.empty(len(fixed) + count), len(fixed)
         made.means[:rows], made.factors[:rows] = fixed.means, fixed.factors
         made.opacities[:rows], made.features[:rows] = fixed.opacities, features_seen(fixed, camera)
         return made
 
     def since(self, row: int) -> _Shapes:
-        """The rows from one on, in the same arrays."""
+        """Returns views of the rows from ``row`` onwards."""
         return _Shapes(*[array[row:] for array in self])
 
 
 class CpuFitEngine:
-    """The ``FitEngine`` of the CPU; it changes the arrays of the table that it is given.
+    """The ``FitEngine`` of the CPU; it updates the arrays of the loaded table in place.
 
     Args:
-        renderer: has the weights of the losses.
+        renderer: renderer that also defines the weights of the losses.
     """
 
     def __init__(self, renderer: CpuRenderer) -> None:
@@ -109,7 +109,7 @@ class CpuFitEngine:
         return FitLoss(view, loss, self.renderer.psnr, self.renderer.exposure_gradient, shift)
 
     def _backward(self, drawn: _Shapes, view: TrainingView, rates: Array) -> tuple[Gradients | None, Array]:
-        """Gradients of all that was drawn, None where nothing but colours learns; and those of the features."""
+        """Returns the gradients of all rendered arrays (None if only colours learn) and those of the features."""
         if rates[: COLOUR.start].any() or rates[COLOUR.stop :].any():
             gradients = self.renderer.forward_backward(*drawn, view)
             return gradients, gradients.features
@@ -118,7 +118,7 @@ class CpuFitEngine:
         return None, rasterizer.feature_gradients(rasterizer.gradient_buffers()[0])
 
     def _record_rendering(self, factors: Array, g_screen: Array, camera: CameraArrays, fixed: int) -> None:
-        """Adds a rendering to the statistics, where there are any."""
+        """Adds a rendering to the statistics, if they are collected."""
         statistics = self._table.statistics
         if statistics is not None:
             half = np.array([camera.width / 2, camera.height / 2], np.float32)

@@ -1,4 +1,4 @@
-"""The floor term: moving Gaussians stay above a plane (Dynamic3DGaussians' floor loss, for a plane of any pose)."""
+"""Floor loss: keeps moving Gaussians above a plane (Dynamic3DGaussians' floor loss, for arbitrary planes)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Array = NDArray[np.float32]
 
 
 def floor_term(plane: Plane, means: Array, rows: NDArray[np.int64], weight: float, g_means: Array) -> float:
-    """The weighted mean depth below the floor; its gradient is added to ``g_means``.
+    """Returns the weighted mean depth below the floor, and adds its gradient to ``g_means``.
 
     Args:
         plane: see ``UpdatePlan.floor``. means: [N, 3] metres. rows: [M] moving Gaussians. g_means: [N, 3], added to.
@@ -20,6 +20,6 @@ def floor_term(plane: Plane, means: Array, rows: NDArray[np.int64], weight: floa
         return 0.0
     normal = np.array(plane[:3], np.float32)
     depth = means[rows] @ normal + np.float32(plane[3])
-    below = depth > 0  # not of a Gaussian that is not finite
+    below = depth > 0  # False for Gaussians that are not finite
     g_means[rows[below]] += np.float32(weight / len(rows)) * normal
     return float(weight * depth[below].sum(dtype=np.float64) / len(rows))

@@ -1,6 +1,6 @@
-"""Colours that depend on direction, as a camera sees them; and what they are made of, learnt.
+"""View-dependent colours, and learning of the gloss and environment that produce them.
 
-``kernels.appearance.direction`` has the formula, and is loaded only where something is glossy.
+``kernels.appearance.direction`` has the formula; it is only imported if a Gaussian is glossy.
 """
 
 from __future__ import annotations
@@ -17,39 +17,39 @@ from scas4d_core.gaussians import Gaussians
 Array = NDArray[np.float32]
 
 GLOSS = np.float32(0.5)
-"""Strength that a Gaussian starts with. Only its product with the environment is seen: those of what is as glossy stay
-near it, and the environment has the rest."""
+"""Initial gloss strength of a Gaussian. Only its product with the environment is visible, so equally glossy Gaussians
+stay near this value and the environment absorbs the rest."""
 RATE_GLOSS, RATE_ENVIRONMENT, RATE_NEARNESS = 1e-3, 2e-2, 5e-3
-"""Adam rates in frame 0; that of the gloss at a strength of ``GLOSS`` (``gloss_rate``). Gloss that each Gaussian learns
-fast explains one camera's highlight by itself: on `gloss` test pictures lost 0.6 dB at 5e-3 for strengths and 3e-3 for
-normals."""
+"""Adam learning rates in frame 0; the gloss rate applies at a strength of ``GLOSS`` (``gloss_rate``). With higher
+gloss rates, single Gaussians fit the highlight of one camera: on the `gloss` scene, test views lost 0.6 dB at 5e-3
+for strengths and 3e-3 for normals."""
 UPDATE_RATE_GLOSS, UPDATE_RATE_ENVIRONMENT, UPDATE_RATE_NEARNESS = 2e-3, 1e-2, 1e-3
-"""The same in an update, where they fall to a tenth."""
+"""Adam learning rates in an update, during which they decay to a tenth."""
 NEARNESS = 0.3
-"""1/m, of the environment before any is learnt: lamps of a room."""
+"""Initial nearness of the environment in 1/m, typical of lamps in a room."""
 NEIGHBOURS = 16
-"""Over so many the changes of normals and strengths are averaged: a surface bends slowly, a highlight is small."""
+"""Number of neighbours over which changes of normals and strengths are averaged: surfaces bend slowly."""
 SAME_SIDE = 0.5
-"""Cosine between normals above which neighbours are of one surface."""
+"""Cosine between normals above which neighbours count as the same surface."""
 
 
 def without_turn(count: int) -> Array:
-    """[count, 4] quaternions that turn nothing."""
+    """Returns [count, 4] identity quaternions."""
     turns = np.zeros((count, 4), np.float32)
     turns[:, 0] = 1
     return turns
 
 
 def features_seen(gaussians: Gaussians, camera: CameraArrays, turns: Array | None = None) -> Array:
-    """[N, 4] the features of a state as a camera sees them: RGB and label. See ``colours_seen``."""
+    """Returns the features [N, 4] of a state as a camera sees them: RGB and label. See ``colours_seen``."""
     return gaussians.features(colours_seen(gaussians, camera, turns))
 
 
 def colours_seen(gaussians: Gaussians, camera: CameraArrays, turns: Array | None = None) -> Array:
-    """[N, 3] the colours of a state as a camera sees them; the state's own array where they depend on no direction.
+    """Returns the colours [N, 3] of a state as a camera sees them; the state's own array if nothing is glossy.
 
     Args:
-        turns: [N, 4] unit quaternions by which the Gaussians have turned since their gloss was known; None: not at all.
+        turns: [N, 4] unit quaternions, rotations of the Gaussians since their gloss was stored; None: no rotation.
     """
     if gaussians.gloss is None or gaussians.environment is None:
         return gaussians.colours
@@ -64,11 +64,11 @@ def colours_seen(gaussians: Gaussians, camera: CameraArrays, turns: Array | None
 
 
 def gloss_rate(rate: float, gloss: Array) -> float:
-    """The rate of a gloss [M, 3] that turns its normals as fast as ``rate`` those of a strength of ``GLOSS``.
+    """Returns the gloss learning rate at which normals [M, 3] rotate as fast as at strength ``GLOSS`` with ``rate``.
 
-    Only strength times environment is seen, and a step is as long whatever the strength: at a fifth of it normals turn
-    five times as fast. On `gloss` that cost frame 0 0.6 dB. The strength is the mean, weighted by itself: what is dull
-    has no normal to turn.
+    Adam's step length does not depend on the strength, so at a fifth of the strength normals rotate five times as fast.
+    On the `gloss` scene, this cost 0.6 dB in frame 0. The strength is a mean weighted by itself, because Gaussians
+    without gloss have no normals.
 
     >>> gloss_rate(1e-3, np.array([[0.1, 0, 0], [0, 0, 0.1], [0, 0, 0]], np.float32))
     0.0002
@@ -79,11 +79,11 @@ def gloss_rate(rate: float, gloss: Array) -> float:
 
 
 class GlossShading:
-    """Gloss and environment as parameters, with their gradients and steps.
+    """Gloss and environment as parameters, with their gradients and optimization steps.
 
     Args:
-        gloss: [M, 3] normals times strengths; changed in place. environment: [ROWS, 3]; changed in place.
-        rates: of the gloss, the environment, its nearness.
+        gloss: [M, 3] normals times strengths; updated in place. environment: [ROWS, 3]; updated in place.
+        rates: learning rates of the gloss, the environment and its nearness.
     """
 
     def __init__(self, gloss: Array, environment: Array, rates: tuple[float, float, float]) -> None:
@@ -104,7 +104,7 @@ class GlossShading:
 
     @classmethod
     def fresh(cls, gloss: Array, means: Array, environment: Array | None = None) -> GlossShading:
-        """With an environment of nothing, unless one is given; the middle is that of the means."""
+        """Creates the parameters with the given or a zero environment, centred on the mean of ``means``."""
         from scas4d_core.kernels.appearance import direction
 
         if environment is None:
@@ -114,13 +114,13 @@ class GlossShading:
         return cls(gloss, environment, (gloss_rate(RATE_GLOSS, gloss), RATE_ENVIRONMENT, RATE_NEARNESS))
 
     def shade(self, means: Array, turns: Array, colours: Array, camera: CameraArrays, features: Array) -> None:
-        """Fills RGB of ``features`` [N, 4] as a camera sees them."""
+        """Fills the RGB channels of ``features`` [N, 4] as a camera sees them."""
         self._kernel.shade(means, self.gloss, turns, colours, self.environment, camera.centre, features)
 
     def shade_backward(
         self, means: Array, turns: Array, colours: Array, camera: CameraArrays, g_features: Array
     ) -> None:
-        """Turns the gradient of the features into that of the colours, and keeps what is its own."""
+        """Converts the gradient of the features to that of the colours, and stores those of gloss and environment."""
         g_environment = self._kernel.shade_backward(
             means, self.gloss, turns, colours, self.environment, camera.centre, g_features, self._turned
         )
@@ -132,7 +132,7 @@ class GlossShading:
         self._seen += 1
 
     def step(self, factor: float = 1.0) -> None:
-        """A step of Adam over the mean of what was seen since the last; the environment then sums to nothing."""
+        """Steps Adam with the mean gradient since the last step; then makes the environment sum to zero."""
         from scas4d_core.kernels.adam import EVERY_ROW, adam
 
         self._steps += 1
@@ -151,7 +151,7 @@ class GlossShading:
         np.clip(nearness, 0, None, out=nearness)
 
     def select_rows(self, rows: NDArray[np.int64], parents: NDArray[np.int64]) -> GlossShading:
-        """The same for some rows, with their moments, and for further ones like their parents, without."""
+        """Returns the gloss of some rows with their moments, then copies of the parents' rows with zero moments."""
         every = np.concatenate([rows, parents])
         chosen = GlossShading(self.gloss[every], self.environment, self._rates)
         moments = self.moments[0][:, every]
@@ -164,7 +164,7 @@ class GlossShading:
         """Averages the changes since ``changed_from`` over neighbours on the same side of a surface.
 
         Args:
-            means: [N, 3] by which the neighbours are found, the first time.
+            means: [N, 3] positions from which the neighbours are determined on the first call.
         """
         count = len(self.gloss)
         if self._near is None:
@@ -179,10 +179,10 @@ class GlossShading:
 
 
 def _cell_areas(side: int) -> Array:
-    """[side²] share of the sphere of each cell of an octahedral map; sums to 1."""
+    """Returns the share of the sphere that each cell of an octahedral map covers, [side²]; sums to 1."""
     u, v = np.meshgrid(*[np.linspace(-1, 1, side)] * 2)
     x, y, z = u, v, 1 - abs(u) - abs(v)
-    # The area of the sphere behind a piece of the map goes as 1/|p|³; rows at the rim stand for half a cell.
+    # The solid angle of a map element is proportional to 1/|p|³; rows at the rim represent half a cell.
     fold = z < 0
     x, y = np.where(fold, (1 - abs(v)) * np.sign(u), u), np.where(fold, (1 - abs(u)) * np.sign(v), v)
     area = (x * x + y * y + z * z) ** -1.5
@@ -193,11 +193,11 @@ def _cell_areas(side: int) -> Array:
 
 
 class LearntGloss:
-    """Gloss and environment as parameters of an attempt, and the turns by which normals follow the deformation.
+    """Gloss and environment as parameters of an attempt, with the rotations that make normals follow the deformation.
 
     Args:
-        gloss, environment: of Θ_{t−1}; the gloss is kept as it was turned there. count: N.
-        rows: [M] the moving Gaussians. roots: [N, 3] metres, places in frame 0, which give the neighbours.
+        gloss, environment: those of Θ_{t−1}; the gloss is relative to the orientation in Θ_{t−1}. count: N.
+        rows: [M] the moving Gaussians. roots: [N, 3] metres, positions in frame 0, used for finding neighbours.
     """
 
     def __init__(self, gloss: Array, environment: Array, count: int, rows: NDArray[np.int64], roots: Array) -> None:
@@ -207,30 +207,30 @@ class LearntGloss:
 
     @property
     def gloss(self) -> Array:
-        """[M, 3] as learnt so far, not yet turned."""
+        """[M, 3] current gloss, relative to the orientation in Θ_{t−1}."""
         return self._shading.gloss
 
     @property
     def environment(self) -> Array:
-        """The environment as learnt so far."""
+        """The current environment."""
         return self._shading.environment
 
     def shade(self, means: Array, turns: Array, colours: Array, camera: CameraArrays, features: Array) -> None:
-        """Fill RGB of ``features`` [N, 4] as a camera sees them; ``turns`` [M, 4] of the moving Gaussians."""
+        """Fills RGB of ``features`` [N, 4] as a camera sees them; ``turns`` [M, 4]: rotations of moving Gaussians."""
         self._turns[self._rows] = turns
         self._shading.shade(means, self._turns, colours, camera, features)
 
     def shade_backward(self, means: Array, colours: Array, camera: CameraArrays, g_features: Array) -> None:
-        """Turn gradients of features into those of colours, in place, and keep those of gloss and environment."""
+        """Converts gradients of features to those of colours in place, and stores those of gloss and environment."""
         self._shading.shade_backward(means, self._turns, colours, camera, g_features)
 
     @property
     def gradients(self) -> tuple[Array, Array]:
-        """Gradients of gloss and environment in the last step."""
+        """Returns the gradients of gloss and environment in the last step."""
         return self._shading.gradients
 
     def step(self, factor: float, smooth: bool) -> None:
-        """Step both; ``smooth`` averages the changes of the gloss over neighbours afterwards."""
+        """Steps gloss and environment; if ``smooth``, the changes of the gloss are then averaged over neighbours."""
         self._shading.step(factor)
         if smooth:
             self._shading.smooth(self._roots)

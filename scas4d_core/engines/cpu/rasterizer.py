@@ -1,10 +1,10 @@
-"""The CPU rasterizer: projection, depth order, tile lists, blending, and the backward of all of them.
+"""CPU rasterizer: projection, depth sorting, tile lists, blending, and the backward pass of all stages.
 
-Buffers are allocated once and grow only; forward and backward of the same view share them. Results do not depend
-on the number of threads. Reference: ``engines.torch.rasterizer``.
+Buffers are reused and only grow; forward and backward pass of a view share them. Results do not depend on the number
+of threads. Reference: ``engines.torch.rasterizer``.
 
-A Gaussian that is not finite, or so large that its footprint overflows, is left out of the picture and its gradients
-are 0; so are gradients that overflow. ``CpuRasterizer.guards`` counts them.
+A Gaussian that is not finite, or whose footprint overflows, is not rendered and gets zero gradients. Gradients that
+overflow are set to 0 as well. ``CpuRasterizer.guards`` counts these events.
 """
 
 from __future__ import annotations
@@ -29,13 +29,12 @@ Array = NDArray[np.float32]
 
 
 class Drawing(NamedTuple):
-    """The blocks of a picture that are drawn; none of the others is read or written.
+    """Selects the blocks of a picture to render; other blocks are neither read nor written.
 
     Attributes:
-        blocks: [tiles] uint64, bits as of ``tiles.cover``. learnt: [N] uint8, 1 for the Gaussians that change: they
-            have to stay within (``CpuRasterizer.outside_region`` is true where one did not), and they alone get
-            gradients.
-        mask_to_region: whether only those of the blocks are drawn that these Gaussians reach: ``CpuRasterizer.drawn``.
+        blocks: [tiles] uint64, bits as in ``tiles.cover``. learnt: [N] uint8, 1 for Gaussians that get gradients. They
+            must stay within the blocks; otherwise ``CpuRasterizer.outside_region`` is set.
+        mask_to_region: whether to render only those blocks that these Gaussians reach (``CpuRasterizer.drawn``).
     """
 
     blocks: NDArray[np.uint64]
@@ -44,7 +43,7 @@ class Drawing(NamedTuple):
 
 
 class ForwardPass(NamedTuple):
-    """Inputs and buffers of a forward pass that ``backward`` reads; valid until the next forward pass."""
+    """Inputs and buffers of a forward pass that ``backward`` needs; valid until the next forward pass."""
 
     means: Array
     factors: Array
@@ -66,12 +65,12 @@ class ForwardPass(NamedTuple):
 
 
 class CpuRasterizer:
-    """Renders any number of feature channels in one pass, and carries gradients back.
+    """Renders any number of feature channels in one pass and backpropagates their gradients.
 
     Attributes:
-        guards: number of times that each guard acted since the last ``reset`` of the counts.
-        outside_region: whether a Gaussian that is learnt reached a block that the last forward pass did not draw.
-        drawn: [tiles] uint64, the blocks that it drew.
+        guards: number of times that each guard was triggered since the last ``reset``.
+        outside_region: whether a learned Gaussian reached a block that the last forward pass did not render.
+        drawn: [tiles] uint64, the blocks that the last forward pass rendered.
 
     >>> from scas4d_core.cameras import Camera
     >>> from scas4d_core.gaussians import Gaussians
@@ -85,7 +84,7 @@ class CpuRasterizer:
     >>> picture.features[:, 8, 8].round(2), round(float(picture.transmittance[8, 8]), 2)
     (array([0.89, 0.  , 0.  , 0.  ], dtype=float32), 0.11)
     >>> g_image, g_alpha = rasterizer.gradient_buffers()
-    >>> g_image[0, :16, :16] = 1  # of the sum of red over the pixels
+    >>> g_image[0, :16, :16] = 1  # gradient of the sum of red over all pixels
     >>> rasterizer.backward(g_image, g_alpha).features.round(0)
     array([[113.,   0.,   0.,   0.]], dtype=float32)
     """
@@ -102,7 +101,7 @@ class CpuRasterizer:
         self._histogram = np.empty(tiles.DIGITS, np.int64)
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: Any = np.float32) -> NDArray[Any]:
-        """A contiguous scratch array; grows by a quarter so that a drifting count does not allocate each time."""
+        """Returns a contiguous scratch array; it grows by a quarter, so that drifting sizes rarely reallocate."""
         view = self._views.get(name)
         if view is not None and view.shape == shape:
             return view
@@ -117,13 +116,15 @@ class CpuRasterizer:
     def project(
         self, means: Array, factors: Array, opacities: Array, features: Array, camera: CameraArrays
     ) -> tuple[Array, NDArray[np.int32], NDArray[np.int32]]:
-        """Projects alone; buffers, see ``projection.project``: splats [N, 16], rects [N, 4], counts [N].
+        """Projects the Gaussians without rendering; see ``projection.project``.
+
+        Returns splats [N, 16], rects [N, 4] and counts [N], which are buffers.
 
         Args:
-            means, factors, opacities, features, camera: as of ``forward``.
+            means, factors, opacities, features, camera: see ``forward``.
         """
         count = len(means)
-        # Projection writes whole groups of sixteen.
+        # The projection kernel writes complete groups of sixteen.
         splats = self._buffer("splats", (count + 15, projection.SPLAT_COLUMNS))[:count]
         rects = self._buffer("rects", (count, 4), np.int32)
         counts = self._buffer("counts", (count,), np.int32)
@@ -161,13 +162,12 @@ class CpuRasterizer:
         """Renders features and transmittance of one view.
 
         Args:
-            means: [N, 3] metres; factors: [N, 3, 3]; opacities: [N]; features: [N, C], C a multiple of 4; all float32,
+                means: [N, 3] metres; factors: [N, 3, 3]; opacities: [N]; features: [N, C], C a multiple of 4; float32 and
                 C-contiguous.
-            camera: of the inside world.
+            camera: camera in the internal world.
             background: [C] float32.
-            depth_channel: a channel of ``features`` that this call fills with the depth of the centres (metres
-                along z), or −1.
-            drawing: what is drawn; None: the whole picture.
+                depth_channel: channel of ``features`` to overwrite with the depth of the centres (metres), or −1.
+            drawing: blocks to render; None: the full picture.
         """
         count, channels = features.shape
         width, height, (tiles_x, tiles_y) = camera.width, camera.height, tile_grid(camera)
@@ -189,7 +189,7 @@ class CpuRasterizer:
         )  # fmt: skip
         tasks = threads()
         begins, ends = self._buffer("begins", (2, tasks), np.int64)
-        # One more: a pair that is not reached is written and then overwritten.
+        # One extra element: a pair that is not reached is written and then overwritten.
         most = tiles.share_pairs(order, visible, counts, begins) + 1
         firsts = self._buffer("firsts", (count,), np.int64)
         pairs = self._buffer("pairs", (most, 2), np.int32)
@@ -207,7 +207,7 @@ class CpuRasterizer:
         slots = self._buffer("slots", (entries,), np.int32)
         covers = self._buffer("covers", (entries,), np.uint64)
         tiles.fill_tiles(begins, ends, pairs, pair_covers, cursors, items, slots, covers)
-        # Heavy tiles first, dealt out in turn: the tasks end together.
+        # Heavy tiles are distributed first and round-robin, so that all tasks finish at about the same time.
         tile_order = np.argsort(starts[:-1] - starts[1:], kind="stable")
         tile_order = tile_order[self.drawn[tile_order] != 0]
         image = self._buffer("image", (channels, tiles_y * TILE, tiles_x * TILE))
@@ -223,21 +223,21 @@ class CpuRasterizer:
         return self.picture
 
     def _whole(self, tile_count: int, count: int) -> Drawing:
-        """A drawing of every block, from which every Gaussian learns."""
+        """Returns a ``Drawing`` of all blocks in which every Gaussian gets gradients."""
         blocks, learnt = self._buffer("blocks", (tile_count,), np.uint64), self._buffer("learnt", (count,), np.uint8)
         blocks[:], learnt[:] = np.uint64(2**64 - 1), 1
         return Drawing(blocks, learnt)
 
     def gradient_buffers(self) -> tuple[Array, Array]:
-        """dL/dfeatures [C, rows, stride] and dL/dalpha [rows, stride] to fill before ``backward``.
+        """Returns the buffers for dL/dfeatures [C, rows, stride] and dL/dalpha [rows, stride] that ``backward`` reads.
 
-        Padded to whole tiles like the forward buffers. They hold 0 when first given out for a size of picture; the
-        padding must keep it.
+        They are padded to whole tiles like the forward buffers, and are zero when first returned for a picture
+        size. The padding must stay zero.
         """
         camera, image, transmittance = self._last.camera, self._last.image, self._last.transmittance
         g_image = self._buffer("g_image", image.shape)
         g_alpha = self._buffer("g_alpha", transmittance.shape)
-        # Pictures of another size may have the same tiles: their gradients would stay in the padding.
+        # Pictures of a different size can have the same number of tiles; their gradients would remain in the padding.
         shape = (len(image), camera.height, camera.width)
         if self._gradient_shape != shape:
             g_image[:] = 0
@@ -246,17 +246,17 @@ class CpuRasterizer:
         return g_image, g_alpha
 
     def backward(self, g_image: Array, g_alpha: Array, detached: int = -1) -> Gradients:
-        """Carries gradients of a loss back through the last forward pass.
+        """Backpropagates the gradients of a loss through the last forward pass.
 
         Args:
-            g_image, g_alpha: from ``gradient_buffers``, filled.
-            detached: a channel whose gradient reaches the features but not the geometry, or −1. Its plane of the
-                forward picture is cleared.
+            g_image, g_alpha: filled buffers from ``gradient_buffers``.
+            detached: channel whose gradient reaches the features but not the geometry, or −1. Its plane of the forward
+                picture is set to zero.
         """
         last = self._last
         features, image = last.features, last.image
         if detached >= 0:
-            # A channel that is zero everywhere pulls at nothing; its own gradient does not read its value.
+            # A channel of zeros contributes nothing to the geometry, and the gradient of its features does not read it.
             features = features.copy()
             features[:, detached] = 0
             image[detached] = 0
@@ -284,7 +284,7 @@ class CpuRasterizer:
         return gradients
 
     def feature_gradients(self, g_image: Array) -> Array:
-        """[N, 4] the gradients of features that ``backward`` finds, alone; of pictures of four channels."""
+        """Returns only the feature gradients [N, 4] that ``backward`` computes; for pictures of four channels."""
         last, count = self._last, len(self._last.features)
         records = self._buffer("records", (last.pairs, blend_kernels.record_columns(blend_kernels.GROUP)))
         feature_gradients.blend_features(
@@ -300,7 +300,7 @@ class CpuRasterizer:
 
     @property
     def planes(self) -> Array:
-        """[C, rows, stride] of the last forward pass, padded to whole tiles."""
+        """[C, rows, stride] planes of the last forward pass, padded to whole tiles."""
         return self._last.image
 
     @property
@@ -311,10 +311,10 @@ class CpuRasterizer:
 
     @property
     def splats(self) -> Array:
-        """[N, 16] of the last forward pass, columns as in ``kernels.projection``."""
+        """[N, 16] splats of the last forward pass, columns as in ``kernels.projection``."""
         return self._last.splats
 
     @property
     def counts(self) -> NDArray[np.int32]:
-        """[N] tiles that each Gaussian reached in the last forward pass, 0 where culled."""
+        """[N] number of tiles that each Gaussian reached in the last forward pass, 0 if culled."""
         return self._last.counts

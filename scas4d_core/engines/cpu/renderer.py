@@ -1,4 +1,4 @@
-"""The renderer of the CPU: draws states, compares them with pictures, and carries the image and mask loss back."""
+"""CPU renderer: renders states, compares them with pictures and backpropagates the image and mask loss."""
 
 from __future__ import annotations
 
@@ -23,25 +23,25 @@ Array = NDArray[np.float32]
 Moments = tuple[Array, Array]
 
 _moments: WeakKeyDictionary[TrainingView, Moments] = WeakKeyDictionary()
-"""SSIM's windowed means of the target and of its square, by view: made once, shared by the renderers of a scene."""
+"""SSIM moments (windowed means of the target and of its square) per view, computed once and shared by renderers."""
 
 
 def no_lap(stage: str) -> None:
-    """Nobody takes the time."""
+    """Ignores the end of a stage."""
 
 
 class CpuRenderer:
-    """Renders states of a scene; the ``Renderer`` of the CPU, and the loss of the iterations there.
+    """Renders states of a scene (the ``Renderer`` of the CPU) and computes the picture loss of the iterations.
 
     Args:
-        background: RGB behind everything.
-        image_weight, mask_weight: weights of the two terms of the loss.
-        mask_moves: whether the mask loss pulls at positions and shapes, or at the labels alone: masks have hard edges,
-            and a silhouette fitted to them is not the one that fits the pictures.
+        background: RGB behind all Gaussians.
+        image_weight, mask_weight: weights of the two loss terms.
+        mask_moves: whether the mask loss affects positions and shapes, or only the labels. Masks have hard edges, so a
+            silhouette fitted to them differs from the one that fits the pictures.
         limits: constants of the rasterizer.
 
     Attributes:
-        image_part, mask_part, psnr: of the last comparison; weighted losses and dB.
+        image_part, mask_part, psnr: weighted losses and PSNR (dB) of the last comparison.
         exposure_gradient: [C, 2] gradient of its loss with respect to the camera's gain and offset.
     """
 
@@ -64,12 +64,12 @@ class CpuRenderer:
         self.psnr = 0.0
 
     def with_new_buffers(self, mask_weight: float) -> CpuRenderer:
-        """A renderer of whole pictures with the same background and limits; its mask loss teaches the labels alone."""
+        """Returns a full-picture renderer with the same background and limits; its mask loss affects only labels."""
         red, green, blue, _ = self._background.tolist()
         limits = Limits(*self.rasterizer.limits.tolist())
         return CpuRenderer((red, green, blue), 1.0, mask_weight, mask_weight == 0, limits)
 
-    # The ``Renderer`` interface: states.
+    # The ``Renderer`` interface, for states.
 
     def render(
         self,
@@ -123,10 +123,10 @@ class CpuRenderer:
         )
         return as_grid(blocks_of(self.rasterizer, means, factors, opacities, features, camera), camera)
 
-    # The loss of an iteration: arrays that change in place.
+    # The loss of an iteration, for arrays that change in place.
 
     def load_state(self, previous: Gaussians) -> None:
-        """Take the state that a frame starts from; here nothing depends on it."""
+        """Loads the initial state of a frame; this class does not need it."""
 
     def forward_backward(
         self,
@@ -137,13 +137,13 @@ class CpuRenderer:
         view: TrainingView,
         lap: Callable[[str], None] = no_lap,
     ) -> Gradients:
-        """Render the view, set ``image_part``, ``mask_part`` and ``psnr`` (dB), and return the gradients.
+        """Renders the view, sets ``image_part``, ``mask_part`` and ``psnr`` (dB), and returns the gradients.
 
-        The gradients are buffers, valid until the next call.
+        The gradients are buffers that stay valid until the next call.
 
         Args:
             means, factors, opacities, features: [N, 3], [N, 3, 3], [N], [N, 4] (RGB, label), float32.
-            lap: called when each stage is done.
+            lap: callback at the end of each stage.
         """
         self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background)
         lap("render")
@@ -155,19 +155,20 @@ class CpuRenderer:
         return gradients
 
     def forward(self, means: Array, factors: Array, opacities: Array, features: Array, view: TrainingView) -> None:
-        """Render the view and set ``image_part``, ``mask_part`` and ``psnr``, without gradients; see
-        ``forward_backward``.
+        """Renders the view and sets ``image_part``, ``mask_part`` and ``psnr``, without gradients.
+
+        See ``forward_backward``.
         """
         self.rasterizer.forward(means, factors, opacities, features, view.camera, self._background)
         g_image, _ = self.rasterizer.gradient_buffers()
         self._compare(view, g_image)
 
     def shown(self, view: TrainingView) -> Picture:
-        """The view's whole picture as ``forward_backward`` rendered it last; valid until anything else is rendered."""
+        """Returns the view's full picture as last rendered by ``forward_backward``; valid until the next rendering."""
         return self.rasterizer.picture
 
     def colour_shift(self, view: TrainingView) -> tuple[float, float, float]:
-        """Mean of the view's picture minus mean of what was rendered for it last, exposure included, RGB in 0…1."""
+        """Returns the mean of the view's picture minus that of its last rendering, with exposure, RGB in 0…1."""
         height, width = view.camera.height, view.camera.width
         rendered = means(self.rasterizer.planes[:3, :height, :width])
         shown = view.exposure[:3, 0] * rendered + view.exposure[:3, 1]
@@ -175,7 +176,7 @@ class CpuRenderer:
         return red, green, blue
 
     def _compare(self, view: TrainingView, g_image: Array) -> None:
-        """Fill the losses of what was rendered, and its gradient."""
+        """Sets the losses of the last rendering and fills its gradient."""
         channels, height, width = view.target.shape
         rows = np.empty((channels, height, 2), np.float32)
         g_exposure = np.empty((channels, height, 2), np.float32)
@@ -191,7 +192,7 @@ class CpuRenderer:
         self.exposure_gradient[:channels] = g_exposure.sum(axis=1)
 
     def _lacking(self, view: TrainingView, most: float) -> tuple[Array, Array]:
-        """The sums of ``residuals`` over what was drawn."""
+        """Returns the sums of ``residuals`` over the last rendering."""
         height, width = view.camera.height, view.camera.width
         g_image, _ = self.rasterizer.gradient_buffers()
         gain, offset = view.exposure[:3, :1, None], view.exposure[:3, 1:, None]
@@ -202,7 +203,7 @@ class CpuRenderer:
         return sums[:, :3].copy(), sums[:, LABEL].copy()
 
     def _moments(self, view: TrainingView) -> Moments:
-        """[C, H, W] twice: SSIM's windowed means of a view's target and of its square."""
+        """Returns the two SSIM moments [C, H, W] of a view: windowed means of the target and of its square."""
         moments = _moments.get(view)
         if moments is None:
             moments = np.empty_like(view.target), np.empty_like(view.target)
@@ -211,7 +212,7 @@ class CpuRenderer:
         return moments
 
     def _scratch_of(self, channels: int, height: int, width: int) -> Array:
-        """Zero-bordered scratch of the image loss, one for each size of picture."""
+        """Returns the zero-bordered scratch buffer of the image loss, one per picture size."""
         key = (channels, height, width)
         if key not in self._scratch:
             padded = (6, channels, height + 2 * image_loss.REACH, image_loss.stride(width))
@@ -220,14 +221,14 @@ class CpuRenderer:
 
 
 def forget_moments(view: TrainingView) -> None:
-    """Free the moments of a view, of which its renderer has kept the part that it needs."""
+    """Drops the cached moments of a view, when its renderer has copied the part that it needs."""
     _moments.pop(view, None)
 
 
 def blocks_of(
     rasterizer: CpuRasterizer, means: Array, factors: Array, opacities: Array, features: Array, camera: CameraArrays
 ) -> NDArray[np.uint64]:
-    """[tiles] blocks of a picture that the supports of Gaussians meet."""
+    """Returns the [tiles] block masks of a picture that the supports of Gaussians intersect."""
     splats, rects, _ = rasterizer.project(means, factors, opacities, features, camera)
     tiles_x, tiles_y = tile_grid(camera)
     marks = np.zeros(tiles_x * tiles_y, np.uint64)
