@@ -1,1 +1,1 @@
-"""Measures the method and the service; run by `scripts/bench`, not packaged."""
+"""Studies that measure the method and the service; run by `scripts/bench`, not packaged."""

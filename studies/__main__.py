@@ -1,10 +1,10 @@
-"""`scripts/bench`, from a checkout: `python -m studies`."""
+"""Entry point of `scripts/bench` in a checkout: `python -m studies`."""
 
 from __future__ import annotations
 
 
 def remedy(missing: ModuleNotFoundError) -> str:
-    """Names what to install for a missing package, as matplotlib; studies need everything that the tests need."""
+    """Prints what to install if a package such as matplotlib is missing; studies need all test dependencies."""
     return f"this needs {missing.name}, which is not installed; in the checkout: scripts/setup dev"
 
 

@@ -1,4 +1,4 @@
-"""A measurement in a process of its own, so that its memory and its caches are not those of earlier work."""
+"""Measurements in a separate process, so that memory and caches of earlier work do not affect them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 
 def in_a_process(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Calls a function of a module in a fresh process; returns its result, or raises its exception.
+    """Calls a function of a module in a new process; returns its result or raises its exception.
 
     Raises:
         BrokenProcessPool: the process ended before it answered: out of memory, or killed.

@@ -1,4 +1,4 @@
-"""Captures of studies, of any layout, with cameras to measure on."""
+"""Captures of any layout for studies, with cameras to measure on."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from scas4d_core.captures import Capture
 
 
 def open_measured(folder: Path | str, options: CaptureOptions = DEFAULT_OPTIONS, **more: Any) -> Capture:
-    """Opens a capture to measure on: where it has no test cameras on its training cameras, and says so.
+    """Opens a capture for a study; without test cameras, it measures on the training cameras and prints a note.
 
     Args:
         folder: of the capture. options: how it is read. more: as in `open_source`.

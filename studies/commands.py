@@ -1,4 +1,4 @@
-"""`scripts/bench`: the list of all studies. Each study's own modules are imported when it runs."""
+"""List of all studies of `scripts/bench`. The modules of a study are imported when it runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Varies constants of the method: numbers that only its author turns, each in the module that uses it."""
+"""Variation of the method's internal constants, each in the module that uses it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 @contextmanager
 def varied(place: str, value: Any) -> Iterator[None]:
-    """Gives a module's constant another value for a while, in this process.
+    """Temporarily sets a module's constant to another value, in this process.
 
     A constant that a compiled kernel reads keeps the value that the kernel was compiled with.
 
@@ -37,7 +37,7 @@ def varied(place: str, value: Any) -> Iterator[None]:
 
 @contextmanager
 def all_varied(constants: Iterable[tuple[str, Any]]) -> Iterator[None]:
-    """Gives several constants another value for a while, see ``varied``; each is its dotted name and the value."""
+    """Temporarily sets several constants, see ``varied``; each is given by its dotted name and the value."""
     with ExitStack() as stack:
         for place, value in constants:
             stack.enter_context(varied(place, value))

@@ -18,7 +18,7 @@ CPU_INFO = Path("/proc/cpuinfo")
 
 
 def machine() -> dict[str, Any]:
-    """Processor, cores this process may use, memory, system and Python, for a row of a study."""
+    """Returns processor, usable cores, memory, system and Python version, for a row of a study."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     facts: dict[str, Any] = {"processor": processor(), "cores": cores}
     if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
@@ -27,7 +27,7 @@ def machine() -> dict[str, Any]:
 
 
 def in_words(of: Mapping[str, Any]) -> str:
-    """One line of what ``machine`` returned; what is not known is left out."""
+    """Formats the result of ``machine`` as one line; unknown values are omitted."""
     words = [str(of.get("processor", "unknown processor"))]
     if "cores" in of:
         words.append(f"{of['cores']} core{'s' if of['cores'] != 1 else ''}")
@@ -41,7 +41,7 @@ def in_words(of: Mapping[str, Any]) -> str:
 
 
 def processor() -> str:
-    """The processor's name."""
+    """Returns the name of the processor."""
     if CPU_INFO.exists():
         for line in CPU_INFO.read_text().splitlines():
             if line.startswith("model name"):
@@ -50,7 +50,7 @@ def processor() -> str:
 
 
 def resident_mb(pid: int | None = None) -> float:
-    """Resident memory of a process, this one without ``pid``, 10⁶ bytes; NaN where it cannot be read."""
+    """Returns the resident memory of a process (default: this one) in 10⁶ bytes, or NaN if it cannot be read."""
     with contextlib.suppress(OSError):
         for line in Path(f"/proc/{pid or 'self'}/status").read_text().splitlines():
             if line.startswith("VmRSS"):
@@ -59,7 +59,7 @@ def resident_mb(pid: int | None = None) -> float:
 
 
 def core_version() -> str:
-    """Eight hexadecimal digits of the sources of the method (all of ``scas4d_core``).
+    """Returns eight hexadecimal digits that identify the sources of the method (all of ``scas4d_core``).
 
     Settings name a row; this says which rows come from the same code.
     """

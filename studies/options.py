@@ -1,4 +1,4 @@
-"""Options, output and folders that several studies share."""
+"""Options, output and folders shared by several studies."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Again = Annotated[bool, typer.Option("--again", help="Measure rows anew that are
 
 
 def write_part(path: Path, text: str) -> None:
-    """Replaces the part of a page between two marks, the first and the last line of ``text``.
+    """Replaces the part of a page between two marks, which are the first and the last line of ``text``.
 
     The rest of the page stays. Without the marks the text goes to the end.
     """
@@ -44,7 +44,7 @@ def write_part(path: Path, text: str) -> None:
 
 
 def write_page(out: Path | None, text: str) -> None:
-    """Writes the text to `out`, whose folder is made when missing; does nothing for None."""
+    """Writes the text to `out`, creating its folder if necessary; does nothing for None."""
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text(text if text.endswith("\n") else text + "\n")

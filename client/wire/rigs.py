@@ -29,7 +29,7 @@ class CameraModel(Model):
     def _can_be(self) -> CameraModel:
         if self.name == "time" or self.name.startswith("mask."):
             raise InputError(f"camera name {self.name!r} is the name of another field of a frame", "rename the camera")
-        self.camera()  # raises CameraError, a ValueError, for what cannot be a camera
+        self.camera()  # raises CameraError, a ValueError, for an invalid camera
         return self
 
     def camera(self) -> Camera:

@@ -17,7 +17,7 @@ class Limits(NamedTuple):
             invisible in 8-bit pictures. Culling by this support is exact.
         alpha_cap: upper bound of a Gaussian's alpha; it bounds 1/(1 − alpha) in the backward pass.
         transmittance_stop: a pixel is finished when its transmittance would fall below this value.
-            low_pass: pixels², added to the diagonal of the projected covariance, so that a Gaussian covers a pixel.
+        low_pass: pixels², added to the diagonal of the projected covariance, so that a Gaussian covers a pixel.
         near: metres; Gaussians closer than this are culled.
         tangent_margin: how far x/z (y/z) may lie beyond the picture's border before the projection's Jacobian is
             evaluated at a clamped position; in units of half the picture's width (height).

@@ -23,7 +23,7 @@ class Picture(NamedTuple):
     """A rendered picture. It may share a buffer of the renderer, which the next call overwrites.
 
     Attributes:
-            features: [C, H, W] float32, before the camera's exposure.
+        features: [C, H, W] float32, before the camera's exposure.
         transmittance: [H, W] float32, remaining transmittance.
     """
 

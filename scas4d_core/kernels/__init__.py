@@ -1,1 +1,1 @@
-"""Numba kernels of the CPU engine: flat functions over arrays, each tested against torch."""
+"""Numba kernels of the CPU engine: plain functions on arrays, each tested against PyTorch."""

@@ -1,8 +1,7 @@
-"""Free parameters of frame 0 to the rasterizer's inputs, and gradients back. Twin: the same formulas in torch, in the
-tests.
+"""Activation of the parameters of frame 0 to the rasterizer's inputs, and its backward pass.
 
-F = R(q/|q|) diag(exp s); opacity = sigmoid(o); label = sigmoid(m). A quaternion without a direction is no rotation:
-``guards.QUATERNION_FLOOR``.
+F = R(q/|q|) diag(exp s); opacity = sigmoid(o); label = sigmoid(m). A zero quaternion is treated as no rotation:
+``guards.QUATERNION_FLOOR``. The tests contain a reference in PyTorch.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from scas4d_core.kernels.jit import LOG2_E, ONE, ZERO, exp, inline, parallel_ker
 
 CHUNK = 256
 
-# Columns of a row of parameters: mean 0–2, quaternion 3–6, log scale 7–9, opacity logit 10, colour 11–13, label 14.
+# Columns of a parameter row: mean 0–2, quaternion 3–6, log scale 7–9, opacity logit 10, colour 11–13, label 14.
 COLUMNS = 15
 
 
@@ -38,7 +37,7 @@ def activate(
     """Fills means [N, 3], factors [N, 3, 3], opacities [N], features [N, 4] (RGB, label) from parameters [N, 15].
 
     Returns:
-        [2] Gaussians for which each guard in ``COUNTED_GUARDS`` acted.
+        [2] number of Gaussians for which each guard in ``COUNTED_GUARDS`` was triggered.
     """
     guard_counts = np.zeros((-(-len(parameters) // CHUNK), len(COUNTED_GUARDS)), np.int64)
     activate_rows(parameters, means, factors, opacities, features, guard_counts)
@@ -48,7 +47,7 @@ def activate(
 
 @inline
 def direction(p):
-    """The unit quaternion of a row of parameters, and 1 over its length; no rotation and 0 without a direction."""
+    """Returns the unit quaternion of a parameter row and its inverse norm; identity and 0 for a zero quaternion."""
     square = p[3] * p[3] + p[4] * p[4] + p[5] * p[5] + p[6] * p[6]
     directed = square > SHORTEST
     norm = ONE / np.float32(np.sqrt(square)) if directed else ZERO
@@ -61,7 +60,7 @@ def direction(p):
 
 @parallel_kernel
 def activate_rows(parameters, means, factors, opacities, features, guard_counts):
-    """Runs ``activate`` in tasks; ``guard_counts`` [tasks, 2] is filled."""
+    """Runs ``activate`` in parallel tasks; fills ``guard_counts`` [tasks, 2]."""
     count = parameters.shape[0]
     for task in prange((count + CHUNK - 1) // CHUNK):
         aimless = clamped = 0
@@ -87,7 +86,7 @@ def activate_rows(parameters, means, factors, opacities, features, guard_counts)
 
 @parallel_kernel
 def activate_backward(parameters, factors, opacities, features, g_means, g_factors, g_opacities, g_features, gradients):
-    """Fills dL/dparameters [N, 15] from the rasterizer's gradients."""
+    """Fills dL/dparameters [N, 15] from the gradients of the rasterizer's inputs."""
     count = parameters.shape[0]
     for task in prange((count + CHUNK - 1) // CHUNK):
         for i in range(task * CHUNK, min(count, (task + 1) * CHUNK)):

@@ -1,6 +1,6 @@
-"""A step of Adam (Kingma and Ba 2015) over a table of parameters, a rate per column. Twin: ``torch.optim.Adam``.
+"""Adam step (Kingma and Ba 2015) for a parameter table with one rate per column. Reference: ``torch.optim.Adam``.
 
-Numbers that are not finite, or would not stay so, are clamped and counted: ``guards.GRADIENT_CEILING``,
+Values that are not finite, or would become so, are clamped and counted: ``guards.GRADIENT_CEILING``,
 ``guards.MOMENT_FLOOR``.
 """
 
@@ -24,7 +24,7 @@ COUNTED_GUARDS = ("gradient_ceiling", "moment_floor")
 """Guards that ``adam`` counts."""
 
 EVERY_ROW = np.ones(1, np.float32)
-"""``by_row`` where all rows have the same rates."""
+"""``by_row`` if all rows have the same rates."""
 
 ROWS = 1024
 
@@ -43,13 +43,13 @@ def adam(
     """Updates ``parameters`` [n, columns] in place.
 
     Args:
-        gradients: [n, columns], C-contiguous; guarded numbers are overwritten with their bounds.
-        first, second: [n, columns], moments, updated in place. rates: [columns].
-        by_row: [n], factor on the rates of each row, or ``EVERY_ROW``.
-        beta1, beta2: decays (float32). step: 1 for the first update.
+        gradients: [n, columns], C-contiguous; guarded values are overwritten with their bounds.
+        first, second: [n, columns] moments, updated in place. rates: [columns] learning rates.
+        by_row: [n] factor on the rates of each row, or ``EVERY_ROW``.
+        beta1, beta2: decay rates (float32). step: 1 for the first update.
 
     Returns:
-        [2] numbers of the gradient on which each guard in ``COUNTED_GUARDS`` acted.
+        [2] number of gradient values for which each guard in ``COUNTED_GUARDS`` was triggered.
     """
     guard_counts = np.zeros((-(-len(parameters) // ROWS), len(COUNTED_GUARDS)), np.int64)
     adam_rows(parameters, gradients, first, second, rates, by_row, beta1, beta2, step, guard_counts)
@@ -59,8 +59,8 @@ def adam(
 
 @kernel
 def guard_gradients(gradients, first, last, guard_counts):
-    """Clamps the numbers from flat index ``first`` to before ``last``; adds to ``guard_counts`` [2]."""
-    # A sum shows at once whether any number needs a guard: NaN and infinity stay in it.
+    """Clamps values from flat index ``first`` up to, but not including, ``last``; adds to ``guard_counts`` [2]."""
+    # A single sum reveals whether any value needs a guard, because NaN and infinity propagate.
     total, least = lanes.fill(ZERO), lanes.fill(ONE)
     for place in range(first, last, lanes.COUNT):
         size = lanes.magnitude(lanes.load_first(gradients, place, last - place))
@@ -75,7 +75,7 @@ def guard_gradients(gradients, first, last, guard_counts):
         size = lanes.magnitude(given)
         tiny = (size > ZERO) & (size <= SMALLEST)
         fits = size <= LARGEST
-        # NaN is neither above nor below 0: it becomes 0.
+        # NaN compares neither above nor below 0, so it becomes 0.
         bound = lanes.choose(given > ZERO, most, lanes.choose(given < ZERO, -most, lanes.fill(ZERO)))
         taken = lanes.choose(fits, lanes.choose(tiny, lanes.fill(ZERO), given), bound)
         lanes.store_first(gradients, place, last - place, taken)
@@ -87,7 +87,7 @@ def guard_gradients(gradients, first, last, guard_counts):
 
 @parallel_kernel
 def adam_rows(parameters, gradients, first, second, rates, by_row, beta1, beta2, step, guard_counts):
-    """Runs ``adam`` in tasks; ``guard_counts`` [tasks, 2] is added to."""
+    """Runs ``adam`` in parallel tasks; adds to ``guard_counts`` [tasks, 2]."""
     rows, columns = parameters.shape
     correction1 = ONE - np.float32(beta1**step)
     correction2 = ONE - np.float32(beta2**step)

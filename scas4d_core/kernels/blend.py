@@ -1,7 +1,7 @@
-"""Front-to-back blending of tiles, forward and backward. Reference: ``engines.torch.rasterizer``.
+"""Front-to-back blending of tiles, forward and backward pass. Reference: ``engines.torch.rasterizer``.
 
-A tile is 8×8 blocks of 4×4 pixels, and a block is one ``Lanes``. For each Gaussian, the blocks that its support meets
-are visited (``tiles.cover``), in the order of their bits.
+A tile is 8×8 blocks of 4×4 pixels, and a block is one ``Lanes``. For each Gaussian, the blocks that intersect its
+support (``tiles.cover``) are visited in the order of their bits.
 """
 
 from __future__ import annotations
@@ -16,37 +16,37 @@ from scas4d_core.kernels.jit import HALF, ONE, TWO, ZERO, inline, kernel, parall
 from scas4d_core.kernels.projection import CONIC_A, CONIC_B, CONIC_C, LOG_OPACITY, MEAN_X, MEAN_Y, TILE
 
 # Columns of a pair's gradient record: sums over the tile's pixels of dL/dpower times the monomials of the offset
-# (dx, dy), then the features.
+# (dx, dy), followed by the features.
 SUM_1, SUM_X, SUM_Y, SUM_XX, SUM_XY, SUM_YY, FEATURES = range(7)
 
 GROUP = 4
-"""Channels are blended four at a time, written out."""
+"""Channels are blended in unrolled groups of four."""
 
 BLOCK = lanes.ACROSS
 BLOCKS = (TILE // BLOCK) ** 2
 BLOCK_X = np.array([BLOCK * (block >> 3) for block in range(BLOCKS)], np.float32)
 BLOCK_Y = np.array([BLOCK * (block & 7) for block in range(BLOCKS)], np.float32)
 AHEAD = 4
-"""Entries by which a Gaussian's numbers are prefetched: they lie anywhere in memory."""
+"""Prefetch distance in entries; the data of Gaussians is scattered in memory."""
 
 HALF_LOG2_E = np.float32(0.5 * 1.4426950408889634)
-"""Powers are of 2 inside: alpha = 2^(log2(opacity) − HALF_LOG2_E · quadratic form)."""
+"""Factor for powers of 2: alpha = 2^(log2(opacity) − HALF_LOG2_E · quadratic form)."""
 
 
 def record_columns(channels: int) -> int:
-    """Columns of a gradient record: whole ``Lanes``."""
+    """Returns the number of columns of a gradient record, a multiple of ``Lanes``."""
     return -(-(FEATURES + channels) // lanes.COUNT) * lanes.COUNT
 
 
 @inline
 def without_lowest_block(cover):
-    """A cover without its lowest block."""
+    """Clears the lowest block of a cover."""
     return cover & (cover - np.uint64(1))
 
 
 @inline
 def fetch_ahead(entry, end, items, splats, features):
-    """Prefetches the numbers of an entry further on."""
+    """Prefetches the data of a later entry."""
     i = items[min(entry + AHEAD, end - 1)]
     lanes.prefetch_row(splats, i)
     lanes.prefetch_row(features, i)
@@ -54,7 +54,7 @@ def fetch_ahead(entry, end, items, splats, features):
 
 @kernel
 def copy_blocks(plane, y_first, x_first, state, start, step, inward):
-    """Copies between a plane's tile and one plane of the blocks' state, from ``start``, a block each ``step``."""
+    """Copies blocks between a tile of a plane and the block state, from ``start`` with ``step`` per block."""
     for column in range(TILE // BLOCK):
         for row in range(TILE // BLOCK):
             place = start + step * (column * (TILE // BLOCK) + row)
@@ -89,7 +89,7 @@ def blend_task(
     faintest = np.float32(log2(limits[0]))
     channels = GROUP * len(groups)
     tiles_x = (size[0] + TILE - 1) // TILE
-    # Per block: light left, negative once the pixel is finished; colours.
+    # Per block: transmittance, negative if the pixel is finished; colours.
     step = lanes.COUNT * (1 + channels)
     state = np.empty(BLOCKS * step + lanes.COUNT, np.float32)
     base = lanes.aligned(state)
@@ -125,8 +125,8 @@ def blend_task(
                 after = before - weight
                 drawn = (power >= faintest) & (after >= stop)
                 if not lanes.any_of(drawn):
-                    # Nothing visible, though pixels may end here. The backward skips a visit that changes nothing;
-                    # a block that is finished is not visited again.
+                    # Nothing visible, but pixels may end here. The backward pass skips a visit that changes nothing.
+                    # A finished block is not visited again.
                     bit = np.uint64(1) << np.uint64(block)
                     ended = (power >= faintest) & (before > ZERO)
                     if lanes.any_of(ended):
@@ -191,14 +191,14 @@ def blend(
 
     Args:
         splats: [N, 16]; features: [N, C] float32, C a multiple of 4; starts [tiles + 1], items: tile lists.
-        groups: a tuple of C/4 numbers, whose length the compiler knows.
-        covers: [entries] uint64, the blocks of the tile that the entry's support meets; left with those where it was
-            drawn.
-        wanted: [tiles] uint64, the blocks of each tile that are drawn; the others come out as the background.
-        tile_order: int64, the tiles to blend, dealt to ``tasks`` in this order; others are left as they are.
+        groups: a tuple of length C/4, which is known at compile time.
+        covers: [entries] uint64, the blocks of the tile that the entry's support intersects; reduced to those where it
+            was blended.
+        wanted: [tiles] uint64, the blocks of each tile to render; all others are filled with the background.
+        tile_order: int64, the tiles to render, distributed to ``tasks`` in this order; others are unchanged.
         size: (width, height) in pixels. background: [C]. limits: [6], the fields of ``Limits``.
-        image: out [C, rows, stride] float32, padded to whole tiles. transmittance: out [rows, stride] transmittance
-            left.
+        image: out [C, rows, stride] float32, padded to whole tiles. transmittance: out [rows, stride] remaining
+            transmittance.
     """
     for task in prange(tasks):
         blend_task(
@@ -241,13 +241,13 @@ def blend_backward_task(
     g_alpha,
     records,
 ):
-    """Carries gradients back through the tiles of one task of ``blend_backward``."""
+    """Backpropagates through the tiles of one task of ``blend_backward``."""
     cap, stop = limits[1], limits[2]
     faintest = np.float32(log2(limits[0]))
     channels = GROUP * len(groups)
     columns = records.shape[1]
     tiles_x = (size[0] + TILE - 1) // TILE
-    # Per block: light left, negative once the pixel is finished; what remains behind; incoming gradients.
+    # Per block: transmittance, negative if the pixel is finished; contribution of later entries; incoming gradients.
     step = lanes.COUNT * (2 + channels)
     state = np.empty(BLOCKS * step + lanes.COUNT, np.float32)
     base = lanes.aligned(state)
@@ -271,7 +271,7 @@ def blend_backward_task(
         for block in range(BLOCKS):
             lanes.store(state, base + block * step, lanes.fill(ONE))
         end = starts[tile + 1]
-        while end > starts[tile] and learnt[items[end - 1]] == 0:  # what lies behind is in the total already
+        while end > starts[tile] and learnt[items[end - 1]] == 0:  # later entries are already in the total
             end -= 1
         for entry in range(starts[tile], end):
             cover = covers[entry]
@@ -395,14 +395,14 @@ def blend_backward(
 ):
     """Computes the gradients of every entry, a pair of Gaussian and tile.
 
-    Front to back, as forward: what lies behind entry i enters only through its product with the incoming gradient,
-    one number a pixel, which is what remains of the total after the entries so far.
+    It runs front to back like the forward pass. The later entries only matter through the product of their colour with
+    the incoming gradient. Per pixel, this is one number: the total minus the contribution of the entries so far.
 
     Args:
-        slots: [entries] the pair of each. covers: [entries] as ``blend`` left them.
-        learnt: [N] uint8, 0 for Gaussians of which no gradient is wanted; their records are not written.
-        g_image: [C, rows, stride] dL/dimage. g_alpha: [rows, stride] dL/dalpha, alpha = 1 - rest.
-        records: out [pairs, whole ``Lanes``] float32, columns above.
+        slots: [entries] pair of each entry. covers: [entries] as returned by ``blend``.
+        learnt: [N] uint8, 0 for Gaussians that need no gradient; their records are not written.
+        g_image: [C, rows, stride] dL/dimage. g_alpha: [rows, stride] dL/dalpha, alpha = 1 - transmittance.
+        records: out [pairs, multiple of ``Lanes``] float32, columns above.
     """
     for task in prange(tasks):
         blend_backward_task(

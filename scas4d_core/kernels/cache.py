@@ -1,12 +1,13 @@
-"""The cache of compiled kernels: a folder for each version of the kernels' sources.
+"""Cache of compiled kernels, with one folder per version of the kernel sources.
 
-Numba keeps a compiled function as long as its own file does not change. A kernel also contains functions that it calls
-from other files, which Numba does not watch: after an edit there it would continue with the old code. So the folder is
-named by a digest of all files here and of the guards, whose values they contain; folders of earlier versions are
-removed.
+Numba keeps a compiled function until its own source file changes. A kernel also contains inlined functions from other
+files, which Numba does not track, so it would keep outdated code after an edit there. The folder is therefore named
+after a digest of all kernel files and of the guards, whose values are compiled in. Folders of older versions are
+deleted.
 
-Several processes may fill one folder. Numba replaces files atomically, but two that save different types of one
-function at a time would give both the same number, and one would later load the other's code: saving takes a lock.
+Several processes may fill the same folder. Numba replaces files atomically. However, two processes that save different
+signatures of one function at the same time could assign the same number, and one would load wrong code. Saving is
+therefore protected by a lock.
 """
 
 from __future__ import annotations
@@ -24,19 +25,19 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 try:
     import fcntl
-except ImportError:  # not on this system
+except ImportError:  # not available on this system
     fcntl = None  # type: ignore[assignment]
 
 PREFIX = "kernels-"
 KEPT = 3
-"""Versions kept: several checkouts may share a cache."""
+"""Number of versions to keep, since several checkouts may share a cache."""
 
 
 GUARDS = Path(__file__).parent.parent / "guards.py"
 
 
 def digest(folder: Path = Path(__file__).parent) -> str:
-    """Digest of the names and contents of the Python files in and below a folder, and of the guards."""
+    """Returns a digest of the Python files in and below a folder (names and contents) and of the guards."""
     hasher = hashlib.sha256()
     for path in [*sorted(folder.rglob("*.py")), GUARDS]:
         name = os.path.relpath(path, folder)
@@ -45,31 +46,31 @@ def digest(folder: Path = Path(__file__).parent) -> str:
 
 
 def base() -> Path:
-    """Folder of all versions: NUMBA_CACHE_DIR, else scas4d/numba in the user's folder of caches."""
+    """Returns the folder of all versions: NUMBA_CACHE_DIR, or scas4d/numba in the user's cache folder."""
     given = os.environ.get("NUMBA_CACHE_DIR")
     if given:
         path = Path(given)
-        return path.parent if path.name.startswith(PREFIX) else path  # set by `use` in the process before
+        return path.parent if path.name.startswith(PREFIX) else path  # set by `use` in a parent process
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "scas4d" / "numba"
 
 
 def use(folder: Path) -> None:
-    """Has Numba cache in this version's folder; where none can be made, Numba's own choice stands."""
+    """Makes Numba use this version's cache folder; if it cannot be created, Numba's default applies."""
     mine = folder / (PREFIX + digest())
     try:
         mine.mkdir(parents=True, exist_ok=True)
         os.utime(mine)
     except OSError:
         return
-    # The environment too: Numba reads it anew when it changes, and processes started from here inherit it.
+    # Also set the environment, which Numba re-reads when it changes and child processes inherit.
     os.environ["NUMBA_CACHE_DIR"] = str(mine)
     numba.config.CACHE_DIR = str(mine)  # type: ignore[attr-defined]
     remove_old(folder)
 
 
 def remove_old(folder: Path, kept: int = KEPT) -> None:
-    """Removes all versions but the ``kept`` that were used last."""
-    with contextlib.suppress(OSError):  # another process may remove the same ones
+    """Deletes all versions except the ``kept`` most recently used ones."""
+    with contextlib.suppress(OSError):  # another process may delete the same folders
         versions = sorted(folder.glob(PREFIX + "*"), key=lambda path: path.stat().st_mtime, reverse=True)
         for path in versions[kept:]:
             shutil.rmtree(path, ignore_errors=True)
@@ -77,12 +78,12 @@ def remove_old(folder: Path, kept: int = KEPT) -> None:
 
 @contextlib.contextmanager
 def locked(path: Path, *, wait: bool = True) -> Iterator[bool]:
-    """Holds the lock of a file, which is made, as long as this process lives; yields whether it does.
+    """Holds a file lock, creating the file if needed; yields whether the lock was acquired.
 
-    Where the system or the file system has no such locks, or the file cannot be made, everybody gets the lock.
+    If file locks are not supported or the file cannot be created, every caller gets the lock.
 
     Args:
-        wait: until the one who holds it lets go; else yields False.
+        wait: whether to wait until the lock is free; otherwise yields False if it is taken.
     """
     with contextlib.ExitStack() as stack:
         if fcntl is not None:
@@ -98,7 +99,7 @@ def locked(path: Path, *, wait: bool = True) -> Iterator[bool]:
 
 
 class _OneAtATime(IndexDataCacheFile):
-    """The index and the data of one function; one process saves at a time."""
+    """Cache index and data of one function, saved by one process at a time."""
 
     def save(self, key: Any, data: Any) -> None:
         with locked(Path(self._cache_path) / "saving.lock"):
@@ -106,9 +107,9 @@ class _OneAtATime(IndexDataCacheFile):
 
 
 def shared(dispatcher: Any) -> Any:
-    """Has a compiled function's cache filled by one process at a time; returns the function."""
+    """Makes the cache of a compiled function safe for concurrent saving; returns the function."""
     cache = dispatcher._cache
-    if isinstance(cache, FunctionCache):  # it has one
+    if isinstance(cache, FunctionCache):  # the function is cached
         file = cache._cache_file
         cache._cache_file = _OneAtATime(file._cache_path, cache._impl.filename_base, file._source_stamp)
     return dispatcher

@@ -1,16 +1,15 @@
-"""The cascade of cluster maps and its backward (paper, single-layer deformation function and nesting).
+"""Cascade of cluster maps and its backward pass (paper, single-layer deformation function and nesting).
 
-Twin: ``deformation.cascade``. Every step handles sixteen Gaussians of one cluster (``Lanes``), so that values
-of a cluster are numbers and values of Gaussians are vectors; ``deform`` combines the steps. A layer carries
-a point x, the Gaussian's factor F (nine entries, row by row; the map's Jacobian is applied to it at once) and its turn
-Q to the next.
+Reference: ``deformation.cascade``. Every step processes sixteen Gaussians of one cluster (``Lanes``), so cluster values
+are scalars and Gaussian values are vectors; ``deform`` combines the steps. A layer passes on a point x, the Gaussian's
+factor F (nine entries, row-major; the map's Jacobian is applied to it directly) and its rotation Q.
 
 Cluster map, y = x − p, z = c·y + s, f = 2σ(2z), f' = f(2 − f):
 centred x' = p + t + f R y, published x' = f (R y + p + t); both have J = R (f I + f' e cᵀ)
-with e = y, or e = y + Rᵀ(p + t). Where the covariance is separate, a factor stays as it is.
+with e = y, or e = y + Rᵀ(p + t). With separate covariance, factors stay unchanged.
 
-Points go by their change, x' = w + (f − 1) u with w = x + t + (R − I) y, u = R y or u = w: every term but x is 0 where
-the parameters are, so that the identity keeps every bit on every processor.
+Points are updated by their displacement: x' = w + (f − 1) u with w = x + t + (R − I) y, u = R y or u = w. All terms
+except x are 0 if the parameters are 0, so the identity preserves every bit on every processor.
 """
 
 from __future__ import annotations
@@ -21,12 +20,12 @@ from scas4d_core.guards import EMPTY_CLUSTER, EXPONENT, HALF_TURN
 from scas4d_core.kernels import lanes
 from scas4d_core.kernels.jit import LOG2_E, ONE, TWO, ZERO, inline, kernel
 
-# Columns of a cluster's table: rotation matrix 0–8, quaternion 9–12, pivot 13–15, translation 16–18, c 19–21, s 22, the
+# Columns of a cluster's table: rotation matrix 0–8, quaternion 9–12, pivot 13–15, translation 16–18, c 19–21, s 22,
 # diagonal of R − I 23–25.
 TABLE = 26
 # Columns of a cluster's parameters: r 0–2, t 3–5, c 6–8, s 9.
 PARAMETERS = 10
-# A block's share of its cluster's gradient: rotation matrix 0–8, quaternion 9–12, t 13–15; then c 16–18, s 19.
+# A block's contribution to its cluster's gradient: rotation matrix 0–8, quaternion 9–12, t 13–15; c 16–18, s 19.
 RECORD = 2 * lanes.COUNT
 
 LEAST = np.float32(HALF_TURN)
@@ -39,7 +38,7 @@ COUNTED_GUARDS = ("exponent", "half_turn", "folded")
 
 @inline
 def rotation_entries(w, x, y, z):
-    """Unit quaternion to the nine entries of its matrix, row by row."""
+    """Converts a unit quaternion to the nine entries of its matrix, row by row."""
     return (
         ONE - TWO * (y * y + z * z), TWO * (x * y - w * z), TWO * (x * z + w * y),
         TWO * (x * y + w * z), ONE - TWO * (x * x + z * z), TWO * (y * z - w * x),
@@ -49,7 +48,7 @@ def rotation_entries(w, x, y, z):
 
 @inline
 def rotation_gradient(w, x, y, z, g0, g1, g2, g3, g4, g5, g6, g7, g8):
-    """dL/dquaternion from dL/dmatrix (nine entries, row by row), for the formula of ``rotation_entries``."""
+    """Converts dL/dmatrix (nine entries, row by row) to dL/dquaternion, for the formula of ``rotation_entries``."""
     gw = TWO * (-z * g1 + y * g2 + z * g3 - x * g5 - y * g6 + x * g7)
     gx = TWO * (y * g1 + z * g2 + y * g3 - TWO * x * g4 - w * g5 + z * g6 + w * g7 - TWO * x * g8)
     gy = TWO * (-TWO * y * g0 + x * g1 + w * g2 + x * g3 + z * g5 - w * g6 + z * g7 - TWO * y * g8)
@@ -59,7 +58,7 @@ def rotation_gradient(w, x, y, z, g0, g1, g2, g3, g4, g5, g6, g7, g8):
 
 @inline
 def product(aw, ax, ay, az, bw, bx, by, bz):
-    """Quaternion product a∘b: first b, then a."""
+    """Returns the quaternion product a∘b, i.e. rotation b followed by rotation a."""
     return (
         aw * bw - ax * bx - ay * by - az * bz,
         aw * bx + ax * bw + ay * bz - az * by,
@@ -70,11 +69,11 @@ def product(aw, ax, ay, az, bw, bx, by, bz):
 
 @kernel
 def cluster_table(parameters, sums, first, last, count, table):
-    """Fills the table of a cluster: rotation, pivot and the parameters that its points read.
+    """Fills the table of a cluster: rotation, pivot and the parameters needed for its points.
 
     Args:
-        parameters: [10]. sums: [blocks, 3] of the points of each block as moved by the layers above; the cluster has
-            the blocks from ``first`` to before ``last``, ``count`` points.
+        parameters: [10]. sums: [blocks, 3] sums of each block's points after the coarser layers. The cluster has the
+            blocks from ``first`` up to, but not including, ``last``, with ``count`` points.
         table: out [26].
     """
     px = py = pz = np.float64(0.0)
@@ -98,7 +97,7 @@ def cluster_table(parameters, sums, first, last, count, table):
 
 @inline
 def scaling_terms(table, about_origin, x, y, z):
-    """f, y and u of points, u being the vector that f scales, R y or R y + p + t; and −2z."""
+    """Returns f, y, u and −2z of points, where u is the vector scaled by f: R y or R y + p + t."""
     r0, r1, r2, r3, r4, r5, r6, r7, r8 = (
         table[0], table[1], table[2], table[3], table[4], table[5], table[6], table[7], table[8]
     )  # fmt: skip
@@ -113,7 +112,7 @@ def scaling_terms(table, about_origin, x, y, z):
 
 @inline
 def move_through_layer(table, about_origin, x, y, z):
-    """Points after a layer."""
+    """Moves points through a layer."""
     f, yx, yy, yz, ux, uy, uz, _ = scaling_terms(table, about_origin, x, y, z)
     more = f - ONE
     return (
@@ -125,10 +124,10 @@ def move_through_layer(table, about_origin, x, y, z):
 
 @inline
 def polar(table, about_origin, f, yx, yy, yz):
-    """The polar rotation of f I + f' e cᵀ, which acts in the plane of e and c; the common factor f is left out.
+    """Computes the polar rotation of f I + f' e cᵀ in the plane of e and c; the common factor f is omitted.
 
     Returns:
-        The quaternion a (4); and for the backward e (3), e·c, c × e (3), cosine, sine (3), their length rho, the
+        The quaternion a (4); for the backward pass e (3), e·c, c × e (3), cosine, sine (3), their norm rho, the
         quaternion's scale, and rho + cosine.
     """
     cx, cy, cz = table[19], table[20], table[21]
@@ -153,22 +152,22 @@ def polar(table, about_origin, f, yx, yy, yz):
 
 @kernel
 def apply_cluster_map(table, about_origin, separate, points, place, v, present, lane, guard_counts):
-    """Factors and turns of a block through a layer, in place.
+    """Moves factors and rotations of a block through a layer, in place.
 
     Args:
-        table: [26] of its cluster. separate: None: J is applied to the factors; else nothing.
-        points: x, y, z of the block from flat index ``place`` on, as they enter.
-        v: [13, 16] factors 0–8 and turns 9–12.
-        present: flat; from ``lane`` on, 0 for a Gaussian that is not counted, else 1.
-        guard_counts: [3 or more] int64, added to: Gaussians for which each guard in ``COUNTED_GUARDS`` acted; None:
-            not counted.
+        table: [26] of its cluster. separate: None: J is applied to the factors; otherwise it is not.
+        points: x, y, z of the block from flat index ``place``, before the layer.
+        v: [13, 16] factors 0–8 and rotations 9–12.
+        present: flat array; from ``lane``, 0 for Gaussians that are not counted, else 1.
+        guard_counts: [3 or more] int64, accumulated number of Gaussians for which each guard in ``COUNTED_GUARDS`` was
+            triggered; None: not counted.
     """
     x, y, z = (
         lanes.load(points, place), lanes.load(points, place + lanes.COUNT), lanes.load(points, place + 2 * lanes.COUNT)
     )  # fmt: skip
     f, yx, yy, yz, ux, uy, uz, exponent = scaling_terms(table, about_origin, x, y, z)
     slope = f * (TWO - f)
-    if separate is None:  # known as the kernel is compiled
+    if separate is None:  # resolved at compile time
         for column in range(3):
             j0, j1, j2 = (
                 lanes.load(v, lanes.COUNT * column),
@@ -189,9 +188,9 @@ def apply_cluster_map(table, about_origin, separate, points, place, v, present, 
     lanes.store(v, 10 * lanes.COUNT, ox)
     lanes.store(v, 11 * lanes.COUNT, oy)
     lanes.store(v, 12 * lanes.COUNT, oz)
-    if guard_counts is not None:  # known as the kernel is compiled
+    if guard_counts is not None:  # resolved at compile time
         clamped = lanes.magnitude(exponent) > LARGEST
-        # det J = f³ (1 + (2 − f) e·c), and the cosine is 1 more than its second factor. Half turns are among the folds.
+        # det J = f³ (1 + (2 − f) e·c), and the cosine is its second factor plus 1. Half turns are folds too.
         folded = a[11] <= ONE
         if lanes.any_of(clamped):
             guard_counts[0] += lanes.count_of(clamped & (lanes.load(present, lane) > ZERO))
@@ -203,13 +202,13 @@ def apply_cluster_map(table, about_origin, separate, points, place, v, present, 
 
 @kernel
 def apply_cluster_map_backward(table, about_origin, separate, points, place, v, entering, g, records, record):
-    """Backward of a layer for a block.
+    """Backpropagates through a layer for one block.
 
     Args:
-        table, about_origin, separate, points, place: as for ``apply_cluster_map``.
-        v: factors and turns as they enter, from flat index ``entering`` on.
-        g: [16, 16] gradients, in place: point 0–2, factor 3–11, turn 12–15; of the layer's outputs, then of its inputs.
-        records: out from flat index ``record`` on, the block's share of its cluster's gradient.
+        table, about_origin, separate, points, place: see ``apply_cluster_map``.
+        v: factors and rotations before the layer, from flat index ``entering``.
+        g: [16, 16] gradients, in place: point 0–2, factor 3–11, rotation 12–15; of the outputs, then of the inputs.
+        records: out from flat index ``record``, the block's contribution to its cluster's gradient.
     """
     n = lanes.COUNT
     r0, r1, r2, r3, r4, r5, r6, r7, r8 = (
@@ -235,7 +234,7 @@ def apply_cluster_map_backward(table, about_origin, separate, points, place, v, 
             g1 = lanes.load(g, n * (6 + column))
             g2 = lanes.load(g, n * (9 + column))
             along = j0 * cx + j1 * cy + j2 * cz
-            # Gradient of f and of the factor's columns, turned back by R.
+            # Gradients of f and of the factor's columns, rotated back by R.
             h0, h1, h2 = g0 * r0 + g1 * r3 + g2 * r6, g0 * r1 + g1 * r4 + g2 * r7, g0 * r2 + g1 * r5 + g2 * r8
             g_f += h0 * j0 + h1 * j1 + h2 * j2
             outer = ux * g0 + uy * g1 + uz * g2
@@ -282,7 +281,7 @@ def apply_cluster_map_backward(table, about_origin, separate, points, place, v, 
     unit = aw * bw + ax * bx + ay * by + az * bz
     g_h = (bw - aw * unit) * scale
     gsx, gsy, gsz = (bx - ax * unit) * scale, (by - ay * unit) * scale, (bz - az * unit) * scale
-    # Where the floor acts it is a constant.
+    # A value at the floor is a constant.
     g_h = lanes.choose(half < LEAST, nothing, g_h)
     shrink = g_h / lanes.maximum(lanes.fill(LEAST), rho)
     g_cosine = g_h + cosine * shrink
@@ -323,10 +322,10 @@ def apply_cluster_map_backward(table, about_origin, separate, points, place, v, 
 
 @kernel
 def cluster_gradient(records, layer, first, last, table, gradient):
-    """Sums the records of a cluster's blocks, in order, into dL/dparameters [10].
+    """Sums the records of a cluster's blocks, in order, to dL/dparameters [10].
 
     Args:
-        records: [blocks, layers, 32]; those of blocks from ``first`` to before ``last`` in ``layer``.
+        records: [blocks, layers, 32]; blocks from ``first`` up to, but not including, ``last`` in ``layer`` are summed.
     """
     sums = np.empty(RECORD, np.float32)
     low = high = lanes.fill(ZERO)
@@ -341,7 +340,7 @@ def cluster_gradient(records, layer, first, last, table, gradient):
         w, x, y, z, sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], sums[6], sums[7], sums[8]
     )
     gw, gx, gy, gz = gw + sums[9], gx + sums[10], gy + sums[11], gz + sums[12]
-    # Of r in the quaternion (1, r) w.
+    # Gradient of r in the quaternion (1, r) w.
     along = w * gw + x * gx + y * gy + z * gz
     gradient[0], gradient[1], gradient[2] = (gx - x * along) * w, (gy - y * along) * w, (gz - z * along) * w
     for k in range(7):

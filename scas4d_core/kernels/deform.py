@@ -1,9 +1,10 @@
-"""D_t over all moving Gaussians, and its backward: ``cascade`` and ``deltas`` combined. Twin: ``deformation``.
+"""Deformation D_t of all moving Gaussians and its backward pass; combines ``cascade`` and ``deltas``.
 
-Gaussians are taken in blocks of sixteen of one finest cluster, hence of one cluster in every layer; where the size of a
-cluster is no multiple of sixteen, its last block repeats its last Gaussian. Only points are kept between layers
-(pivots are their means): the backward carries factors and turns through the layers again, which costs less than
-reading them from memory. Layers that rest are applied once (``settle``), and what follows begins behind them.
+Reference: ``deformation``. Gaussians are processed in blocks of sixteen that belong to one finest cluster, and hence to
+one cluster in every layer. If the size of a cluster is not a multiple of sixteen, its last block repeats its last
+Gaussian. Only points are stored between layers (pivots are their means); the backward pass recomputes factors and
+rotations, which is cheaper than reading them from memory. Frozen layers are applied once (``freeze_layer``), and
+later passes start after them.
 """
 
 from __future__ import annotations
@@ -23,15 +24,15 @@ from scas4d_core.kernels.deltas import apply_gaussian_deltas, apply_gaussian_del
 from scas4d_core.kernels.jit import inline, kernel, parallel_kernel
 
 BLOCKS = 16
-"""Blocks a task."""
+"""Blocks per task."""
 
 CARRIED = 13 * lanes.COUNT
-"""Numbers of a block's factors and turns."""
+"""Number of values of a block's factors and rotations."""
 
 
 @kernel
 def prefetch(block, rows, one, two):
-    """Prefetches the rows of a block's Gaussians in two arrays: they lie anywhere in memory."""
+    """Prefetches the rows of a block's Gaussians in two arrays, which are scattered in memory."""
     block = min(block, rows.shape[0] - 1)
     for lane in range(lanes.COUNT):
         lanes.prefetch_row(one, rows[block, lane])
@@ -40,7 +41,7 @@ def prefetch(block, rows, one, two):
 
 @kernel
 def move_points(block, table, about_origin, points, layer, out, place):
-    """Moves the points of a block through a layer, from ``points[layer]`` to flat index ``place`` of ``out`` on."""
+    """Moves the points of a block from ``points[layer]`` through a layer to ``out``, from flat index ``place``."""
     first = (layer * points.shape[1] + block) * 3 * lanes.COUNT
     x, y, z = move_through_layer(
         table, about_origin, lanes.load(points, first), lanes.load(points, first + lanes.COUNT),
@@ -53,7 +54,7 @@ def move_points(block, table, about_origin, points, layer, out, place):
 
 @kernel
 def sum_block(block, points, layer, present, sums):
-    """Sums of a block's points as they enter a layer, into ``sums[layer, block]``."""
+    """Sums a block's points before a layer into ``sums[layer, block]``."""
     first = (layer * points.shape[1] + block) * 3 * lanes.COUNT
     weight = lanes.load(present, block * lanes.COUNT)
     for k in range(3):
@@ -62,7 +63,7 @@ def sum_block(block, points, layer, present, sums):
 
 @parallel_kernel
 def block_sums(points, present, sums):
-    """Sums of the points as they enter the first layer: ``sums[0]`` of ``deform``."""
+    """Sums the points before the first layer, ``sums[0]`` of ``deform``."""
     for block in prange(points.shape[1]):
         sum_block(np.int64(block), points, np.int64(0), present, sums)
 
@@ -71,11 +72,11 @@ def block_sums(points, present, sums):
 def freeze_layer(
     layer, parameters, offsets, ranges, clusters, present, entering, about_origin, separate, points, sums, tables
 ):  # fmt: skip
-    """Moves what enters a layer through it, for as long as it rests: ``entering`` then enters the layer below.
+    """Freezes a layer: applies it to its inputs, so that ``entering`` becomes the input of the next layer.
 
     Args:
-        layer: not the last. entering: [B, 13 · 16] in place, see ``deform``, which describes the others, too; of points
-            and sums those of the layer below are filled, of tables those of its clusters.
+        layer: any except the last. entering: [B, 13 · 16], updated in place. See ``deform`` for the others. Points and
+            sums of the next layer, and tables of this layer's clusters are filled.
     """
     blocks = clusters.shape[0]
     for j in prange(offsets[layer], offsets[layer + 1]):
@@ -103,24 +104,24 @@ def deform(
     first, parameters, offsets, ranges, clusters, entries, rows, present, entering, deltas, about_origin, separate,
     points, sums, tables, means, factors, state, guard_counts,
 ):  # fmt: skip
-    """Moves M of N Gaussians, in B blocks, through L layers of K clusters together.
+    """Moves M of N Gaussians, in B blocks, through L layers of K clusters in total.
 
     Args:
-        first: the first layer that does not rest; the points, sums and tables of those before are as they were left.
-        parameters: [K, 10], layer after layer, coarse to fine. offsets: [L + 1] int64, the first cluster of each layer.
-        ranges: [K, 3] int64, each cluster's first block, its last and one more, and its number of Gaussians.
+        first: the first layer that is not frozen; points, sums and tables of earlier layers are reused.
+        parameters: [K, 10], layer by layer, coarse to fine. offsets: [L + 1] int64, the first cluster of each layer.
+        ranges: [K, 3] int64: first block, last block + 1, and number of Gaussians of each cluster.
         clusters: [B, L] int64, the clusters of each block.
-        entries, rows: [B, 16] int64, each Gaussian's row among the M and among the N.
-        present: [B, 16] float32, 0 where a Gaussian is repeated, else 1.
-        entering: [B, 13 · 16] factors 0–8 and turns 9–12 as they enter layer ``first``; of frame t−1 those are its
-            factors and no turn. deltas: [M, 9] Δp, Δr, Δs.
-        about_origin: 0 for the centred map, 1 for the published one. separate: None: J is applied to the factors; else
-            nothing.
-        points: [max(L, 1), B, 3, 16] as they enter each layer; of ``first`` given, of those below filled.
-        sums: [max(L, 1), B, 3] of them; likewise. tables: out [K, 26].
-        means [N, 3], factors [N, 3, 3]: out at ``rows``. state: [M, 16], out its means and turns, see ``deltas``.
-        guard_counts: out [tasks of ``BLOCKS`` blocks, 3] int64, how often the guards in ``cascade.COUNTED_GUARDS``
-            acted.
+        entries, rows: [B, 16] int64, index of each Gaussian among the M and among the N.
+        present: [B, 16] float32, 0 for repeated Gaussians, else 1.
+        entering: [B, 13 · 16] factors 0–8 and rotations 9–12 before layer ``first``; for frame t−1, its factors and
+            the identity. deltas: [M, 9] Δp, Δr, Δs.
+        about_origin: 0 for the centred map, 1 for the published one. separate: None: J is applied to the factors;
+            otherwise it is not.
+        points: [max(L, 1), B, 3, 16] before each layer; given for ``first``, filled for later layers.
+        sums: [max(L, 1), B, 3] of the points, likewise. tables: out [K, 26].
+        means [N, 3], factors [N, 3, 3]: out at ``rows``. state: [M, 16], out: means and rotations, see ``deltas``.
+        guard_counts: out [tasks of ``BLOCKS`` blocks, 3] int64, number of times that the guards in
+            ``cascade.COUNTED_GUARDS`` were triggered.
     """
     blocks, layers = clusters.shape
     tasks = (blocks + BLOCKS - 1) // BLOCKS
@@ -175,15 +176,15 @@ def deform_backward(
     first, offsets, ranges, clusters, entries, rows, present, entering, deltas, about_origin, separate, points, tables,
     scale_weight, bounds, g_means, g_factors, g_tied, records, gradients, g_deltas, losses,
 ):  # fmt: skip
-    """Backward of ``deform``, with the gradient of the scale loss added.
+    """Backpropagates through ``deform``, and adds the gradient of the scale loss.
 
     Args:
-        first … tables: as ``deform`` left them; layers that rest get no gradient.
-        scale_weight: weight of the scale loss over its mean's count 3M; 0 leaves it out.
-        bounds: [M, 3] metres, the length each axis may have.
-        g_means [N, 3], g_factors [N, 3, 3]: in. g_tied: [M, 8] in, of means and turns, see ``deltas``.
+        first … tables: as returned by ``deform``; frozen layers get no gradient.
+        scale_weight: weight of the scale loss divided by 3M, the number of averaged values; 0 disables it.
+        bounds: [M, 3] metres, maximum length of each axis.
+        g_means [N, 3], g_factors [N, 3, 3]: in. g_tied: [M, 8] in, for means and rotations, see ``deltas``.
         records: scratch [B, L, 32]. gradients: out [K, 10]. g_deltas: out [M, 9].
-        losses: out [B], metres of excess length of the axes, summed over each block.
+        losses: out [B], metres of excess axis length, summed over each block.
     """
     blocks, layers = clusters.shape
     for task in prange((blocks + BLOCKS - 1) // BLOCKS):

@@ -1,7 +1,7 @@
-"""Deltas of single Gaussians after the cascade (Δp, ΔR, Δs), and the scale loss. Twin: ``deformation.deform``.
+"""Per-Gaussian deltas after the cascade (Δp, ΔR, Δs), and the scale loss. Reference: ``deformation.deform``.
 
-F_t = R(Δr) J F_{t−1} diag(exp Δs); x_t = x + Δp; turn = q(Δr) ∘ Q, taken with w ≥ 0. Sixteen Gaussians at a time, as in
-``cascade``.
+F_t = R(Δr) J F_{t−1} diag(exp Δs); x_t = x + Δp; turn = q(Δr) ∘ Q, with w ≥ 0. As in ``cascade``, sixteen Gaussians
+are processed at a time.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ LARGEST = np.float32(EXPONENT) / LOG2_E
 COLUMNS = 9
 """Columns of ``deltas``: Δp 0–2, Δr 3–5, Δs 6–8."""
 
-# Columns of a Gaussian's state for the neighbour terms: mean now 0–2, turn since frame t−1 3–6, mean at frame t−1 7–9.
-# A row is a cache line.
+# Columns of a Gaussian's state for the neighbour terms: current mean 0–2, rotation since frame t−1 3–6, mean at frame
+# t−1 7–9. A row is a cache line.
 STATE = 16
 MEAN, TURN, PREVIOUS = 0, 3, 7
 TIED = 8
-"""Columns of their gradients: of the mean 0–2, of the turn 3–6, none."""
+"""Number of columns of the state's gradients: mean 0–2, rotation 3–6, one unused."""
 
 
 @inline
 def gaussian_delta_rotation(deltas, entries, place):
-    """The unit quaternion (1, Δr)/|(1, Δr)|."""
+    """Returns the unit quaternion (1, Δr)/|(1, Δr)|."""
     a = lanes.gather_column(deltas, entries, place, COLUMNS, 3)
     b = lanes.gather_column(deltas, entries, place, COLUMNS, 4)
     c = lanes.gather_column(deltas, entries, place, COLUMNS, 5)
@@ -38,15 +38,15 @@ def gaussian_delta_rotation(deltas, entries, place):
 
 @kernel
 def apply_gaussian_deltas(deltas, entries, rows, place, present, v, points, means, factors, state, guard_counts):
-    """Writes sixteen moved Gaussians.
+    """Computes and stores sixteen deformed Gaussians.
 
     Args:
-        deltas: [M, 9]. entries, rows: flat int64; from ``place`` on, the Gaussians' rows among the M that move and
-            among all N.
-        present: flat; from ``place`` on, 0 for a Gaussian that is not counted, else 1.
-        v: [13, 16] factors 0–8 and turns 9–12 from the cascade. points: [3, 16] likewise.
-        means [N, 3], factors [N, 3, 3]: out at those rows. state: [M, 16], out mean and turn.
-        guard_counts: [1 or more] int64, added to: for how many Gaussians the exponent of a stretch was clamped.
+        deltas: [M, 9]. entries, rows: flat int64; from ``place``, indices of the Gaussians among the M moving and among
+            all N.
+        present: flat; from ``place``, 0 for Gaussians that are not counted, else 1.
+        v: [13, 16] factors 0–8 and rotations 9–12 from the cascade. points: [3, 16] from the cascade.
+        means [N, 3], factors [N, 3, 3]: out at those rows. state: [M, 16], out: means and rotations.
+        guard_counts: [1 or more] int64, accumulated number of Gaussians for which a stretch exponent was clamped.
     """
     n = lanes.COUNT
     for k in range(3):
@@ -82,18 +82,18 @@ def apply_gaussian_deltas(deltas, entries, rows, place, present, v, points, mean
 def apply_gaussian_deltas_backward(
     deltas, entries, rows, place, present, v, leaving, scale_weight, bounds, g_means, g_factors, g_tied, g, g_deltas
 ):
-    """Backward of ``apply_gaussian_deltas``, with the gradient of the scale loss added.
+    """Backpropagates through ``apply_gaussian_deltas``, and adds the gradient of the scale loss.
 
     Args:
-        present: flat; from ``place`` on, 1 for each of the sixteen Gaussians, 0 for one that is repeated.
-        v: factors and turns from the cascade, from flat index ``leaving`` on.
-        scale_weight: weight of the scale loss over its mean's count 3M; 0 leaves it out.
-        bounds: [M, 3] metres, the length each axis may have.
-        g_means [N, 3], g_factors [N, 3, 3]: in. g_tied: [M, 8] in, more gradient of the means, and that of the turns.
-        g: out [16, 16], gradients of point 0–2, factor 3–11, turn 12–15. g_deltas: out [M, 9].
+        present: flat; from ``place``, 0 for repeated Gaussians, else 1.
+        v: factors and rotations from the cascade, from flat index ``leaving``.
+        scale_weight: weight of the scale loss divided by 3M, the number of averaged values; 0 disables it.
+        bounds: [M, 3] metres, maximum length of each axis.
+        g_means [N, 3], g_factors [N, 3, 3]: in. g_tied: [M, 8] in, additional gradients of means and rotations.
+        g: out [16, 16], gradients of point 0–2, factor 3–11, rotation 12–15. g_deltas: out [M, 9].
 
     Returns:
-        Metres of excess length of the axes, summed.
+        Sum of the excess lengths of the axes, in metres.
     """
     n = lanes.COUNT
     nothing = lanes.fill(ZERO)
@@ -124,7 +124,7 @@ def apply_gaussian_deltas_backward(
         g6 += h2 * e0
         g7 += h2 * e1
         g8 += h2 * e2
-        # Scale loss on the length of the axis, which ΔR does not change.
+        # Scale loss on the axis length, which ΔR does not change.
         length = lanes.square_root(e0 * e0 + e1 * e1 + e2 * e2)
         bound = lanes.gather_column(bounds, entries, place, 3, column)
         over = length - bound

@@ -1,9 +1,9 @@
-"""The gradients of features alone, where nothing asks for those of places and shapes.
+"""Gradients of the features alone, used if positions and shapes need no gradient.
 
 Reference: ``engines.torch.rasterizer``.
 
-A feature's gradient is the incoming gradient summed with the weights that its Gaussian was blended with. These are
-found front to back, as ``blend`` finds them, and what lies behind is not asked for: the bits of ``blend_backward``.
+A feature's gradient is the sum of the incoming gradient, weighted with the Gaussian's blending weights. The weights are
+recomputed front to back as in ``blend``. Later entries are not needed. Results are bit-identical to ``blend_backward``.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ from scas4d_core.kernels.projection import (
 def blend_features_task(
     task, splats, starts, items, slots, covers, learnt, tile_order, tasks, size, limits, g_image, records
 ):
-    """Sums the weights of the tiles of one task of ``blend_features``."""
+    """Sums the weighted gradients of the tiles of one task of ``blend_features``."""
     cap, stop = limits[1], limits[2]
     faintest = np.float32(log2(limits[0]))
     tiles_x = (size[0] + TILE - 1) // TILE
-    # Per block: light left, negative once the pixel is finished; incoming gradients.
+    # Per block: transmittance, negative if the pixel is finished; incoming gradients.
     step = lanes.COUNT * (1 + GROUP)
     state = np.empty(BLOCKS * step + lanes.COUNT, np.float32)
     base = lanes.aligned(state)
@@ -99,7 +99,7 @@ def blend_features_task(
 
 @parallel_kernel
 def blend_features(splats, starts, items, slots, covers, learnt, tile_order, tasks, size, limits, g_image, records):
-    """Sums the incoming gradients of every entry, a pair of Gaussian and tile, with the weights that it has.
+    """Sums the incoming gradients of every entry (a pair of Gaussian and tile) with its blending weights.
 
     Args:
         splats, starts, items, slots, covers, learnt, tile_order, tasks, size, limits: see ``blend.blend_backward``.
@@ -114,12 +114,12 @@ def blend_features(splats, starts, items, slots, covers, learnt, tile_order, tas
 
 @parallel_kernel
 def sum_features(counts, firsts, records, g_features, guard_counts):
-    """Sums each Gaussian's pairs, in the order of ``projection.project_backward``.
+    """Sums the records of each Gaussian's pairs, in the same order as ``projection.project_backward``.
 
     Args:
-        counts, firsts: [N], how many pairs each Gaussian has, and the first. records: of ``blend_features``.
-        g_features: out [N, 4], 0 where there is no pair, and where the sums overflow.
-        guard_counts: out [tasks of ``CHUNK``, 1] int64, for how many Gaussians they did.
+        counts, firsts: [N] number of pairs of each Gaussian, and its first pair. records: from ``blend_features``.
+        g_features: out [N, 4], 0 for Gaussians without pairs or with overflowing sums.
+        guard_counts: out [tasks of ``CHUNK``, 1] int64, number of Gaussians with overflowing sums.
     """
     count = g_features.shape[0]
     for task in prange((count + CHUNK - 1) // CHUNK):

@@ -1,9 +1,9 @@
-"""The image loss 0.8 L1 + 0.2 (1 − SSIM) and its gradient, over planes [C, H, W]. Twin: ``losses.image_loss``.
+"""Image loss 0.8 L1 + 0.2 (1 − SSIM) of planes [C, H, W], and its gradient. Reference: ``losses.image_loss``.
 
-SSIM is that of 3D Gaussian Splatting: 11×11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01², C2 = 0.03². The
-window is separable: one pass filters along each row, the other across rows. Both process sixteen pixels at a time.
+SSIM follows 3D Gaussian Splatting: 11×11 Gaussian window, sigma 1.5, zero padding, C1 = 0.01², C2 = 0.03². The
+window is separable: one pass filters along rows, another one across rows. Both process sixteen pixels at a time.
 
-Large parts of many images are black in the target and in the render. A window that is 0 in both has an SSIM of 1 and
+Large parts of many images are black in the target and in the rendering. A window that is 0 in both has an SSIM of 1 and
 no gradient, so only columns near other pixels are computed. If only a part of the image is requested (``near``), blocks
 of sixteen columns far from it are skipped as well.
 """
@@ -19,7 +19,7 @@ from scas4d_core.kernels import lanes
 from scas4d_core.kernels.jit import ONE, TWO, ZERO, inline, kernel, parallel_kernel
 
 REACH = 5
-"""Pixels of the window on either side of its centre."""
+"""Radius of the window in pixels."""
 
 _taps = np.exp(-((np.arange(2 * REACH + 1) - REACH) ** 2) / (2 * 1.5**2))
 _taps = (_taps / _taps.sum()).astype(np.float32)
@@ -32,25 +32,25 @@ SSIM_SHARE = np.float32(0.2)
 
 
 PAD = lanes.COUNT
-"""Zeros on either side of a row that is filtered along itself."""
+"""Number of zeros on either side of a row that is filtered along itself."""
 
 
 BAND = 16
-"""Rows a task."""
+"""Rows per task."""
 
 WINDOWS, LOSS, SPREAD, GRADIENT = np.uint8(1), np.uint8(2), np.uint8(4), np.uint8(8)
-"""Bits of that which is computed of sixteen columns of a row: windowed quantities, the loss, its gradients filtered
-along the row, and those across rows, which are the gradient of the picture."""
+"""Flags of the quantities to compute for sixteen columns of a row: windowed quantities, loss, its gradients filtered
+along the row, and those filtered across rows, which are the gradient of the picture."""
 EVERYWHERE = np.full((1, 1), WINDOWS | LOSS | SPREAD | GRADIENT)
 LOSSES = WINDOWS | LOSS
-"""No gradient."""
+"""All flags that are needed without gradients."""
 
 
 def near(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """[H, columns] what has to be computed where the gradient of some pixels is asked for, and the loss they change.
+    """Returns the flags [H, columns] that are needed for the gradient of some pixels and the losses that they affect.
 
     Args:
-        shown: [H, W] these pixels.
+        shown: [H, W] mask of these pixels.
 
     >>> shown = np.zeros((20, 48), bool)
     >>> shown[10, 20] = True
@@ -59,7 +59,7 @@ def near(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """
     height, width = shown.shape
     columns = stride(width) // lanes.COUNT
-    bytes_of_rows = np.zeros((height, (columns + 2) * lanes.COUNT), np.uint8)  # and sixteen columns on either side
+    bytes_of_rows = np.zeros((height, (columns + 2) * lanes.COUNT), np.uint8)  # with 16 extra columns on either side
     bytes_of_rows[:, lanes.COUNT : lanes.COUNT + width] = shown
     eights = bytes_of_rows.view("<u8").reshape(height, columns + 2, 2)
     inside = (eights[:, 1:-1, 0] | eights[:, 1:-1, 1]) != 0
@@ -74,13 +74,13 @@ def near(shown: NDArray[np.bool_]) -> NDArray[np.uint8]:
 
 
 def stride(width: int) -> int:
-    """Numbers of a row of scratch: whole ``Lanes``."""
+    """Returns the row length of scratch buffers, the width rounded up to a multiple of ``Lanes``."""
     return -(-width // lanes.COUNT) * lanes.COUNT
 
 
 @inline
 def filter_along_row(row, place):
-    """Sixteen numbers of a row filtered along itself, from flat index ``place`` on."""
+    """Filters sixteen values along a row, from flat index ``place``."""
     return (
         T0 * (lanes.load(row, place - 5) + lanes.load(row, place + 5))
         + T1 * (lanes.load(row, place - 4) + lanes.load(row, place + 4))
@@ -93,7 +93,7 @@ def filter_along_row(row, place):
 
 @inline
 def filter_across_rows(scratch, place, pitch):
-    """Sixteen numbers filtered across the eleven rows from flat index ``place`` on, ``pitch`` apart."""
+    """Filters sixteen values across the eleven rows from flat index ``place``, ``pitch`` apart."""
     return (
         T0 * (lanes.load(scratch, place) + lanes.load(scratch, place + 10 * pitch))
         + T1 * (lanes.load(scratch, place + pitch) + lanes.load(scratch, place + 9 * pitch))
@@ -106,24 +106,24 @@ def filter_across_rows(scratch, place, pitch):
 
 @inline
 def apply_exposure(value, gain, offset):
-    """The value that a camera records: gain times the rendered value, plus offset."""
+    """Returns the value that a camera records: gain times the rendered value, plus offset."""
     return gain * value + offset
 
 
 @inline
 def is_needed(what, wanted, y, x):
-    """True where something is computed of the sixteen columns from x on."""
+    """Returns whether a quantity is needed in the sixteen columns from x."""
     return (wanted[0, 0] if wanted.shape[0] == 1 else wanted[y, x // lanes.COUNT]) & what != 0
 
 
 @kernel
 def filter_rows(rows, quantities, scratch, kind, channel, y, span, cleared, what, wanted):
-    """Filters padded rows along themselves, into a row of scratch.
+    """Filters padded rows along themselves into a row of the scratch buffer.
 
     Args:
-        rows: [quantities or more, pitch + 2 PAD]. kind, channel, y: of the first quantity in ``scratch``.
-        span: first column and last but one that are filtered, whole ``Lanes``. cleared: the same around it, set to 0.
-        what, wanted: where it is ``asked``; elsewhere scratch stays as it is.
+        rows: [quantities or more, pitch + 2 PAD]. kind, channel, y: index of the first quantity in ``scratch``.
+        span: range of columns to filter, multiples of ``Lanes``. cleared: surrounding range of columns to set to 0.
+        what, wanted: arguments of ``is_needed``; elsewhere, the scratch buffer is unchanged.
     """
     _, channels, height, pitch = scratch.shape
     for k in range(quantities):
@@ -139,17 +139,17 @@ def filter_rows(rows, quantities, scratch, kind, channel, y, span, cleared, what
 
 @inline
 def start_of(planes, channel, y):
-    """Flat index of a row."""
+    """Returns the flat index of a row."""
     return (channel * planes.shape[1] + y) * planes.shape[2]
 
 
 @kernel
 def span_of(image, gain, offset, target, channel, y, pitch, spans):
-    """Finds the columns of a row that are not black in both pictures, in whole ``Lanes``.
+    """Finds the columns of a row that are not black in both pictures, rounded to multiples of ``Lanes``.
 
     Args:
-        spans: out [4]: first column and last but one of the windows that hold such a pixel, then the same of the pixels
-            in these windows; (pitch, 0) where there is none.
+        spans: out [4]: column range (first, last + 1) of the windows with such pixels, then that of the pixels in these
+            windows; (pitch, 0) if there are none.
     """
     width = target.shape[2]
     here, there = start_of(image, channel, y), start_of(target, channel, y)
@@ -172,7 +172,7 @@ def span_of(image, gain, offset, target, channel, y, pitch, spans):
 
 @inline
 def union_of_spans(spans, which, y, reach):
-    """Smallest range of columns that holds the spans of the rows around row y."""
+    """Returns the smallest column range that contains the spans of the rows around row y."""
     first, last = spans[y, which], spans[y, which + 1]
     for other in range(max(0, y - reach), min(spans.shape[0], y + reach + 1)):
         first = min(first, spans[other, which])
@@ -182,10 +182,10 @@ def union_of_spans(spans, which, y, reach):
 
 @parallel_kernel
 def target_moments(target, scratch, means, squares):
-    """Fills the window's means of a target and of its square, once per frame and view.
+    """Fills the windowed means of a target and of its square; needed once per frame and view.
 
     Args:
-        target: [C, H, W]. scratch: [2 or more, C, H + 10, stride(W)], its upper and lower 5 rows 0.
+        target: [C, H, W]. scratch: [2 or more, C, H + 10, stride(W)], with 0 in its first and last 5 rows.
         means, squares: out [C, H, W].
     """
     channels, height, width = target.shape
@@ -212,7 +212,7 @@ def target_moments(target, scratch, means, squares):
 
 @kernel
 def windows_of_row(image, exposure, target, scratch, spans, rows, channel, y, wanted):
-    """First pass of ``image_loss`` over a row: the windowed quantities, filtered along the row."""
+    """Runs the first pass of ``image_loss`` on a row: computes the windowed quantities, filtered along the row."""
     width, pitch = target.shape[2], scratch.shape[3]
     gain, offset = exposure[channel, 0], exposure[channel, 1]
     here, there = start_of(image, channel, y), start_of(target, channel, y)
@@ -239,7 +239,7 @@ def loss_of_row(
     image, exposure, target, target_means, target_squares, weights, pixels, scratch, spans, rows, losses, channel, y,
     wanted,
 ):  # fmt: skip
-    """Second pass: the loss of a row, and its gradients by the windowed quantities, filtered along the row."""
+    """Runs the second pass: computes the loss of a row, and its gradients filtered along the row."""
     channels, height, width = target.shape
     pitch = scratch.shape[3]
     gain, offset = exposure[channel, 0], exposure[channel, 1]
@@ -281,7 +281,7 @@ def loss_of_row(
 
 @kernel
 def gradient_of_row(image, exposure, target, weights, pixels, scratch, spans, g_image, g_exposure, channel, y, wanted):
-    """Third pass: the gradient of a row."""
+    """Runs the third pass: computes the gradient of a row."""
     channels, height, width = target.shape
     pitch = scratch.shape[3]
     share = weights[channel] / np.float32(pixels)
@@ -321,17 +321,17 @@ def gradient_of_row(image, exposure, target, weights, pixels, scratch, spans, g_
 def image_loss(
     image, exposure, target, target_means, target_squares, weights, pixels, scratch, wanted, g_image, losses, g_exposure
 ):
-    """Loss of a rendered picture, or of a part of one, and its gradient.
+    """Computes the loss of a rendered picture, or of a part of one, and its gradient.
 
     Args:
         image: [>= C, >= H, >= W] rendered planes. exposure: [C, 2] gain and offset of the camera per channel.
         target, target_means, target_squares: [C, H, W]. weights: [C] weight of each channel's mean.
-        pixels: that the mean is taken over; H W for a whole picture.
-        scratch: [6, C, H + 10, stride(W)], its upper and lower 5 rows 0: three windowed quantities, their gradients.
+        pixels: number of pixels over which the mean is taken; H W for a full picture.
+        scratch: [6, C, H + 10, stride(W)], first and last 5 rows 0: three windowed quantities, their gradients.
         wanted: see ``near``, ``EVERYWHERE``.
-        g_image: out [>= C, >= H, >= W] dL/dimage, where it is wanted; elsewhere anything. losses: out [C, H, 2], each
-            row's share of the loss and its sum of squared differences.
-        g_exposure: out [C, H, 2], each row's share of the gradient of gain and offset.
+        g_image: out [>= C, >= H, >= W] dL/dimage, undefined where it is not requested.
+        losses: out [C, H, 2], loss contribution and sum of squared differences of each row.
+        g_exposure: out [C, H, 2], contribution of each row to the gradient of gain and offset.
     """
     channels, height, _ = target.shape
     pitch = scratch.shape[3]

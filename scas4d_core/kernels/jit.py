@@ -1,4 +1,4 @@
-"""Compilers of kernels: the one set of options that all of them share, and the float32 exponential."""
+"""Kernel compilers: their common options, and a float32 exponential."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ from scas4d_core.kernels import cache
 
 cache.use(cache.base())
 
-# LLVM unrolls short loops before it vectorizes loops; unrolled, the rows of 16 pixels stay scalar (measured: blending
-# 3 times slower). Loops over channels (at most 8) may still be unrolled.
+# LLVM unrolls short loops before it vectorizes. Unrolled rows of 16 pixels stay scalar (measured: blending is 3 times
+# slower). Loops over channels (at most 8) may still be unrolled.
 llvm.set_option("scas4d", "-unroll-full-max-count=8")
-# Overlap checks hoisted out of the loop over rows compare whole arrays, find overlap, and take the scalar path.
+# Overlap checks hoisted out of the row loop compare whole arrays, detect an overlap, and take the scalar path.
 llvm.set_option("scas4d", "-hoist-runtime-checks=false")
 
-# No fast math: every operation rounds as IEEE 754 says, in the order written, so that kernels compute the same bits on
-# every processor. An estimated reciprocal (`arcp`, `afn`) rounds differently by manufacturer, a product fused with a
-# sum (`contract`) only where there is such an instruction, a reordered sum (`reassoc`) by the width of the registers.
-# Sums over many numbers are written in lanes instead. The cost is about 1 % (docs/tried.md).
+# No fast math: every operation is rounded according to IEEE 754, in the order written, so that kernels give the same
+# bits on every processor. An estimated reciprocal (`arcp`, `afn`) depends on the manufacturer, a fused multiply-add
+# (`contract`) on the instruction set, and a reordered sum (`reassoc`) on the register width.
+# Long sums are written with explicit lanes instead. The cost is about 1 % (docs/tried.md).
 STRICT: dict[str, Any] = {"fastmath": False, "error_model": "numpy"}
 
 
 def _compiler(**more: Any) -> Any:
-    """A decorator like Numba's; several processes may fill the cache of what it compiles."""
-    options = {**STRICT, **more, "cache": True, "no_cfunc_wrapper": True}  # nobody asks for C functions
+    """Returns a decorator like Numba's whose cache can be filled by several processes."""
+    options = {**STRICT, **more, "cache": True, "no_cfunc_wrapper": True}  # C callbacks are not needed
     decorate: Any = njit(**options)
     return lambda function: cache.shared(decorate(function))
 
 
 kernel: Any = _compiler()
-"""A function on one thread, or called from inside a kernel."""
+"""Compiles a single-threaded function, or one that is called from a kernel."""
 
 parallel_kernel: Any = _compiler(parallel=True)
-"""A function over ``prange`` tasks. Tasks write disjoint places: the result does not depend on the thread count."""
+"""Compiles a function with parallel ``prange`` tasks. Tasks write disjoint data, so thread counts do not matter."""
 
 inline: Any = _compiler(inline="always")
-"""A few lines shared by kernels."""
+"""Compiles a small helper that is inlined into kernels."""
 
 ZERO = np.float32(0.0)
 HALF = np.float32(0.5)
@@ -54,7 +54,7 @@ MOST = np.float32(EXPONENT)
 
 
 def threads() -> int:
-    """Threads that kernels use (``NUMBA_NUM_THREADS`` or the cores at hand)."""
+    """Returns the number of threads of kernels (``NUMBA_NUM_THREADS`` or the available cores)."""
     return int(numba.get_num_threads())
 
 
@@ -70,7 +70,7 @@ def _float_of_bits(typing_context: Any, bits: Any) -> Any:
 
 @inline
 def exp(x):
-    """The exponential in float32, relative error 2e-7, clamped to ±87; unlike libm's, loops over it vectorize."""
+    """Returns the float32 exponential, relative error 2e-7, clamped to ±87; unlike libm's, it vectorizes in loops."""
     v = min(max(x * LOG2_E, -MOST), MOST)
     whole = np.floor(v + HALF)
     r = v - whole

@@ -1,8 +1,8 @@
-"""Sixteen float32 in one value: vector instructions for kernels, written out.
+"""Explicit SIMD for kernels: sixteen float32 in one value.
 
 ``Lanes`` is LLVM's ``<16 x float>``: one AVX-512 register, two of AVX2, four of NEON. Kernels add, subtract, multiply,
-divide and compare it like a number (a float32 beside it is spread over the lanes), and read and write it at a flat
-index of a contiguous array. No result depends on the compiler's loop vectorizer.
+divide and compare it like a number (float32 operands are broadcast), and load and store it at a flat index of a
+contiguous array. Results do not depend on the compiler's loop vectorizer.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from numba.extending import intrinsic, lower_builtin, lower_cast, models, regist
 from scas4d_core.kernels.jit import LOG2_E, MOST, inline
 
 COUNT = 16
-"""Lanes of a value."""
+"""Number of lanes of a value."""
 
 emitted: Any = intrinsic
-"""A function that kernels call and that writes its own instructions."""
+"""Decorator of kernel functions that emit their own instructions."""
 
 _FLOAT, _BYTE = ir.FloatType(), ir.IntType(8)
 _INT, _BIT, _LONG = ir.IntType(32), ir.IntType(1), ir.IntType(64)
@@ -31,14 +31,14 @@ _FLOATS, _INTS, _BITS = (ir.VectorType(kind, COUNT) for kind in (_FLOAT, _INT, _
 
 
 class LanesType(types.Type):
-    """Sixteen float32."""
+    """Type of sixteen float32."""
 
     def __init__(self) -> None:
         super().__init__(name="lanes")
 
 
 class LaneMaskType(types.Type):
-    """Sixteen truth values."""
+    """Type of sixteen booleans."""
 
     def __init__(self) -> None:
         super().__init__(name="lane_mask")
@@ -82,7 +82,7 @@ def _spread(context: Any, builder: Any, source: Any, target: Any, value: Any) ->
 
 
 def _operator(function: Any, result: Any, method: str, *how: str) -> None:
-    """Lets ``function`` take two ``Lanes``, or one and a float32; ``method`` of the builder writes the instruction."""
+    """Registers an operator for two ``Lanes``, or one and a float32; the builder's ``method`` emits the instruction."""
 
     class Template(AbstractTemplate):
         key = function
@@ -113,7 +113,7 @@ for _names, _method in (
         _operator(getattr(operator, _name), lanes_type, _method)
 for _name, _sign in (("lt", "<"), ("le", "<="), ("gt", ">"), ("ge", ">=")):
     _operator(getattr(operator, _name), mask_type, "fcmp_ordered", _sign)
-_operator(operator.ne, mask_type, "fcmp_unordered", "!=")  # NaN differs from everything
+_operator(operator.ne, mask_type, "fcmp_unordered", "!=")  # NaN is not equal to any number
 
 
 class _Negative(AbstractTemplate):
@@ -148,7 +148,7 @@ def _lower_and(context: Any, builder: Any, signature: Any, arguments: Any) -> An
 
 @emitted
 def choose(typing_context: Any, mask: Any, yes: Any, no: Any) -> Any:
-    """``yes`` where the mask holds, ``no`` elsewhere."""
+    """Selects ``yes`` in lanes where the mask is set, ``no`` elsewhere."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.select(*arguments)
@@ -158,7 +158,7 @@ def choose(typing_context: Any, mask: Any, yes: Any, no: Any) -> Any:
 
 @emitted
 def any_of(typing_context: Any, mask: Any) -> Any:
-    """True where the mask holds in any lane."""
+    """Returns whether the mask is set in any lane."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         bits = builder.bitcast(arguments[0], ir.IntType(COUNT))
@@ -208,7 +208,7 @@ def _fixed(values: Any) -> Any:
 
 
 ACROSS = 4
-"""Columns and rows of a block: the pixels of one ``Lanes``, row by row."""
+"""Columns and rows of a block, whose pixels form one ``Lanes`` in row-major order."""
 
 block_columns = emitted(_fixed([k % ACROSS for k in range(COUNT)]))
 block_rows = emitted(_fixed([k // ACROSS for k in range(COUNT)]))
@@ -220,13 +220,13 @@ ends = emitted(_fixed([-1.0] * 8 + [1.0] * 8))
 
 @inline
 def ramp(start):
-    """``start`` and every fourth number after it, eight of them, twice."""
+    """Returns eight values ``start``, ``start`` + 4, …, twice."""
     return _eight_columns() + start
 
 
 @emitted
 def fill(typing_context: Any, value: Any) -> Any:
-    """A float32 in every lane."""
+    """Broadcasts a float32 to all lanes."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return _filled(builder, arguments[0])
@@ -252,7 +252,7 @@ def _places(context: Any, builder: Any, array_type: Any, array: Any, index: Any,
 
 @emitted
 def load(typing_context: Any, array: Any, index: Any) -> Any:
-    """The sixteen numbers from a flat index of a float32 array on; unaligned is fine, out of bounds is not."""
+    """Loads sixteen values of a float32 array from a flat index; no alignment needed, bounds are not checked."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = _place(context, builder, signature.args[0], *arguments)
@@ -263,7 +263,7 @@ def load(typing_context: Any, array: Any, index: Any) -> Any:
 
 @emitted
 def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
-    """Writes the lanes from a flat index on."""
+    """Stores the lanes at a flat index."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = _place(context, builder, signature.args[0], *arguments[:2])
@@ -274,7 +274,7 @@ def store(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
 
 
 def _first(builder: Any, count: Any) -> Any:
-    """Bits of the first ``count`` lanes."""
+    """Returns a mask of the first ``count`` lanes."""
     most = builder.select(builder.icmp_signed("<", count, _LONG(COUNT)), count, _LONG(COUNT))
     nothing = ir.Constant(_INTS, ir.Undefined)
     whole = builder.insert_element(nothing, builder.trunc(most, _INT), _INT(0))
@@ -284,7 +284,7 @@ def _first(builder: Any, count: Any) -> Any:
 
 @emitted
 def load_first(typing_context: Any, array: Any, index: Any, count: Any) -> Any:
-    """Loads the first ``count`` numbers only (16 or more: all); 0 beyond, which is not read."""
+    """Loads only the first ``count`` values (16 or more: all); the others are 0 and not read."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = _place(context, builder, signature.args[0], *arguments[:2])
@@ -296,7 +296,7 @@ def load_first(typing_context: Any, array: Any, index: Any, count: Any) -> Any:
 
 @emitted
 def store_first(typing_context: Any, array: Any, index: Any, count: Any, value: Any) -> Any:
-    """Stores the first ``count`` lanes only (16 or more: all)."""
+    """Stores only the first ``count`` lanes (16 or more: all)."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         place = _place(context, builder, signature.args[0], *arguments[:2])
@@ -309,7 +309,7 @@ def store_first(typing_context: Any, array: Any, index: Any, count: Any, value: 
 
 @emitted
 def only_first(typing_context: Any, value: Any, count: Any) -> Any:
-    """The first ``count`` lanes (16 or more: all), 0 beyond."""
+    """Returns the first ``count`` lanes (16 or more: all), and 0 in the others."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.select(_first(builder, arguments[1]), arguments[0], _constant([0] * COUNT))
@@ -319,19 +319,19 @@ def only_first(typing_context: Any, value: Any, count: Any) -> Any:
 
 @inline
 def count_of(mask):
-    """Number of lanes for which a mask holds."""
+    """Returns the number of lanes in which a mask is set."""
     return np.int64(sum_of(choose(mask, fill(np.float32(1.0)), fill(np.float32(0.0)))))
 
 
 @inline
 def aligned(array):
-    """The first flat index of a float32 array whose address is a multiple of 64 bytes: of a ``Lanes``."""
+    """Returns the first flat index of a float32 array that is aligned to 64 bytes, the size of a ``Lanes``."""
     return -(array.ctypes.data // 4) & (COUNT - 1)
 
 
 @emitted
 def gather(typing_context: Any, array: Any, index: Any, stride: Any) -> Any:
-    """The numbers at a flat index of a float32 array and at every ``stride`` after it: a column of sixteen rows."""
+    """Loads sixteen values with a stride from a flat index of a float32 array, such as a column of sixteen rows."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         value = ir.Constant(_FLOATS, ir.Undefined)
@@ -344,7 +344,7 @@ def gather(typing_context: Any, array: Any, index: Any, stride: Any) -> Any:
 
 @emitted
 def scatter(typing_context: Any, array: Any, index: Any, stride: Any, value: Any) -> Any:
-    """Writes the lanes to a flat index and to every ``stride`` after it."""
+    """Stores the lanes with a stride from a flat index."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         for lane, place in enumerate(_places(context, builder, signature.args[0], *arguments[:3])):
@@ -355,7 +355,7 @@ def scatter(typing_context: Any, array: Any, index: Any, stride: Any, value: Any
 
 
 def _places_of_rows(context: Any, builder: Any, types_of: Any, values: Any) -> list[Any]:
-    """Pointers to ``array[rows[place + lane], column]``, for each lane."""
+    """Returns pointers to ``array[rows[place + lane], column]`` for each lane."""
     (array_type, rows_type), (array, rows, place, columns, column) = types_of, values
     if not (isinstance(rows_type, types.Array) and rows_type.dtype == types.int64 and rows_type.layout == "C"):
         raise TypeError(f"rows are a C-contiguous int64 array; this is {rows_type}")
@@ -367,7 +367,7 @@ def _places_of_rows(context: Any, builder: Any, types_of: Any, values: Any) -> l
 
 @emitted
 def gather_column(typing_context: Any, array: Any, rows: Any, place: Any, columns: Any, column: Any) -> Any:
-    """A column of sixteen rows of a float32 array [n, columns]: those that ``rows`` (int64) names from ``place`` on."""
+    """Loads a column of sixteen rows of a float32 array [n, columns], with row indices ``rows[place:]`` (int64)."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         value = ir.Constant(_FLOATS, ir.Undefined)
@@ -382,9 +382,7 @@ def gather_column(typing_context: Any, array: Any, rows: Any, place: Any, column
 def scatter_column(
     typing_context: Any, array: Any, rows: Any, place: Any, columns: Any, column: Any, value: Any
 ) -> Any:
-    """Writes the lanes to a column of the rows that ``gather_column`` would read; of rows named twice, the last lane
-    stays.
-    """
+    """Stores the lanes to a column of the rows that ``gather_column`` reads; for duplicate rows, the last lane wins."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         for lane, place in enumerate(_places_of_rows(context, builder, signature.args[:2], arguments[:5])):
@@ -396,7 +394,7 @@ def scatter_column(
 
 @emitted
 def gather_rows(typing_context: Any, array: Any, rows: Any, place: Any) -> Any:
-    """Sixteen rows of a float32 array [n, 16], those that ``rows`` (int64) names from ``place`` on."""
+    """Loads sixteen rows of a float32 array [n, 16], with row indices ``rows[place:]`` (int64)."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         given = [arguments[0], arguments[1], arguments[2], _LONG(COUNT), _LONG(0)]
@@ -409,7 +407,7 @@ def gather_rows(typing_context: Any, array: Any, rows: Any, place: Any) -> Any:
 
 @emitted
 def add_halves(typing_context: Any, array: Any, rows: Any, place: Any, columns: Any) -> Any:
-    """Adds eight ``Lanes``, the columns of sixteen rows, to a float32 array [n, 8] at the rows named, one by one."""
+    """Adds eight ``Lanes``, the columns of sixteen rows, to the given rows of a float32 array [n, 8], one by one."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         given = [arguments[0], arguments[1], arguments[2], _LONG(COUNT // 2), _LONG(0)]
@@ -420,9 +418,9 @@ def add_halves(typing_context: Any, array: Any, rows: Any, place: Any, columns: 
         def shuffled(a: Any, b: Any, picked: list[int]) -> Any:
             return builder.shuffle_vector(a, b, ir.Constant(ir.VectorType(_INT, len(picked)), picked))
 
-        # Pairs of columns side by side, then fours, then eights: lane by lane, the columns come together.
+        # Interleave pairs of columns, then fours, then eights: the columns of each row become adjacent.
         width = 1
-        groups = [[value] for value in values]  # each: the vectors that hold rows 0–15 of ``width`` columns in turn
+        groups = [[value] for value in values]  # each: vectors with rows 0–15 of ``width`` columns in order
         while len(groups) > 1:
             merged = []
             for left, right in zip(groups[::2], groups[1::2], strict=True):
@@ -447,7 +445,7 @@ def add_halves(typing_context: Any, array: Any, rows: Any, place: Any, columns: 
 
 @emitted
 def prefetch_row(typing_context: Any, array: Any, row: Any) -> Any:
-    """Prefetches a row of a two-dimensional float32 array into the first-level cache; any row, inside or not."""
+    """Prefetches a row of a two-dimensional float32 array into the L1 cache; the row may be out of bounds."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         struct = cgutils.create_struct_proxy(signature.args[0])(context, builder, value=arguments[0])
@@ -461,7 +459,7 @@ def prefetch_row(typing_context: Any, array: Any, row: Any) -> Any:
 
 @emitted
 def _times_power_of_two(typing_context: Any, value: Any, whole: Any) -> Any:
-    """``value`` · 2^``whole``, by its exponent's bits."""
+    """Returns ``value`` · 2^``whole``, computed on the exponent bits."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         steps = builder.shl(builder.fptosi(arguments[1], _INTS), ir.Constant(_INTS, [23] * COUNT))
@@ -472,7 +470,7 @@ def _times_power_of_two(typing_context: Any, value: Any, whole: Any) -> Any:
 
 @inline
 def exp2(x):
-    """2^x for x in [-126, 126], relative error 3e-7: a polynomial on [-1/2, 1/2]."""
+    """Returns 2^x for x in [-126, 126] with relative error 3e-7, using a polynomial on [-1/2, 1/2]."""
     whole = nearest(x)
     part = x - whole
     y = part * np.float32(1.3276470119986325e-3) + np.float32(9.675541319518366e-3)
@@ -485,7 +483,7 @@ def exp2(x):
 
 @inline
 def exp(x):
-    """The exponential in float32, relative error 2e-7, clamped to ±87; NaN stays NaN."""
+    """Returns the float32 exponential with relative error 2e-7, clamped to ±87; NaN is preserved."""
     v = minimum(fill(MOST), maximum(fill(-MOST), x * LOG2_E))
     whole = nearest(v)
     r = v - whole
@@ -500,13 +498,13 @@ def exp(x):
 
 @emitted
 def _exponent_and_mantissa(typing_context: Any, x: Any) -> Any:
-    """Splits positive numbers: x = m 2^e with m in [1/√2, √2)."""
+    """Splits positive numbers into x = m 2^e with m in [1/√2, √2)."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         def all_of(value: int) -> Any:
             return ir.Constant(_INTS, [value] * COUNT)
 
-        bits = builder.sub(builder.bitcast(arguments[0], _INTS), all_of(0x3F3504F3))  # of 1/√2
+        bits = builder.sub(builder.bitcast(arguments[0], _INTS), all_of(0x3F3504F3))  # bits of 1/√2
         exponent = builder.sitofp(builder.ashr(bits, all_of(23)), _FLOATS)
         mantissa = builder.bitcast(builder.add(builder.and_(bits, all_of(0x7FFFFF)), all_of(0x3F3504F3)), _FLOATS)
         return context.make_tuple(builder, signature.return_type, (exponent, mantissa))
@@ -516,7 +514,7 @@ def _exponent_and_mantissa(typing_context: Any, x: Any) -> Any:
 
 @inline
 def log2(x):
-    """Logarithm of positive, normal numbers, absolute error 2e-7 near 1 and relative 2e-7 elsewhere."""
+    """Returns log2 of positive normal numbers, with absolute error 2e-7 near 1 and relative error 2e-7 elsewhere."""
     exponent, mantissa = _exponent_and_mantissa(x)
     t = (mantissa - np.float32(1.0)) / (mantissa + np.float32(1.0))
     square = t * t
@@ -528,10 +526,10 @@ def log2(x):
 
 @emitted
 def column_bits(typing_context: Any, ends: Any) -> Any:
-    """The blocks between rows of pixels: an int64 with a byte per column of blocks, a bit per row of blocks.
+    """Converts row ranges to blocks: an int64 with a byte per column of blocks and a bit per row of blocks.
 
-    Of column k (of 8), the rows from lane k to lane k + 8, whole numbers; none where the first is below the last. Rows
-    above -1 and below 32 only.
+    Column k (of 8) contains the rows from lane k to lane k + 8, which are integers; none if the first exceeds the last.
+    Rows must be above -1 and below 32.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -557,7 +555,7 @@ def column_bits(typing_context: Any, ends: Any) -> Any:
 
 @emitted
 def lowest_bit(typing_context: Any, bits: Any) -> Any:
-    """Number of the lowest bit set; the bits must not be 0."""
+    """Returns the index of the lowest set bit; the argument must not be 0."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         return builder.cttz(arguments[0], _BIT(1))
@@ -567,7 +565,7 @@ def lowest_bit(typing_context: Any, bits: Any) -> Any:
 
 @emitted
 def sum_of(typing_context: Any, value: Any) -> Any:
-    """The sum over the lanes."""
+    """Returns the sum over the lanes."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         total = arguments[0]
@@ -581,11 +579,11 @@ def sum_of(typing_context: Any, value: Any) -> Any:
 
 @emitted
 def sums_of(typing_context: Any, values: Any) -> Any:
-    """The sum over the lanes of each of up to sixteen ``Lanes`` in a tuple, in order; the last lanes are 0."""
+    """Returns the lane sums of up to sixteen ``Lanes`` in a tuple, in order; unused lanes are 0."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         given = [builder.extract_value(arguments[0], k) for k in range(len(values))]
-        # Halves of two values side by side and added make one; four times, and each lane is one value's sum.
+        # Add the interleaved halves of two values to get one; after four steps, each lane is the sum of one value.
         length = COUNT
         while length > 1:
             half = length // 2
@@ -609,14 +607,14 @@ def sums_of(typing_context: Any, values: Any) -> Any:
 
 @emitted
 def transposed(typing_context: Any, values: Any) -> Any:
-    """Sixteen ``Lanes`` in a tuple, as rows and columns changed places."""
+    """Transposes sixteen ``Lanes`` in a tuple."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         rows = [builder.extract_value(arguments[0], k) for k in range(COUNT)]
         length = COUNT
         while length > 1:
             half = length // 2
-            # Off-diagonal quarters of each square of ``length`` rows and columns change places.
+            # Swap the off-diagonal quarters of each square of ``length`` rows and columns.
             low = [k if k % length < half else COUNT + k - half for k in range(COUNT)]
             high = [k + half if k % length < half else COUNT + k for k in range(COUNT)]
             for k in range(COUNT):

@@ -1,9 +1,10 @@
-"""Rigidity, isometry and rotation losses over sampled neighbourhoods, with gradients. Twins: ``losses.rigidity_loss``,
-``losses.isometry_loss``, ``losses.rotation_loss``.
+"""Rigidity, isometry and rotation losses over sampled neighbourhoods, with gradients.
 
-Sixteen sampled Gaussians at a time, each with its k-th neighbour. A pair's gradient falls on both of its Gaussians.
-Tasks are a fixed number, each with its own accumulator, summed in a fixed order: no atomics, and the same bits whatever
-the number of threads.
+References: ``losses.rigidity_loss``, ``losses.isometry_loss``, ``losses.rotation_loss``.
+
+Sixteen sampled Gaussians are processed at a time, each with its k-th neighbour. A pair contributes to the gradients of
+both Gaussians. A fixed number of tasks with separate accumulators, summed in a fixed order, avoids atomics and makes
+the result independent of the number of threads.
 """
 
 from __future__ import annotations
@@ -19,21 +20,21 @@ from scas4d_core.kernels.jit import ONE, ZERO, kernel, parallel_kernel
 
 TASKS = 4
 UNDER_ROOT = np.float32(ROOT_FLOOR)
-"""Added under each root."""
+"""Added under each square root."""
 
 CHUNK = 4096
-"""Numbers that a task sums."""
+"""Number of values that a task sums."""
 
 
 @kernel
 def state_of(state, who):
-    """Columns of the state of sixteen Gaussians."""
+    """Returns the state columns of sixteen Gaussians."""
     return lanes.transposed(lanes.gather_rows(state, who, 0))
 
 
 @kernel
 def pairs_task(state, sample, neighbours, weights, distances, rigid, isometric, turning, own, losses):
-    """Sums losses [3] of the Gaussians ``sample`` of one task; gradients are added to ``own`` [M, 8]."""
+    """Sums the losses [3] of one task's sampled Gaussians, and adds their gradients to ``own`` [M, 8]."""
     count = neighbours.shape[1]
     who, other = np.empty(lanes.COUNT, np.int64), np.empty(lanes.COUNT, np.int64)
     present = np.empty(lanes.COUNT, np.float32)
@@ -58,7 +59,7 @@ def pairs_task(state, sample, neighbours, weights, distances, rigid, isometric, 
             weight = lanes.load(present, 0) * lanes.gather_column(weights, who, 0, count, k)
             counts = weight > ZERO
             ox, oy, oz = there[0] - mx, there[1] - my, there[2] - mz
-            # Rigidity: the neighbour's offset, turned back, equals that of frame t−1.
+            # Rigidity: the neighbour's offset, rotated back, should equal that of frame t−1.
             ex = r0 * ox + r3 * oy + r6 * oz - (there[7] - px)
             ey = r1 * ox + r4 * oy + r7 * oz - (there[8] - py)
             ez = r2 * ox + r5 * oy + r8 * oz - (there[9] - pz)
@@ -78,7 +79,7 @@ def pairs_task(state, sample, neighbours, weights, distances, rigid, isometric, 
             g6 += oz * ex
             g7 += oz * ey
             g8 += oz * ez
-            # Isometry: the distance equals that of frame 0.
+            # Isometry: the distance should equal that of frame 0.
             distance = lanes.square_root(ox * ox + oy * oy + oz * oz + UNDER_ROOT)
             stretch = distance - lanes.gather_column(distances, who, 0, count, k)
             length = lanes.square_root(weight * stretch * stretch + UNDER_ROOT)
@@ -87,7 +88,7 @@ def pairs_task(state, sample, neighbours, weights, distances, rigid, isometric, 
             gx += pull * ox
             gy += pull * oy
             gz += pull * oz
-            # Rotation: both have turned alike.
+            # Rotation: both Gaussians should have rotated equally.
             dw, dx, dy, dz = there[3] - w, there[4] - x, there[5] - y, there[6] - z
             length = lanes.square_root(weight * (dw * dw + dx * dx + dy * dy + dz * dz) + UNDER_ROOT)
             rotation += lanes.choose(counts, length, nothing)
@@ -111,14 +112,14 @@ def pairs_task(state, sample, neighbours, weights, distances, rigid, isometric, 
 
 @parallel_kernel
 def neighbour_terms(state, sample, neighbours, weights, distances, strengths, accumulators, losses):
-    """Weighted sum of the three losses over the sampled Gaussians, and its gradient (Dynamic3DGaussians).
+    """Computes the weighted sum of the three losses over the sampled Gaussians, and its gradient (Dynamic3DGaussians).
 
     Args:
         state: [M, 16], columns as in ``deltas``. sample: [S] int64 rows whose neighbours are compared.
         neighbours [M, k] int32, weights [M, k] (0: no neighbour), distances [M, k] metres at frame 0.
-        strengths: [3] float32, weights of rigidity, isometry and rotation over the mean's count S k.
-        accumulators: out [4, M, 8]; the first holds the gradients, columns as in ``deltas``.
-        losses: out [4, 3], unweighted sums over pairs by task.
+        strengths: [3] float32, weights of rigidity, isometry and rotation divided by the number of pairs S k.
+        accumulators: out [4, M, 8]; the first one contains the gradients, columns as in ``deltas``.
+        losses: out [4, 3], unweighted sums over the pairs of each task.
     """
     size = (sample.shape[0] + TASKS - 1) // TASKS
     for task in prange(TASKS):

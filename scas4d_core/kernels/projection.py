@@ -1,10 +1,10 @@
-"""EWA projection of Gaussians into a camera, and its backward. Reference: ``engines.torch.rasterizer``.
+"""EWA projection of Gaussians into a camera, and its backward pass. Reference: ``engines.torch.rasterizer``.
 
-A camera enters as ``pose`` [3, 4] float32 (world to camera, OpenCV axes) and ``lens`` [6] float32
-(fx, fy, cx, cy, width, height) in pixels; pixel centres at +0.5.
+A camera is given as ``pose`` [3, 4] float32 (world to camera, OpenCV axes) and ``lens`` [6] float32
+(fx, fy, cx, cy, width, height) in pixels, with pixel centres at +0.5.
 
-A Gaussian that cannot be drawn without spoiling the pixels of others is left out, and counted; so is a gradient that
-overflows (``guards``).
+Gaussians with invalid values are not rendered, because they would corrupt the pixels of others. Gradients that overflow
+are dropped. Both are counted (``guards``).
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from scas4d_core.kernels import lanes
 from scas4d_core.kernels.jit import HALF, ONE, TWO, ZERO, inline, kernel, parallel_kernel
 
 TILE = 32
-"""Pixels along the side of a tile: 8 by 8 blocks of 4 by 4, a bit each in 64; their state fits into the first cache."""
+"""Side of a tile in pixels: 8×8 blocks of 4×4 pixels, one bit each in 64; its state fits into the L1 cache."""
 
 CHUNK = 256
-"""Gaussians a task: enough work for a thread, few enough for balance."""
+"""Gaussians per task, a compromise between overhead and load balance."""
 
 AHEAD = 16
-"""Gaussians by which records are prefetched: they lie anywhere in memory."""
+"""Prefetch distance in Gaussians, whose records are scattered in memory."""
 
 FARTHEST = np.float32(NOT_FINITE)
 BRIGHTEST = np.float32(FEATURE_CEILING)
@@ -37,9 +37,9 @@ COUNTED_GUARDS = ("not_finite", "footprint_ceiling")
 COUNTED_GUARDS_BACKWARD = ("gradient_not_finite",)
 """Guards that ``project_backward`` counts."""
 
-# Columns of ``splats`` [N, 16], a Gaussian as later kernels read it. REACH is the support's squared Mahalanobis
-# radius. At a column dx right of the centre, the support is at SLOPE dx ± sqrt(SPREAD (REACH - THIN dx²)) below it; it
-# is lowest at dx = LOWEST_X, highest at -LOWEST_X.
+# Columns of ``splats`` [N, 16], the Gaussian data that later kernels read. REACH is the support's squared Mahalanobis
+# radius. In a column dx right of the centre, the support spans the rows SLOPE dx ± sqrt(SPREAD (REACH - THIN dx²))
+# below it. It is lowest at dx = LOWEST_X and highest at -LOWEST_X.
 MEAN_X, MEAN_Y, CONIC_A, CONIC_B, CONIC_C, OPACITY, REACH, DEPTH = range(8)
 LOG_OPACITY, SLOPE, SPREAD, THIN, LOWEST_X = range(8, 13)
 SPLAT_COLUMNS = 16
@@ -47,7 +47,7 @@ SPLAT_COLUMNS = 16
 
 @inline
 def tangents(u, v, lens, margin):
-    """x/z and y/z, clamped for the Jacobian, and masks of those inside the bounds."""
+    """Returns x/z and y/z clamped for the Jacobian, and masks of values within the bounds."""
     fx, fy, cx, cy, width, height = lens[0], lens[1], lens[2], lens[3], lens[4], lens[5]
     margin_x = margin * HALF * width / fx
     margin_y = margin * HALF * height / fy
@@ -61,13 +61,13 @@ def tangents(u, v, lens, margin):
 
 @inline
 def rotate_coordinate(pose, row, x, y, z):
-    """One coordinate of vectors turned into the camera's axes."""
+    """Returns one coordinate of vectors rotated into the camera's axes."""
     return x * pose[row, 0] + y * pose[row, 1] + z * pose[row, 2]
 
 
 @inline
 def sound_features(features, first):
-    """1 for each of sixteen Gaussians from row ``first`` on whose features are finite and not too large, else 0."""
+    """Returns 1 for each of sixteen Gaussians from row ``first`` with finite, not too large features, else 0."""
     columns = features.shape[1]
     sound = lanes.fill(ONE)
     total = lanes.fill(ZERO)
@@ -82,11 +82,11 @@ def sound_features(features, first):
 
 @kernel
 def project_group(first, means, factors, opacities, features, pose, lens, limits, splats, place, boxes, guard_counts):
-    """Projects sixteen Gaussians from row ``first`` on; see ``project``.
+    """Projects sixteen Gaussians from row ``first``; see ``project``.
 
     Args:
-        splats: out, from row ``place`` on. boxes: out [5 · 16]: tiles x0, y0, x1, y1 of each, and how many.
-        guard_counts: [2], added to.
+        splats: out, from row ``place``. boxes: out [5 · 16]: tiles x0, y0, x1, y1 of each, and their number.
+        guard_counts: [2], accumulated.
     """
     alpha_floor, low_pass, near, margin = limits[0], limits[3], limits[4], limits[5]
     fx, fy, cx, cy = lens[0], lens[1], lens[2], lens[3]
@@ -119,7 +119,7 @@ def project_group(first, means, factors, opacities, features, pose, lens, limits
         syy = syy + m1 * m1
         m00, m01, m02 = m01, m02, m0
         m10, m11, m12 = m11, m12, m1
-    # |m0 x m1|^2 + low_pass (...) - low_pass^2 without the cancellation of sxx syy - sxy^2 for needles.
+    # |m0 x m1|^2 + low_pass (...) - low_pass^2 avoids the cancellation of sxx syy - sxy^2 for needle-shaped Gaussians.
     n0 = m01 * m12 - m02 * m11
     n1 = m02 * m10 - m00 * m12
     n2 = m00 * m11 - m01 * m10
@@ -140,7 +140,7 @@ def project_group(first, means, factors, opacities, features, pose, lens, limits
     reach = lanes.maximum(reach, zero)
     half_x = lanes.square_root(reach * sxx)
     half_y = lanes.square_root(reach * syy)
-    # Pixel centres lie at +0.5: the first covered column has centre >= mx - half_x.
+    # Pixel centres are at +0.5: the first covered column has its centre at or right of mx - half_x.
     left, right = mx - half_x - HALF, mx + half_x + HALF
     top, bottom = my - half_y - HALF, my + half_y + HALF
     visible = visible & (right > ZERO) & (left < width) & (bottom > ZERO) & (top < height)
@@ -169,7 +169,7 @@ def project_group(first, means, factors, opacities, features, pose, lens, limits
 
 @kernel
 def padded_1(rows, first):
-    """Up to sixteen numbers of an array from ``first`` on, as sixteen; those beyond are 0."""
+    """Returns up to sixteen values of an array from ``first``, padded with 0 to sixteen."""
     result = np.zeros(lanes.COUNT, np.float32)
     for k in range(min(lanes.COUNT, rows.shape[0] - first)):
         result[k] = rows[first + k]
@@ -178,7 +178,7 @@ def padded_1(rows, first):
 
 @kernel
 def padded_2(rows, first):
-    """Up to sixteen rows of an array from ``first`` on, as sixteen; those beyond are 0."""
+    """Returns up to sixteen rows of an array from ``first``, padded with 0 to sixteen."""
     result = np.zeros((lanes.COUNT, rows.shape[1]), np.float32)
     for k in range(min(lanes.COUNT, rows.shape[0] - first)):
         for column in range(rows.shape[1]):
@@ -188,7 +188,7 @@ def padded_2(rows, first):
 
 @kernel
 def padded_3(rows, first):
-    """Up to sixteen 3×3 matrices of an array from ``first`` on, as sixteen; those beyond are 0."""
+    """Returns up to sixteen 3×3 matrices of an array from ``first``, padded with 0 to sixteen."""
     result = np.zeros((lanes.COUNT, 3, 3), np.float32)
     for k in range(min(lanes.COUNT, rows.shape[0] - first)):
         for i in range(3):
@@ -225,12 +225,13 @@ def project(means, factors, opacities, features, pose, lens, limits, splats, rec
 
     Args:
         means: [N, 3] float32 world. factors: [N, 3, 3] float32, Σ = F Fᵀ. opacities: [N] float32.
-        features: [N, C] float32; only whether they are finite is read.
+        features: [N, C] float32, only checked for valid values.
         pose, lens: the camera. limits: [6] float32, the fields of ``Limits`` in order.
         splats: out [N + 15 or more, 16] float32, columns above.
-        rects: out [N, 4] int32, tiles x0, y0, x1, y1 (exclusive) of the support's box; empty where culled.
-        counts: out [N] int32, tiles in the box.
-        guard_counts: out [tasks of ``CHUNK``, 2] int64, for how many Gaussians the guards in ``COUNTED_GUARDS`` acted.
+        rects: out [N, 4] int32, tiles x0, y0, x1, y1 (exclusive) of the support's box; empty if culled.
+        counts: out [N] int32, number of tiles in the box.
+        guard_counts: out [tasks of ``CHUNK``, 2] int64, number of Gaussians for which each guard in ``COUNTED_GUARDS``
+            was triggered.
     """
     for task in prange((means.shape[0] + CHUNK - 1) // CHUNK):
         project_task(
@@ -243,16 +244,16 @@ def project_backward_group(
     first, place, means, factors, pose, lens, limits, splats, sums, columns, depth_channel, g_means, g_factors,
     g_opacities, g_screen,
 ):  # fmt: skip
-    """Carries sixteen Gaussians' gradients from the picture to the world; see ``project_backward``.
+    """Backpropagates the gradients of sixteen Gaussians from the picture to the world; see ``project_backward``.
 
     Args:
         first: row of the Gaussians in ``means`` and ``factors``. place: their row in ``splats``.
-        sums: [16, columns], each Gaussian's record summed over its pairs, and 1 behind it if there was one, else 0;
-            0 is written there of a Gaussian whose gradient overflows.
-        g_means, g_factors, g_opacities, g_screen: out, from row ``first`` on.
+        sums: [16, columns], each Gaussian's record summed over its pairs, followed by 1 if it has pairs, else 0. That
+            flag is set to 0 if the gradient of the Gaussian overflows.
+        g_means, g_factors, g_opacities, g_screen: out, from row ``first``.
 
     Returns:
-        Whether a gradient overflowed here.
+        Whether a gradient overflowed.
     """
     margin = limits[5]
     fx, fy = lens[0], lens[1]
@@ -305,7 +306,7 @@ def project_backward_group(
             g = ga0 * pose[0, j] + ga1 * pose[1, j] + ga2 * pose[2, j]
             size = size + lanes.magnitude(g)
             lanes.scatter(g_factors, 9 * first + 3 * j + k, 9, lanes.choose(seen, g, zero))
-    # The clamped tangents are constants; the projected centre always moves.
+    # Clamped tangents are treated as constants; the projected centre always gets a gradient.
     g_u = lanes.choose(free_u, g_u, zero) * inverse
     g_v = lanes.choose(free_v, g_v, zero) * inverse
     gx = fx * inverse * g_x + g_u
@@ -337,7 +338,7 @@ def project_backward_group(
 
 @kernel
 def clear_steep_gradients(sums, counts, first, some, used):
-    """Clears the sums and the mark of those of sixteen Gaussians whose pairs add up to more than ``STEEPEST``."""
+    """Clears sums and flags of those of sixteen Gaussians whose pairs sum to more than ``STEEPEST``."""
     for k in range(some):
         steep = ZERO
         for column in range(used):
@@ -352,7 +353,7 @@ def project_backward_task(
     task, means, factors, pose, lens, limits, splats, counts, firsts, records, depth_channel, g_means, g_factors,
     g_opacities, g_features, g_screen, guard_counts,
 ):  # fmt: skip
-    """Carries the gradients of the Gaussians of one task of ``project_backward``."""
+    """Backpropagates the gradients of the Gaussians of one task of ``project_backward``."""
     channels = g_features.shape[1]
     columns = records.shape[1]
     count = means.shape[0]
@@ -424,16 +425,16 @@ def project_backward(
     g_screen,
     guard_counts,
 ):
-    """Sums each Gaussian's pairs (in a fixed order) and carries the gradients to the world, sixteen at a time.
+    """Sums each Gaussian's pairs (in a fixed order) and backpropagates them to the world, sixteen at a time.
 
     Args:
-        records: [pairs, whole ``Lanes``] from ``blend_backward``; counts, firsts: [N], how many each Gaussian
-            has, and the first.
-        depth_channel: the feature channel that holds the depth of the centre, or -1.
-        g_means [N, 3], g_factors [N, 3, 3], g_opacities [N], g_features [N, C], g_screen [N, 2]: out, float32; 0 where
-            culled. ``g_screen`` is dL/d(projected centre) per pixel, which density control reads.
-        guard_counts: out [tasks of ``CHUNK``, 1] int64, for how many Gaussians the guard in
-            ``COUNTED_GUARDS_BACKWARD`` acted.
+        records: [pairs, multiple of ``Lanes``] from ``blend_backward``. counts, firsts: [N] number of pairs of each
+            Gaussian, and its first pair.
+        depth_channel: the feature channel that contains the depth of the centre, or -1.
+        g_means [N, 3], g_factors [N, 3, 3], g_opacities [N], g_features [N, C], g_screen [N, 2]: out, float32; 0 if
+            culled. ``g_screen`` is dL/d(projected centre) per pixel, which density control uses.
+        guard_counts: out [tasks of ``CHUNK``, 1] int64, number of Gaussians for which the guard in
+            ``COUNTED_GUARDS_BACKWARD`` was triggered.
     """
     for task in prange((means.shape[0] + CHUNK - 1) // CHUNK):
         project_backward_task(

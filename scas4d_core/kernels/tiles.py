@@ -1,4 +1,4 @@
-"""Depth order and tile lists: one global sort; lists filled in that order are sorted by construction."""
+"""Depth sorting and tile lists: one global sort, so that lists filled in this order are sorted by construction."""
 
 from __future__ import annotations
 
@@ -26,30 +26,30 @@ RADIX_BITS = 12
 DIGITS = 1 << RADIX_BITS
 
 BLOCK = lanes.ACROSS
-"""Pixels of a block's side."""
+"""Side of a block in pixels."""
 
 SOME = 4096
-"""Rows a task."""
+"""Rows per task."""
 
 AHEAD = 8
-"""Gaussians by which numbers are prefetched: in depth order they lie anywhere in memory."""
+"""Prefetch distance in Gaussians, which are scattered in memory when in depth order."""
 
 
 @inline
 def cover(splat, tile_x, tile_y):
-    """The blocks of a tile that the support (an ellipse) meets: bit 8 x + y for column x and row y of blocks.
+    """Returns the blocks of a tile that the support (an ellipse) intersects: bit 8 x + y for block column x and row y.
 
-    Culling by the cover is exact: per column of blocks, it spans the support's highest to lowest row there.
+    Culling by the cover is exact: in each column of blocks, it spans the support's extreme rows.
     """
     left = lanes.ramp(np.float32(tile_x * TILE) + HALF - splat[MEAN_X])
-    # Eight lanes for the upper ends of the columns of blocks, eight for the lower.
+    # Eight lanes for the upper ends of the block columns, eight for the lower ends.
     down = lanes.ends()
-    # Rounding must not cull what the blending kernels would still draw.
+    # Rounding must not cull pixels that the blending kernels would render.
     reach = splat[REACH] * WIDER + SLACK
     dx = lanes.minimum(lanes.maximum(down * splat[LOWEST_X], left), left + np.float32(lanes.ACROSS - 1))
     room = reach - dx * dx * splat[THIN]
     dy = dx * splat[SLOPE] + down * lanes.square_root(lanes.maximum(room * splat[SPREAD], lanes.fill(ZERO)))
-    # Rows whose centres are inside: from the ceiling of the upper end, to the floor of the lower.
+    # Rows whose centres are inside: from the ceiling of the upper end to the floor of the lower end.
     row = down * lanes.floor(down * (dy + (splat[MEAN_Y] - HALF - np.float32(tile_y * TILE))))
     row = lanes.choose(room >= ZERO, row, down * np.float32(-1e4))
     row = lanes.minimum(lanes.maximum(row, lanes.fill(np.float32(-1.0))), lanes.fill(np.float32(TILE)))
@@ -58,18 +58,18 @@ def cover(splat, tile_x, tile_y):
 
 @kernel
 def depth_order(splats, counts, keys, order, keys_too, order_too, histogram):
-    """Sorts the visible Gaussians by depth, nearest first; equal depths keep row order.
+    """Sorts the visible Gaussians by depth, nearest first; equal depths keep the row order.
 
-    Depths are positive, so their float32 bits sort as integers: stable passes of 12 bits over the difference from the
-    nearest, two where the farthest is within four times the nearest.
+    Depths are positive, so their float32 bits sort as integers. A stable radix sort runs 12-bit passes on the
+    difference from the nearest depth; two passes suffice if the farthest depth is within four times the nearest.
 
     Args:
-        splats: [N, 16]; counts: [N] tiles of each, 0 where culled.
+        splats: [N, 16]; counts: [N] number of tiles of each, 0 if culled.
         keys, keys_too: scratch [N] uint32. order, order_too: [N] int32.
         histogram: scratch [DIGITS] int64.
 
     Returns:
-        How many are visible, and which of the two arrays holds their order.
+        The number of visible Gaussians, and the one of the two arrays that contains their order.
     """
     visible = 0
     for i in range(counts.shape[0]):
@@ -111,10 +111,10 @@ def depth_order(splats, counts, keys, order, keys_too, order_too, histogram):
 
 @kernel
 def share_pairs(order, visible, counts, begins):
-    """Fills the first pair of each task, ``begins`` [tasks] int64: tasks have equal shares of the order.
+    """Computes the first pair of each task, ``begins`` [tasks] int64; tasks get equal shares of the order.
 
     Returns:
-        Largest number of pairs of Gaussians and tiles: the tiles of all boxes.
+        Upper bound of the number of Gaussian–tile pairs: the tiles of all boxes.
     """
     tasks = begins.shape[0]
     total = 0
@@ -150,7 +150,7 @@ def cover_tiles_task(
                 blocks = cover(splats[i], tile_x, tile_y)
                 outside += np.int64(learnt[i] != 0 and (blocks & ~drawn[tile]) != 0)
                 blocks &= drawn[tile]
-                # Written in any case, kept if reached: without a branch that the processor could mispredict.
+                # Always written and only kept if reached, which avoids a branch that could be mispredicted.
                 reached = np.int64(blocks != 0)
                 pairs[pair, 0] = i
                 pairs[pair, 1] = tile
@@ -166,19 +166,19 @@ def cover_tiles_task(
 def cover_tiles(
     splats, rects, order, visible, tiles_x, drawn, learnt, begins, ends, counts, firsts, pairs, covers, tile_counts
 ):
-    """Lists the tiles that each Gaussian's support reaches, in depth order.
+    """Lists the tiles that each Gaussian's support intersects, in depth order.
 
     Args:
-        drawn: [tiles] uint64, the blocks of each tile that are drawn; the others reach nobody.
-        learnt: [N] uint8, 1 for Gaussians that have to stay within what is drawn.
-        begins: [tasks] from ``share_pairs``. ends: out [tasks] int64, where each task's pairs end.
-        counts: in: tiles of each Gaussian's box; out: tiles reached. firsts: out [N] int64, each one's first pair; the
-            others follow it.
+        drawn: [tiles] uint64, the blocks of each tile to render; other blocks are ignored.
+        learnt: [N] uint8, 1 for Gaussians that must stay within the rendered blocks.
+        begins: [tasks] from ``share_pairs``. ends: out [tasks] int64, end of each task's pairs.
+        counts: in: tiles of each Gaussian's box; out: tiles reached. firsts: out [N] int64, first pair of each
+            Gaussian; its other pairs follow.
         pairs: out [pairs, 2] int32, Gaussian and tile. covers: out [pairs] uint64, blocks of the tile, see ``cover``.
         tile_counts: out [tasks, tiles] int32.
 
     Returns:
-        How many times one of these reached a tile outside of what is drawn.
+        Number of times that a learned Gaussian reached blocks that are not rendered.
     """
     tasks = begins.shape[0]
     left = np.zeros(tasks, np.int64)
@@ -195,11 +195,11 @@ def cover_tiles(
 
 @kernel
 def mark_blocks(splats, rects, chosen, tiles_x, marks):
-    """Marks the blocks that the supports of Gaussians meet.
+    """Marks the blocks that the supports of Gaussians intersect.
 
     Args:
-        splats, rects: of ``projection.project``. chosen: [N] uint8, 0 for Gaussians that mark nothing.
-        marks: [tiles] uint64, added to.
+        splats, rects: from ``projection.project``. chosen: [N] uint8, 0 for Gaussians that are ignored.
+        marks: [tiles] uint64, to which bits are added.
     """
     for i in range(rects.shape[0]):
         if chosen[i] == 0:
@@ -211,7 +211,7 @@ def mark_blocks(splats, rects, chosen, tiles_x, marks):
 
 @kernel
 def find_meeting(splats, rects, tiles_x, drawn, meets):
-    """Finds the Gaussians whose support meets a block that is drawn.
+    """Finds the Gaussians whose support intersects a block to render.
 
     Args:
         drawn: [tiles] uint64. meets: out [N] bool.
@@ -227,7 +227,7 @@ def find_meeting(splats, rects, tiles_x, drawn, meets):
 
 @parallel_kernel
 def put_rows(rows, places, part, whole):
-    """Copies rows of an array to places of another.
+    """Copies rows of one array to rows ``places`` of another.
 
     Args:
         rows, places: [M] int64. part: [P, K], whole: out [W, K] float32.
@@ -240,19 +240,19 @@ def put_rows(rows, places, part, whole):
 
 @inline
 def is_marked(blocks, tiles_x, y, x):
-    """True where the block of a pixel is among the marked ones."""
+    """Returns whether the block of a pixel is marked."""
     number = x % TILE // BLOCK * (TILE // BLOCK) + y % TILE // BLOCK
     return (blocks[y // TILE * tiles_x + x // TILE] >> np.uint64(number)) & np.uint64(1) != 0
 
 
 @kernel
 def compose_box(planes, base, blocks, tiles_x, box, part, shifts):
-    """Composes a box of a picture: the blocks that were drawn, and what is known of all others.
+    """Composes a box of a picture from the rendered blocks and a known base picture.
 
     Args:
-        planes: [C, rows, stride] float32, as drawn. base: [C, H, W] float32, all that is not.
-        blocks: [tiles] uint64. box: first row, last but one, first column, last but one.
-        part: out [C, h, w] float32, the box. shifts: out [C] float64, sums over the box of how much it differs from the
+        planes: [C, rows, stride] float32, the rendering. base: [C, H, W] float32, values of all other blocks.
+        blocks: [tiles] uint64. box: first row, last row + 1, first column, last column + 1.
+        part: out [C, h, w] float32, the box. shifts: out [C] float64, sums over the box of its difference from the
             base.
     """
     top, bottom, left, right = box
@@ -272,7 +272,7 @@ def compose_box(planes, base, blocks, tiles_x, box, part, shifts):
 
 @kernel
 def write_blocks(part, blocks, tiles_x, box, planes):
-    """Copies the blocks that were drawn from a box to a picture, as ``compose_box`` has them; others stay as they are.
+    """Copies the rendered blocks from a box to a picture, like ``compose_box``; other blocks are unchanged.
 
     Args:
         part: [C, h, w] float32. planes: out [C, rows, stride] float32.
@@ -288,10 +288,10 @@ def write_blocks(part, blocks, tiles_x, box, planes):
 
 @kernel
 def tile_offsets(tile_counts, starts, cursors):
-    """Fills the start of each tile's list, ``starts`` [tiles + 1], and of each task's part, ``cursors`` [tasks, tiles].
+    """Computes the start of each tile's list, ``starts`` [tiles + 1], and each task's part, ``cursors`` [tasks, tiles].
 
     Returns:
-        Entries of all lists.
+        Number of entries of all lists.
     """
     total = 0
     for tile in range(tile_counts.shape[1]):
@@ -305,10 +305,10 @@ def tile_offsets(tile_counts, starts, cursors):
 
 @parallel_kernel
 def fill_tiles(begins, ends, pairs, covers, cursors, items, slots, entry_covers):
-    """Writes the tile lists in depth order, each task its share, at the places of ``tile_offsets``.
+    """Writes the tile lists in depth order; each task writes its share at the offsets from ``tile_offsets``.
 
     Args:
-        cursors: [tasks, tiles] int64, moved on. items, slots: out [entries] int32, the Gaussian and its pair.
+        cursors: [tasks, tiles] int64, advanced. items, slots: out [entries] int32, the Gaussian and its pair.
         entry_covers: out [entries] uint64.
     """
     for task in prange(begins.shape[0]):

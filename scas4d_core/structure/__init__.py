@@ -1,1 +1,1 @@
-"""The clusters and the neighbour graph of the moving Gaussians."""
+"""Cluster hierarchy and neighbour graph of the moving Gaussians."""

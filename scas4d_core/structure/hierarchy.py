@@ -1,9 +1,9 @@
-"""The hierarchy of clusters (paper, Training Strategy): K-means for the finest layer, agglomerative merging upward.
+"""Cluster hierarchy (paper, Training Strategy): K-means for the finest layer, agglomerative merging for the others.
 
 Clusters are numbered so that, with Gaussians sorted by their finest cluster, every cluster of every layer is one
-contiguous range: the kernels and the sums of gradients rely on it.
+contiguous range. The kernels and the gradient sums rely on this order.
 
-Gaussians that are not finite are in no cluster: they stand, and are counted (``guards.LEFT_OUT``).
+Gaussians that are not finite belong to no cluster: they do not move, and are counted (``guards.LEFT_OUT``).
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from threadpoolctl import threadpool_limits
 Int = NDArray[np.int64]
 
 KMEANS_ROUNDS = 30
-"""Lloyd iterations: the update needs compact clusters, not an optimum."""
+"""Maximum number of Lloyd iterations; the update needs compact clusters, not an optimum."""
 
 KMEANS_SAMPLE_PER_CLUSTER = 256
-"""Points per cluster that K-means uses; beyond, a sample bounds time and memory (1 M points: 330,000 x 3)."""
+"""Points per cluster that K-means uses; sampling bounds time and memory (1 M points: 330,000 x 3)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,10 +30,10 @@ class Hierarchy:
     """Nested clusters of the M moving Gaussians.
 
     Attributes:
-        rows: [M] int64, the moving Gaussians' rows in Θ, in the order that makes clusters contiguous.
+        rows: [M] int64, rows of the moving Gaussians in Θ, in the order that makes clusters contiguous.
         labels: per layer, coarse to fine, [M] int32 cluster of each entry of ``rows``; ascending.
-        starts: per layer [K + 1] int64, each cluster's range of entries.
-        left_out: moving Gaussians that are not finite and so in no cluster.
+        starts: per layer, [K + 1] int64 range of entries of each cluster.
+        left_out: number of moving Gaussians that are not finite and therefore in no cluster.
     """
 
     rows: Int
@@ -43,12 +43,12 @@ class Hierarchy:
 
     @property
     def sizes(self) -> tuple[int, ...]:
-        """Clusters per layer."""
+        """Number of clusters per layer."""
         return tuple(len(starts) - 1 for starts in self.starts)
 
     @property
     def without_layers(self) -> Hierarchy:
-        """The same Gaussians in the same order, each alone."""
+        """Returns a hierarchy of the same Gaussians in the same order, without layers."""
         return Hierarchy(self.rows, (), (), self.left_out)
 
 
@@ -58,13 +58,13 @@ def build_hierarchy(
     """Clusters the moving Gaussians (paper, Training Strategy).
 
     Args:
-        means: [N, 3] metres; not finite ones belong to no cluster. moving: [N]; nor do the others.
-        clusters: clusters per layer, coarse to fine, ascending; capped so that ``smallest`` Gaussians fall into each
-            on average. Empty: no layer.
-        seed: of K-means.
+        means: [N, 3] metres; rows that are not finite belong to no cluster. moving: [N] Gaussians to cluster.
+        clusters: number of clusters per layer, coarse to fine, ascending; capped to an average of at least ``smallest``
+            Gaussians per cluster. Empty: no layers.
+        seed: random seed of K-means.
 
     Raises:
-        ValueError: the numbers do not ascend.
+        ValueError: if the numbers of clusters are not ascending.
 
     >>> points = np.array([[0, 0, 0], [5, 0, 0], [0.1, 0, 0], [5.1, 0, 0], [9, 9, 9]])
     >>> moving = np.array([True, True, True, True, False])
@@ -84,7 +84,7 @@ def build_hierarchy(
     if not sizes:
         return Hierarchy(rows, (), (), left_out)
     points = np.asarray(means, dtype=np.float64)[rows]
-    # Libraries sum in the order of their threads: one thread, so that the same scene gets the same clusters.
+    # Library sums depend on the thread order, so a single thread is used to get reproducible clusters.
     with threadpool_limits(limits=1):
         finest = _kmeans(points, sizes[-1], seed)
         layers = [finest]
@@ -102,12 +102,12 @@ def build_hierarchy(
 
 
 def _kmeans(points: NDArray[np.float64], count: int, seed: int) -> Int:
-    """[M] labels of K-means; empty clusters vanish.
+    """Returns K-means labels [M]; empty clusters are removed.
 
-    In float64 about the middle: a point nearly as near to a second cluster goes to the same one on every processor,
-    whatever its linear algebra rounds like.
+    It works in float64 on centred points, so that nearly equidistant points get the same label on every processor,
+    regardless of rounding in its linear algebra.
     """
-    from sklearn.cluster import KMeans  # takes a second, and views and frame 0 begin without it
+    from sklearn.cluster import KMeans  # the import takes a second and is not needed for views and frame 0
 
     points = points - points.mean(axis=0)
     limit = KMEANS_SAMPLE_PER_CLUSTER * count
@@ -121,11 +121,11 @@ def _kmeans(points: NDArray[np.float64], count: int, seed: int) -> Int:
 
 
 def _merge(points: NDArray[np.float64], labels: Int, count: int) -> Int:
-    """[M] labels after merging the clusters' mean positions to ``count`` clusters.
+    """Returns labels [M] after merging the clusters to ``count`` clusters.
 
-    Agglomerative (the paper), then evened out: K-means among the merged clusters, started from what was merged, gives
-    a cluster at the border of two parents to the nearer one. Still nested, and rounder: without this, clusters merged
-    first stay merged however badly the rest then fits.
+    Agglomerative clustering of the mean positions (as in the paper) initializes a K-means among the clusters. K-means
+    assigns clusters at a border to the nearer parent, and keeps the layers nested. Without it, clusters that were
+    merged early stay together even if they fit badly later.
     """
     from sklearn.cluster import AgglomerativeClustering, KMeans
 
@@ -141,7 +141,7 @@ def _merge(points: NDArray[np.float64], labels: Int, count: int) -> Int:
 
 
 def _means(points: NDArray[np.float64], labels: Int, count: int) -> NDArray[np.float64]:
-    """[count, 3] mean position of each cluster; none is empty."""
+    """Returns the mean position [count, 3] of each cluster; no cluster may be empty."""
     sums = np.stack([np.bincount(labels, weights=points[:, k], minlength=count) for k in range(3)], axis=1)
     means: NDArray[np.float64] = sums / np.bincount(labels, minlength=count)[:, None]
     return means

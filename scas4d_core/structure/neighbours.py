@@ -1,4 +1,4 @@
-"""The neighbour graph of the rigidity terms (Dynamic3DGaussians): k nearest moving Gaussians and their weights."""
+"""Neighbour graph of the rigidity terms (Dynamic3DGaussians): k nearest moving Gaussians and their weights."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from scipy.spatial import cKDTree
 
 @dataclass(frozen=True, eq=False)
 class Neighbours:
-    """Graph over M Gaussians, in the order of the hierarchy.
+    """Neighbour graph over M Gaussians, in the order of the hierarchy.
 
     Attributes:
-        index: [M, k] int32. weights: [M, k] float32, exp(−falloff d²), 0 where there is no neighbour.
-        distances: [M, k] float32 metres, when the graph was built.
+        index: [M, k] int32. weights: [M, k] float32, exp(−falloff d²), 0 for missing neighbours.
+        distances: [M, k] float32 metres, at the time when the graph was built.
     """
 
     index: NDArray[np.int32]
@@ -25,7 +25,7 @@ class Neighbours:
 
 
 def build_neighbours(means: NDArray[Any], count: int, falloff: float) -> Neighbours:
-    """The ``count`` nearest neighbours of each of ``means`` [M, 3] (metres); fewer where there are fewer Gaussians.
+    """Finds the ``count`` nearest neighbours of each of ``means`` [M, 3]; fewer if there are fewer Gaussians.
 
     Args:
         means: [M, 3] metres. count: k. falloff: 1/m²; the weight of a neighbour at distance d is exp(−falloff d²).
@@ -44,7 +44,7 @@ def build_neighbours(means: NDArray[Any], count: int, falloff: float) -> Neighbo
     distances = np.zeros((total, count), np.float32)
     if neighbour_count > 0:
         far, near = (np.asarray(found_by) for found_by in cKDTree(points).query(points, k=neighbour_count + 1))
-        # The point itself is usually first, but among coincident points it may be any, or none.
+        # The point itself is usually first; if points coincide, it may be at any place or missing.
         own = near == np.arange(total)[:, None]
         own[~own.any(axis=1), -1] = True
         near, far = near[~own].reshape(total, neighbour_count), far[~own].reshape(total, neighbour_count)

@@ -109,8 +109,8 @@ def _wait_for(lock: Path) -> None:
         except BlockingIOError:
             if time.monotonic() > until:
                 raise FencingError(
-                    f"a worker of an earlier service (process {lock.read_text().strip() or 'unknown'}) does not end; "
-                    "end it"
+                    f"a worker of an earlier service (process {lock.read_text().strip() or 'unknown'}) is still "
+                    "running; stop it"
                 ) from None
             time.sleep(0.05)
 

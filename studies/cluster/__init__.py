@@ -1,1 +1,1 @@
-"""The service on a Ray cluster whose nodes all run on this machine."""
+"""Studies of the service on a Ray cluster whose nodes all run on this machine."""

@@ -1,4 +1,4 @@
-"""`scripts/bench cluster`."""
+"""The commands `scripts/bench cluster` and `scripts/bench head`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``scripts/bench cluster``: what Ray adds to an update and to a view, and scenes on three nodes against local ones.
+"""``scripts/bench cluster``: overhead of Ray for updates and views, and scenes on three nodes versus one machine.
 
 Both services run on this machine, in turns: what differs is how processes are started and how messages go.
 """
@@ -25,7 +25,7 @@ EVERY_S = 0.01
 
 @dataclass
 class CostFigures:
-    """Of one placement.
+    """Measurements of one placement.
 
     Attributes:
         updates: seconds from a frame's acknowledgement to its commit, frame by frame. views: seconds of a view.
@@ -40,7 +40,7 @@ class CostFigures:
 def measure(
     study: Study, address: str, *, scenes: int, turns: int, views: int, echo: Echo = print
 ) -> dict[str, CostFigures]:
-    """Runs both placements in turns.
+    """Runs both placements in alternation.
 
     Args:
         study: its frames are sent to each scene. address: of the cluster.
@@ -73,7 +73,7 @@ def measure(
 
 
 def summarize(found: dict[str, CostFigures], scenes: int) -> str:
-    """The figures as Markdown."""
+    """Formats the figures as Markdown."""
     local, ray = found["local"], found["ray"]
     ratios = [there / here for here, there in zip(local.updates, ray.updates, strict=True)]
     rows = [
@@ -95,7 +95,7 @@ def summarize(found: dict[str, CostFigures], scenes: int) -> str:
 
 
 def _begun(study: Study, service: Service) -> str:
-    """A scene with its first frame."""
+    """Creates a scene and waits for its first frame."""
     scene = study.create(service)
     FrameSender(study, service, scene).send(0)
     service.finish(scene, 1)
@@ -103,7 +103,7 @@ def _begun(study: Study, service: Service) -> str:
 
 
 def _views(service: Service, scene: str, camera: str, count: int) -> list[float]:
-    """Seconds of each view of a scene at rest; the first is not counted."""
+    """Returns the seconds of each view of an idle scene, without the first one."""
     seconds = []
     for _ in range(count + 1):
         began = time.monotonic()
@@ -115,7 +115,7 @@ def _views(service: Service, scene: str, camera: str, count: int) -> list[float]
 
 
 def _updates(study: Study, services: Mapping[str, Service], scenes: Mapping[str, str]) -> dict[str, list[float]]:
-    """Seconds of each update of one scene a service, which take turns with every frame: they wait for each other."""
+    """Returns the seconds of each update of one scene per service; the services alternate with every frame."""
     seconds: dict[str, list[float]] = {name: [] for name in scenes}
     for index in range(1, len(study.frames)):
         for name in (PLACEMENTS, PLACEMENTS[::-1])[index % 2]:
@@ -129,7 +129,7 @@ def _updates(study: Study, services: Mapping[str, Service], scenes: Mapping[str,
 
 
 def _together(study: Study, service: Service, scenes: int) -> float:
-    """Frames a second that so many scenes commit together, after their first frames."""
+    """Returns the frames per second that several scenes commit together, after their first frames."""
     ids = [_begun(study, service) for _ in range(scenes)]
     threads = [threading.Thread(target=_send_all, args=(study, service, id)) for id in ids]
     for id in ids:

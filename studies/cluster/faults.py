@@ -1,4 +1,4 @@
-"""Nodes of a cluster killed, stopped and continued late: nothing acknowledged is lost, no bit of the states differs."""
+"""Node failures in a cluster: no acknowledged frame may be lost, and no bit of the states may differ."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SWEPT_S = 180.0
 def killed_nodes(
     study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, count: int, seed: int, echo: Echo
 ) -> ScenarioResult:
-    """`kill -9` of the node on which the scene's worker runs, `count` times, at random moments; a new one parents."""
+    """Kills the node of the scene's worker with `kill -9` `count` times, at random moments; a new node joins."""
     random_ = random.Random(seed)
     moments = [random_.randrange(1, len(study.frames)) for _ in range(count)]
     pauses: list[float] = []
@@ -67,7 +67,7 @@ def killed_nodes(
 def stopped_node(
     study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo
 ) -> ScenarioResult:
-    """SIGSTOP of a node during an update; it is continued when its scene has gone on elsewhere."""
+    """Stops a node with SIGSTOP during an update and continues it after its scene has moved to another node."""
     with running(study, "stopped") as (service, scene, sender):
         states = DataFolder(service.data).scene(scene).states
         _send(sender, _second_half(study, service, scene, sender))
@@ -103,7 +103,7 @@ def stopped_node(
 
 
 def full_nodes(study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo) -> ScenarioResult:
-    """The scene's node is killed while other scenes fill those that are left; then those scenes are deleted."""
+    """Kills the scene's node while other scenes occupy the remaining nodes, then deletes those scenes."""
     with running(study, "full") as (service, scene, sender):
         left = _second_half(study, service, scene, sender)
         others = _fill(study, service)
@@ -138,7 +138,7 @@ def full_nodes(study: Study, nodes: Nodes, expected: Mapping[int, str], update_s
 def restarted_head(
     study: Study, nodes: Nodes, expected: Mapping[int, str], update_s: float, echo: Echo
 ) -> ScenarioResult:
-    """`kill -9` of the cluster's head during an update; it comes back after a while, with what Redis kept."""
+    """Kills the cluster's head with `kill -9` during an update, and restarts it later with the state kept by Redis."""
     with running(study, "head") as (service, scene, sender):
         left = _second_half(study, service, scene, sender)
         sending = threading.Thread(target=_send, args=(sender, left))
@@ -168,7 +168,7 @@ def restarted_head(
 
 
 def _second_half(study: Study, service: Service, scene: str, sender: FrameSender) -> range:
-    """Sends the first half of the frames, and waits for them; returns the others."""
+    """Sends the first half of the frames and waits for them; returns the others."""
     half = len(study.frames) // 2
     _send(sender, range(half))
     service.finish(scene, half)
@@ -176,7 +176,7 @@ def _second_half(study: Study, service: Service, scene: str, sender: FrameSender
 
 
 def _node_of(service: Service, nodes: Nodes, scene: str) -> tuple[int, int]:
-    """The node of the scene's worker, and its process id, as soon as there is one."""
+    """Returns the node and process id of the scene's worker, once it has one."""
     until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
         pid = service.worker_pid(scene)
@@ -187,7 +187,7 @@ def _node_of(service: Service, nodes: Nodes, scene: str) -> tuple[int, int]:
 
 
 def _changed(folder: Path) -> dict[str, int]:
-    """Returns when each file of a folder was changed last, by name; nothing of one that goes meanwhile."""
+    """Returns the last modification time of each file in a folder, by name; files that disappear are skipped."""
     changes = {}
     for name in os.listdir(folder) if folder.is_dir() else ():
         with suppress(FileNotFoundError):
@@ -196,7 +196,7 @@ def _changed(folder: Path) -> dict[str, int]:
 
 
 def _fill(study: Study, service: Service) -> list[str]:
-    """Creates scenes until the worker of one has no room; returns them."""
+    """Creates scenes until one worker finds no room; returns them."""
     scenes: list[str] = []
     while not scenes or not _waits(service, scenes[-1]):
         scenes.append(study.create(service))
@@ -209,7 +209,7 @@ def _is_placed_or_waits(service: Service, scene: str) -> bool:
 
 
 def _waits(service: Service, scene: str) -> bool:
-    """True where the scene's worker finds no room on a node."""
+    """Returns whether the scene's worker finds no room on any node."""
     waiting = Cluster.model_validate_json(service.http.get("/v1/cluster").content).waiting
     return any(one.scene == scene and one.role == "worker" and one.seconds > WAITS_S for one in waiting)
 
@@ -217,7 +217,7 @@ def _waits(service: Service, scene: str) -> bool:
 def _faults_of_kills(
     service: Service, scene: str, sender: FrameSender, expected: Mapping[int, str], pauses: Sequence[float]
 ) -> list[str]:
-    """Faults of a scene whose nodes were killed: frames, states, frames held to blame, and pauses."""
+    """Returns the faults of a scene whose nodes were killed: frames, states, blamed frames, and pauses."""
     faults = sender.check() + compare(digests(DataFolder(service.data).scene(scene).states), expected)
     if blamed := service.deaths(scene):
         faults.append(f"a frame was held to blame for {blamed} of the nodes")
@@ -230,7 +230,7 @@ def _send(sender: FrameSender, indices: range) -> None:
 
 
 def _works(service: Service, scene: str, before: int | None) -> bool:
-    """True where another worker than that before has a frame, or nothing left to do."""
+    """Returns whether a different worker than before has a frame, or no work is left."""
     if service.worker_pid(scene) in (None, before):
         return False
     status = service.status(scene)
@@ -246,7 +246,7 @@ AS_LOCALLY = ("kills", "beginnings", "log", "bits")
 
 
 def run(study: Study, *, count: int, seed: int, parts: Sequence[str], local: Run, echo: Echo) -> list[ScenarioResult]:
-    """The scenarios of nodes on three of them, and those of `local`; states are compared with a run on one machine.
+    """Runs the node scenarios on three nodes and those of `local`; compares the states with a run on one machine.
 
     Args:
         count: of kills. local: runs scenarios by name, over a study whose service is on the cluster.

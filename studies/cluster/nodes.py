@@ -21,7 +21,7 @@ STORE_BYTES = 80 * 2**20
 
 
 class Nodes:
-    """A head without room for scenes, and some nodes beside.
+    """A head without room for scenes, and several nodes.
 
     Args:
         count: of nodes beside the head. cpus: of each. redis_server: program of that name, which keeps what the head
@@ -61,7 +61,7 @@ class Nodes:
             del os.environ[REDIS]
 
     def add(self, labels: Mapping[str, str] | None = None) -> int:
-        """Adds a node, with labels; returns the process id of its raylet."""
+        """Adds a node with labels; returns the process id of its raylet."""
         node = self._cluster.add_node(
             num_cpus=self._cpus, object_store_memory=STORE_BYTES, labels=dict(labels) if labels else None
         )
@@ -70,7 +70,7 @@ class Nodes:
         return pid
 
     def of(self, pid: int) -> int | None:
-        """The node, by its raylet, on which a process runs; None where it runs elsewhere, or not any more."""
+        """Returns the node (its raylet) on which a process runs, or None if it runs elsewhere or has ended."""
         while pid > 1:
             if pid in self._nodes:
                 return pid
@@ -78,7 +78,7 @@ class Nodes:
         return None
 
     def kill(self, node: int) -> None:
-        """`kill -9` of everything on a node; it does not come back."""
+        """Kills all processes of a node with `kill -9`; the node does not come back."""
         tree = [node, *_below(node)]
         for pid in tree:
             _signal(pid, signal.SIGKILL)
@@ -87,31 +87,31 @@ class Nodes:
         del self._nodes[node]
 
     def stop(self, node: int) -> None:
-        """SIGSTOP of everything on a node, the raylet first."""
+        """Stops all processes of a node with SIGSTOP, the raylet first."""
         for pid in (node, *_below(node)):
             _signal(pid, signal.SIGSTOP)
 
     def kill_node_of_head(self) -> None:
-        """`kill -9` of the node that the head's machine is; services that joined by it lose all their actors."""
+        """Kills the node of the head's machine with `kill -9`; services that joined through it lose their actors."""
         self._cluster.head_node.kill_raylet()
 
     def stop_head(self) -> None:
-        """`kill -9` of the head's process, and of its node: `ray start --block` ends both when one does."""
+        """Kills the head's process and its node with `kill -9`: `ray start --block` ends both when one does."""
         self._cluster.head_node.kill_gcs_server()
         self.kill_node_of_head()
 
     def start_head(self) -> None:
-        """Starts it again, at its address; its node stays away, services join by another one of this machine."""
+        """Restarts the head at its address; its node stays down, and services join through another node."""
         self._cluster.head_node.start_gcs_server()
 
     def resume(self, node: int) -> None:
-        """SIGCONT, its processes first: they have a moment before their raylet learns that it was given up."""
+        """Continues a node with SIGCONT, processes first, before their raylet learns that the node was given up."""
         for pid in (*reversed(_below(node)), node):
             _signal(pid, signal.SIGCONT)
 
 
 def redis(program: str) -> subprocess.Popen[bytes]:
-    """A server of Redis in memory; Ray finds it by the environment."""
+    """Starts an in-memory Redis server, which Ray finds through the environment."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -135,7 +135,7 @@ def _signal(pid: int, number: signal.Signals) -> None:
 
 
 def _parent(pid: int) -> int:
-    """0 for a process that is gone."""
+    """Returns 0 for a process that has ended."""
     try:
         return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
     except (OSError, IndexError, ValueError):
@@ -143,7 +143,7 @@ def _parent(pid: int) -> int:
 
 
 def _below(pid: int) -> list[int]:
-    """Processes below one, parents first."""
+    """Returns a process and its descendants, parents first."""
     parents = {each: _parent(each) for each in _pids()}
     pids, level = [], [pid]
     while level := [each for each, parent in parents.items() if parent in level]:

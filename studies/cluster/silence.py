@@ -1,4 +1,4 @@
-"""``scripts/bench head``: for how long a cluster's head is silent which a supervisor starts again as soon as it ends.
+"""``scripts/bench head``: downtime of a cluster's head that a supervisor restarts as soon as it ends.
 
 The head, with Redis, and a node run on this machine, each with process ids and an address of its own, as on two
 machines: `ray start --head` refuses to start beside processes of another node.
@@ -33,7 +33,7 @@ NOT_STARTED = "the cluster did not start"
 
 
 class SupervisedCluster:
-    """A head whose end is followed by its start, and a node."""
+    """A head that is restarted when it ends, and a node."""
 
     def __init__(self) -> None:
         if os.geteuid() != 0:
@@ -77,7 +77,7 @@ class SupervisedCluster:
             head.wait()
 
     def _start(self, *options: str) -> subprocess.Popen[bytes] | None:
-        """Starts a node of Ray; None where the study is over."""
+        """Starts a Ray node; returns None if the study is over."""
         store = ("--object-store-memory", str(STORE_BYTES), "--block", "--disable-usage-stats")
         with self._starting:
             if self._over:
@@ -93,15 +93,15 @@ class SupervisedCluster:
 
 
 class Answers:
-    """An actor that says that it is there."""
+    """An actor that confirms that it is alive."""
 
     def is_there(self) -> bool:
-        """True."""
+        """Returns True."""
         return True
 
 
 def silences(count: int, echo: Callable[[str], None]) -> list[float]:
-    """Kills the head `count` times; seconds from each kill until an actor that was asked for then answers."""
+    """Kills the head `count` times; returns the seconds from each kill until a new actor answers."""
     import ray
 
     gaps = []
@@ -125,7 +125,7 @@ def silences(count: int, echo: Callable[[str], None]) -> list[float]:
 
 
 def summarize(found: Sequence[float]) -> str:
-    """A sentence."""
+    """Formats the result as a sentence."""
     ordered = sorted(found)
     return (
         f"An actor asked for when the head had been killed answered after {ordered[len(ordered) // 2]:.1f} s "
@@ -134,7 +134,7 @@ def summarize(found: Sequence[float]) -> str:
 
 
 def _joined(ray: Any) -> bool:
-    """True once this process is a member by the node, not by the head, and an actor answers."""
+    """Returns whether this process has joined through the node, not the head, and an actor answers."""
     with contextlib.suppress(Exception):  # whatever Ray raises while the node begins
         ray.init(address=f"{HEAD}:{PORT}", _node_ip_address=NODE, log_to_driver=False, logging_level="ERROR")
         ray.get(ray.remote(Answers).options(num_cpus=0.1).remote().is_there.remote(), timeout=PATIENCE_S)

@@ -1,1 +1,1 @@
-"""The compact 4D file: its size, its errors and its speed."""
+"""Studies of the compact 4D file: size, errors and speed."""

@@ -1,4 +1,4 @@
-"""`scripts/bench compact` and `scripts/bench opening`."""
+"""The commands `scripts/bench compact` and `scripts/bench opening`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``scripts/bench compact``: what a compact file takes and loses, against the exact states it is made of."""
+"""``scripts/bench compact``: size and errors of a compact file, compared with the exact states."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ READS = 40
 
 @dataclass(frozen=True)
 class CompactFigures:
-    """Of one capture.
+    """Measurements of one capture.
 
     Attributes:
         gaussians, moving: how many. frames: of the file. exact: bytes a frame of the exact states on disk.
@@ -68,7 +68,7 @@ class CompactFigures:
 
 
 def back_and_forth(indices: Sequence[int], count: int) -> list[int]:
-    """So many indices, forwards, backwards, forwards …
+    """Yields ``count`` indices that alternate between forward and backward order.
 
     >>> back_and_forth([0, 1, 2], 7)
     [0, 1, 2, 1, 0, 1, 2]
@@ -79,7 +79,7 @@ def back_and_forth(indices: Sequence[int], count: int) -> list[int]:
 def measure(
     folder: Path, states: Path, frames: int, bounds: Mapping[str, float], key_every: int | None
 ) -> CompactFigures:
-    """Writes the states of a capture back and forth into a file, and compares it with them."""
+    """Writes the states of a capture back and forth to a file, and compares the file with them."""
     capture = open_source(folder)
     history = History.load(states)
     world = capture.full_rig.world_frame(Settings().scene.metres_per_unit)
@@ -131,7 +131,7 @@ def measure(
 
 
 def summarize(found: CompactFigures) -> str:
-    """The figures as Markdown."""
+    """Formats the figures as Markdown."""
     kinds = ", ".join(f"{name} {size / 1e3:.1f}" for name, size in found.sizes.items())
     errors = ", ".join(f"{name} {value:.4f}" for name, value in found.errors.items())
     pictures = "–" if found.psnr is None else f"{found.psnr:+.3f} (worst frame {found.worst:+.3f})"
@@ -151,7 +151,7 @@ def summarize(found: CompactFigures) -> str:
 
 
 def _write(file: Path, head: FileHeader, states: Iterator[Gaussians], key_every: int) -> list[float]:
-    """Seconds of the processor for each frame after the first."""
+    """Returns the CPU seconds for each frame after the first."""
     seconds = []
     with CompactWriter(file, head, key_every) as writer:
         for place, state in enumerate(states):
@@ -168,7 +168,7 @@ def _seconds(call: Callable[[], Any]) -> float:
 
 
 def _reads(reader: CompactReader) -> list[float]:
-    """Seconds of the processor to read frames at random; those that are born are read before."""
+    """Returns the CPU seconds for reading frames in random order; the frames they depend on are read before."""
     draw = np.random.default_rng(0)
     seconds = []
     reader.state(reader.frames[-1])

@@ -1,4 +1,4 @@
-"""``scripts/bench opening``: how long a history of many frames takes to open, in compact files, and to read from."""
+"""``scripts/bench opening``: time to open and to read a history of many frames in compact files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ EXACT, TURNS, READS = 48, 5, 200
 
 
 def opening(frames: int) -> str:
-    """Makes a history of so many frames, and measures; returns the figures as a sentence."""
+    """Creates a history with a number of frames and measures it; returns the figures as a sentence."""
     with TemporaryDirectory() as temporary:
         folder = Path(temporary) / "states"
         _fill(folder, frames)
@@ -46,7 +46,7 @@ def opening(frames: int) -> str:
 
 
 def _fill(folder: Path, frames: int) -> None:
-    """A history as a service leaves it: the first and the newest frames exact, the others in compact files."""
+    """Writes a history as a service does: the first and newest frames exact, the others in compact files."""
     state = Gaussians.of_points(np.random.default_rng(0).uniform(-1, 1, (GAUSSIANS, 3)), 0.02)
     history = History(folder)
     history.append(0, 0.0, state, report={})

@@ -1,1 +1,1 @@
-"""Time budgets, and iterations saved on frames that show nothing new."""
+"""Studies of time budgets, and of iterations saved on frames without changes."""

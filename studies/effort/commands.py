@@ -1,4 +1,4 @@
-"""`scripts/bench effort`."""
+"""The command `scripts/bench effort`."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""Budgets and adaptive effort, kept to and paid for: how many milliseconds a frame took of those it may take, and what
-a preset that spares effort spares, frame by frame in turns with the one that does not.
-"""
+"""Budgets and adaptive effort: how well budgets in milliseconds are kept, and what an adaptive preset saves."""
 
 from __future__ import annotations
 
@@ -50,15 +48,15 @@ class Kept:
     each: list[float] = field(default_factory=list)
 
     def off(self) -> list[float]:
-        """Milliseconds that each frame took more (+) or less than the budget."""
+        """Returns the difference in milliseconds of each frame from the budget."""
         return [1000 * seconds - self.milliseconds for seconds in self.seconds]
 
     def allowed(self) -> list[float]:
-        """Milliseconds that each may be off."""
+        """Returns the tolerance of each frame in milliseconds."""
         return [max(TOLERANCE * self.milliseconds, 1000 * each) for each in self.each]
 
     def row(self) -> Row:
-        """The answer for one budget; shares of frames."""
+        """Returns the result for one budget; shares are fractions of the frames."""
         off, allowed = np.array(self.off()), np.array(self.allowed())
         return {
             "milliseconds": self.milliseconds,
@@ -75,7 +73,7 @@ class Kept:
 def measure_budgets(
     folder: Path, out: Path, milliseconds: Sequence[float], *, frames: int = FRAMES, report: Report = print
 ) -> Row:
-    """Plays a capture back and forth under each budget; leaves ``out/effort/<capture>-budgets.json``.
+    """Plays a capture back and forth under each budget; writes ``out/effort/<capture>-budgets.json``.
 
     A frame's time goes from before its pictures are decoded to the end of its commit, on disk and synced.
 
@@ -111,8 +109,9 @@ def measure_budgets(
 def measure_adaptive(
     folder: Path, out: Path, *, name: str = "adaptive", updates: int = 10, seeds: int = SEEDS, report: Report = print
 ) -> Row:
-    """A preset that spares effort against ``scas4d``, frame by frame in turns, on a capture as it is, with frames
-    repeated, and slowed; leaves ``out/effort/<capture>-<name>.json``.
+    """Compares an adaptive preset with ``scas4d`` on a capture as recorded, with repeated frames, and slowed down.
+
+    Writes ``out/effort/<capture>-<name>.json``.
 
     Args:
         folder: of a capture with test cameras. out: folder of a study, with its frames 0. updates: of the capture.
@@ -140,7 +139,7 @@ def measure_adaptive(
 
 
 class Turns:
-    """Two settings on the same frames, in turns: seconds and PSNR of each frame.
+    """Two settings on the same frames in alternation: seconds and PSNR of each frame.
 
     Args:
         names: of the settings; the first is what the other is compared with.
@@ -154,7 +153,7 @@ class Turns:
         self._repeats: list[bool] = []
 
     def take(self, capture: Capture, settings: tuple[Settings, Settings], frames: Iterator[Shown], out: Path) -> None:
-        """One sequence of frames more, each of the two from frame 0 on."""
+        """Adds a sequence of frames that each setting processes from frame 0."""
         pair = {name: started(capture, one, out) for name, one in zip(self.names, settings, strict=True)}
         for values in self._psnr.values():
             values.append([])
@@ -169,7 +168,7 @@ class Turns:
             self._repeats.append(shown.repeats)
 
     def row(self) -> Row:
-        """The answer over all sequences taken; ``psnr`` and ``psnr_each`` in dB, times as shares of the first's."""
+        """Returns the result over all sequences: ``psnr`` and ``psnr_each`` in dB, times relative to the first."""
         full, spared = (np.array(self._seconds[name]) for name in self.names)
         again = np.array(self._repeats)
         each = {name: [float(np.mean(values)) for values in self._psnr[name]] for name in self.names}
@@ -185,14 +184,14 @@ class Turns:
 
 
 def _score(reconstruction: Any, capture: Capture, truth: Mapping[str, NDArray[np.float32]]) -> float:
-    """dB, mean over the test cameras, of each ``SEEN_DB`` at most."""
+    """Returns the mean PSNR in dB over the test cameras, each capped at ``SEEN_DB``."""
     cameras = capture.test_rig.cameras if capture.test_rig is not None else ()
     scores = [image_psnr(reconstruction.render(c).colour, truth[c.name]) for c in cameras]
     return float(np.mean(np.minimum(scores, SEEN_DB)))
 
 
 def _each(report: Any) -> float:
-    """Seconds of an iteration of an update."""
+    """Returns the seconds per iteration of an update."""
     points = report.curve
     if len(points) < 2:
         return 0.0
@@ -203,12 +202,12 @@ def _each(report: Any) -> float:
 
 
 def changed(settings: Settings, **changes: Any) -> Settings:
-    """The settings with others of the update."""
+    """Returns the settings with some update settings replaced."""
     return settings.model_copy(update={"update": settings.update.model_copy(update=changes)})
 
 
 def leave(out: Path, name: str, capture: Capture, answer: Row) -> Row:
-    """Write an answer as ``out/effort/<name>.json``, with what it was measured on."""
+    """Writes a result to ``out/effort/<name>.json``, with the machine and sources that it was measured on."""
     from scas4d_core.kernels.jit import threads
 
     row: Row = {

@@ -1,4 +1,4 @@
-"""Budgets and adaptive effort, as a part of the page of the frontier."""
+"""Budgets and adaptive effort, as a section of the frontier page."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ TIME, LOSS_DB, REPEATS = 0.60, 0.10, 0.10
 
 
 def effort_text(out: Path, captures: Sequence[str]) -> str:
-    """The sections that there are measurements for, as Markdown; empty where there are none."""
+    """Returns the sections with measurements as Markdown, or an empty text."""
     budgets = _rows(out, captures, "budgets")
     adaptive = _rows(out, captures, "adaptive")
     report = _rows(out, captures, "report")
@@ -118,10 +118,10 @@ def _report(rows: Sequence[Row]) -> list[str]:
 
 
 def _gain(one: Row) -> float:
-    """DB of the adaptive preset over the fixed one."""
+    """Returns the gain in dB of the adaptive preset over the fixed one."""
     return float(one["psnr"]["adaptive"] - one["psnr"]["scas4d"])
 
 
 def _told(one: Row, name: str) -> str:
-    """DB of a setting, and how far its seeds lie apart."""
+    """Returns the PSNR in dB of a setting, and its spread over seeds."""
     return f"{one['psnr'][name]:.2f} ± {np.std(one['psnr_each'][name]):.2f}"

@@ -1,4 +1,4 @@
-"""Cost of an update's own report: the share of its stage, and the check that the stage leaves nothing out.
+"""Cost of an update's own report: the share of its stage, and a check that the stage is complete.
 
 The stage ``report`` has the stage timers themselves, losses that nothing but the curve asks for, the cameras' colour
 shifts, and assembling and writing the record; publishing it, as a worker does, is timed here and belongs to it. What is
@@ -30,8 +30,7 @@ TARGET = 0.02
 
 
 def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report = print) -> Row:
-    """Updates of ``scas4d`` with a full report, in turns with ones without; leaves
-    ``out/effort/<capture>-report.json``.
+    """Runs updates of ``scas4d`` with and without a full report; writes ``out/effort/<capture>-report.json``.
 
     Args:
         folder: of the capture. out: folder of a study, with its frames 0.
@@ -85,7 +84,7 @@ def measure_report(folder: Path, out: Path, *, updates: int = 12, report: Report
 
 
 def _published(scene: Any, index: int) -> float:
-    """Seconds of what a worker does to publish a record: it is read from the commit and sent through a pipe."""
+    """Returns the seconds that a worker needs to publish a record: reading it from the commit and sending it."""
     began = time.perf_counter()
     ForkingPickler.dumps(scene.history.report(index))  # as a pipe does
     return time.perf_counter() - began

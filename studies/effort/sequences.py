@@ -1,4 +1,4 @@
-"""Sequences of frames to try an update on: a capture as it is, back and forth, with frames repeated, and slowed."""
+"""Frame sequences for testing updates: a capture back and forth, with repeated frames, and slowed down."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from studies.quality.settings import settings_of
 
 @dataclass(frozen=True)
 class Shown:
-    """A frame of a sequence, what the test cameras would have seen, and whether it repeats the frame before."""
+    """A frame of a sequence, the test cameras' pictures, and whether it repeats the previous frame."""
 
     frame: Frame
     truth: Mapping[str, NDArray[np.float32]]
@@ -26,7 +26,7 @@ class Shown:
 
 
 def back_and_forth(capture: Capture, frames: int) -> Iterator[Frame]:
-    """So many frames after the first, played to the end, back to the start and so on; time goes on."""
+    """Returns a number of frames after the first, played back and forth with increasing times."""
     count = capture.frame_count
     first, second = capture.frame(0), capture.frame(1)
     step = second.time - first.time
@@ -36,13 +36,13 @@ def back_and_forth(capture: Capture, frames: int) -> Iterator[Frame]:
 
 
 def as_it_is(capture: Capture, updates: int) -> Iterator[Shown]:
-    """The first updates of a capture."""
+    """Returns the first updates of a capture."""
     for index in range(1, min(updates + 1, capture.frame_count)):
         yield Shown(capture.frame(index), _truth(capture, index))
 
 
 def repeated(capture: Capture, updates: int) -> Iterator[Shown]:
-    """The same with every frame sent twice, as a camera at half the rate of its rig does, and one held for three."""
+    """Returns the sequence with every frame sent twice, as by a camera at half the rate, and one held for three."""
     step = capture.frame(1).time - capture.frame(0).time
     number = 0
     for index in range(1, min(updates + 1, capture.frame_count)):
@@ -54,7 +54,7 @@ def repeated(capture: Capture, updates: int) -> Iterator[Shown]:
 
 
 def slowed(capture: Capture, updates: int, out: Path, factor: int = 3) -> Iterator[Shown]:
-    """A capture at a third of its speed, drawn from a reconstruction of it: in-between states are interpolated.
+    """Renders a capture at a third of its speed from its reconstruction, with interpolated states.
 
     Training pictures and truth are both rendered, so that its figures compare with each other and with no others.
     """
@@ -81,13 +81,13 @@ def _truth(capture: Capture, index: int) -> dict[str, NDArray[np.float32]]:
 
 
 def _levels(colour: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """A rendering as a camera would have stored it."""
+    """Returns a rendering as a camera would have stored it."""
     levels: NDArray[np.uint8] = np.rint(255 * np.clip(colour, 0, 1)).astype(np.uint8)
     return levels
 
 
 def _between(before: Gaussians, after: Gaussians, share: float) -> Gaussians:
-    """A state between two, on straight lines: for frames that are near each other."""
+    """Interpolates linearly between two states of nearby frames."""
     mixed = {
         name: ((1 - share) * getattr(before, name) + share * getattr(after, name)).astype(np.float32)
         for name in ("means", "factors", "colours")

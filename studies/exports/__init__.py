@@ -1,1 +1,1 @@
-"""Exports, read back by other tools' readers and rendered."""
+"""Studies of exports, read back with third-party readers and rendered."""

@@ -1,4 +1,4 @@
-"""`scripts/bench exports`."""
+"""The command `scripts/bench exports`."""
 
 from __future__ import annotations
 

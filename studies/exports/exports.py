@@ -1,4 +1,4 @@
-"""``scripts/bench exports``: every format of splats, read by a reader that is not ours, rendered against the state."""
+"""``scripts/bench exports``: every splat format, read by a third-party reader and compared with the state."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ TITLE, GAP = 24, 12
 
 @dataclass(frozen=True)
 class Found:
-    """Gaussians as a reader gives them: [N, 3] means, scales, colours; [N, 4] rotations (x, y, z, w); [N] opacities."""
+    """Gaussians from a reader: [N, 3] means, scales, colours; [N, 4] rotations (x, y, z, w); [N] opacities."""
 
     means: Float
     rotations: Float
@@ -46,7 +46,7 @@ class Found:
     opacities: Float
 
     def gaussians(self, axes: Float, world: WorldFrame, metres: bool) -> Gaussians:
-        """In the inside world.
+        """Converts the Gaussians to the internal world.
 
         Args:
             axes: signs of the file's axes in ours. metres: the file is in metres, not in the user's unit.
@@ -62,7 +62,7 @@ class Found:
 
 @dataclass(frozen=True)
 class ExportFigures:
-    """Figures of one format.
+    """Measurements of one format.
 
     Attributes:
         size: bytes of the file. psnr: dB of its rendering against the state's, mean over cameras. reader: its name.
@@ -77,7 +77,7 @@ class ExportFigures:
 
 
 def measure(folder: Path, states: Path) -> list[ExportFigures]:
-    """Exports the last committed state of a capture and renders what readers get of it in all test cameras.
+    """Exports the last committed state of a capture, and renders what readers return in all test cameras.
 
     Of the moving parts that is the first state, as the animation of the whole capture has it in the end.
     """
@@ -107,13 +107,13 @@ def measure(folder: Path, states: Path) -> list[ExportFigures]:
 
 
 def summarize(figures: list[ExportFigures]) -> str:
-    """The figures as Markdown."""
+    """Formats the figures as Markdown."""
     rows = [f"| `{one.format}` | {one.size / 1e6:.2f} MB | {one.psnr:.1f} | {one.reader} |" for one in figures]
     return "\n".join(["| format | file | dB against the state | read by |", "|---|---|---|---|", *rows])
 
 
 def sheet(figures: list[ExportFigures], columns: int = 2) -> Image.Image:
-    """A contact sheet: state | export | difference of each format under its name, in the first test camera."""
+    """Draws a contact sheet of state, export and difference for each format, in the first test camera."""
     high, wide = figures[0].picture.shape[:2]
     rows = -(-len(figures) // columns)
     made = Image.new("RGB", (columns * (wide + GAP), rows * (high + TITLE)), "white")
@@ -179,7 +179,7 @@ def _by_gsply(file: Path) -> Found:
 
 
 def _by_pygltflib(file: Path) -> Found:
-    """All nodes where the animation, if there is one, has them at its end."""
+    """Returns all nodes at the end of the animation, if there is one."""
     from pygltflib import GLTF2
 
     document = GLTF2().load(str(file))

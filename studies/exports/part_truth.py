@@ -1,4 +1,4 @@
-"""The moving parts of an exported asset, read back by pygltflib, against the poses of the truth's parts.
+"""Moving parts of an exported asset, read back by pygltflib, compared with the true poses of the parts.
 
 A part of the truth is matched with the node that holds most of its points in frame 0, one to one (Hungarian). Compared
 is the motion since frame 0: the angle of the rotation that is left, and the mean distance at the part's own points.
@@ -34,7 +34,7 @@ BAR_PERCENT, BAR_DEGREES = 1.0, 2.0
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """A node of the asset: [N, 3] places of its Gaussians in frame 0, and [T, 4, 4] motion since then, user's world."""
+    """A node of the asset: [N, 3] positions of its Gaussians in frame 0, and [T, 4, 4] motion, in the user's world."""
 
     name: str
     places: Float
@@ -43,7 +43,7 @@ class Node:
 
 @dataclass(frozen=True, eq=False)
 class PartFigures:
-    """A part of the truth.
+    """A part of the ground truth.
 
     Attributes:
         static: whether it stands in the truth. node: its name in the asset, or "none".
@@ -61,20 +61,20 @@ class PartFigures:
 
     @property
     def covered(self) -> bool:
-        """True where the asset has this part."""
+        """Whether the asset contains this part."""
         return self.share >= COVERED
 
 
 @dataclass(frozen=True, eq=False)
 class AssetFigures:
-    """Of an asset: how its parts were counted, their number, and the parts of the truth."""
+    """Measurements of an asset: how its parts were chosen, their number, and the parts of the ground truth."""
 
     count: str
     nodes: int
     parts: list[PartFigures]
 
     def medians(self, moving: bool = False) -> tuple[float, float]:
-        """Degrees and percent of the extent, over the parts that are covered and their frames.
+        """Returns the error in degrees and percent of the extent, over the covered parts and their frames.
 
         Args:
             moving: only the parts that move in the truth.
@@ -87,7 +87,7 @@ class AssetFigures:
 
 
 def measure_asset(folder: Path, states: Path) -> list[AssetFigures]:
-    """Exports the asset of a whole capture, with the parts chosen by rule and with as many as the truth has.
+    """Exports the asset of a whole capture, with the number of parts chosen by rule and as in the ground truth.
 
     Args:
         folder: of a capture; without ground truth of moving rigid parts nothing is measured.
@@ -117,7 +117,7 @@ def measure_asset(folder: Path, states: Path) -> list[AssetFigures]:
 
 
 def read_asset(file: Path, seconds: Float) -> list[Node]:
-    """Reads the nodes of an asset and where its animation puts them.
+    """Reads the nodes of an asset and their animated poses.
 
     Args:
         file: of format `glb-parts`. seconds: [T] since its first frame, the first is 0.
@@ -168,7 +168,7 @@ def compare(
     frames: list[int],
     extent: float,
 ) -> list[PartFigures]:
-    """Matches the parts of the truth with nodes, and compares their motion.
+    """Matches the parts of the ground truth with nodes, and compares their motion.
 
     Args:
         points: [P, 3] of the truth in frame 0. part_id: [P] of each. frames: T, of the capture. extent: user's unit.
@@ -196,7 +196,7 @@ def compare(
 
 
 def errors(found: Float, true: Float, points: Float, extent: float) -> tuple[Float, Float]:
-    """[T − 1] degrees and [T − 1] percent of the extent between motions [T, 4, 4], at points [M, 3] of frame 0.
+    """Returns [T − 1] degrees and [T − 1] percent of the extent between motions [T, 4, 4], at points [M, 3] of frame 0.
 
     >>> turned = np.tile(np.eye(4), (2, 1, 1))
     >>> turned[1, :3, :3] = Rotation.from_rotvec([0, 0, np.pi / 2]).as_matrix()
@@ -213,7 +213,7 @@ def errors(found: Float, true: Float, points: Float, extent: float) -> tuple[Flo
 
 
 def told_asset(figures: list[AssetFigures]) -> str:
-    """The figures as Markdown: a row a part, and one of all that are covered."""
+    """Formats the figures as Markdown: one row per part, and one for all covered parts."""
     head = (
         "| parts | part of the truth | points | node holds | rotation, median (worst) | at its points, median (worst) |"
     )

@@ -1,1 +1,1 @@
-"""Accuracy against time."""
+"""Studies of accuracy versus time."""

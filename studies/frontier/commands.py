@@ -1,4 +1,4 @@
-"""`scripts/bench frontier`."""
+"""The command `scripts/bench frontier`."""
 
 from __future__ import annotations
 

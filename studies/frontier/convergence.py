@@ -1,4 +1,4 @@
-"""Convergence of an update: the test cameras' PSNR of the state after some of its iterations.
+"""Convergence of an update: PSNR of the test cameras after some of its iterations.
 
 Rates fall and layers begin by shares of an update's iterations, so the curve of a long update does not run through the
 ends of shorter ones. The test cameras are rendered beside the update and never reach it.
@@ -36,7 +36,7 @@ Look = Callable[[int, UpdateEngine], None]
 
 
 class WatchedEngine:
-    """Stands before an update's engine and shows it before each iteration."""
+    """A wrapper of an update's engine that calls an observer before each iteration."""
 
     def __init__(self, inner: UpdateEngine, look: Look) -> None:
         self.inner, self._look = inner, look
@@ -55,7 +55,7 @@ class WatchedEngine:
 def measure_convergence(
     folder: Path, out: Path, *, updates: int = 5, variants: Sequence[Variant] = (), report: Report = print
 ) -> Row:
-    """Watches the first updates of a capture and leaves the curves in ``out/convergence/<capture>.json``.
+    """Observes the first updates of a capture and writes the curves to ``out/convergence/<capture>.json``.
 
     Args:
         folder: of a capture with test cameras.
@@ -92,18 +92,18 @@ def measure_convergence(
 
 
 def read_convergence(out: Path, capture: str) -> Row | None:
-    """Reads the measurements of ``measure_convergence`` for a capture; None where there are none."""
+    """Reads the measurements of ``measure_convergence`` for a capture, or returns None if there are none."""
     return read_row(out / "convergence" / f"{capture}.json")
 
 
 def once(settings: Settings) -> Settings:
-    """The settings with one attempt of as many iterations a frame, the first too."""
+    """Returns the settings with one attempt per frame and a fixed number of iterations, in the first frame too."""
     update = settings.update.model_copy(update={"reject_outliers": False, "cold_start_iterations": 1.0})
     return settings.model_copy(update={"update": update})
 
 
 def _watched(capture: Capture, variant: Variant, out: Path, updates: int) -> list[dict[int, float]]:
-    """For each update the test cameras' mean PSNR in dB, by iterations done."""
+    """Returns, for each update, the mean PSNR in dB of the test cameras by number of iterations."""
     reconstruction = started(capture, once(variant.settings), out)
     curves: list[dict[int, float]] = []
     for index in range(1, updates + 1):
@@ -124,7 +124,7 @@ def _watched(capture: Capture, variant: Variant, out: Path, updates: int) -> lis
 
 
 def _psnr(reconstruction: Any, capture: Capture, state: Gaussians, true: Any) -> float:
-    """Mean over the test cameras, of a state that need not be committed."""
+    """Returns the mean PSNR over the test cameras of a state, which need not be committed."""
     from scas4d_core.query.committed import CommittedScene
     from scas4d_core.storage.history import History
 

@@ -57,17 +57,17 @@ class Variant:
 
     @property
     def settings(self) -> Settings:
-        """Complete."""
+        """The complete settings."""
         return settings_of(self.preset, self.iterations, changes=[f"update.seed={self.seed}", *self.changes])
 
     def job(self, capture: Path, updates: int) -> Job:
-        """The row of a capture over so many updates, or over all."""
+        """Returns the row of a capture over a number of updates, or over all."""
         frames = None if self.whole else updates + 1
         return Job(capture, self.preset, self.settings, frames, pictures=(-1,), constants=self.constants)
 
     @property
     def record(self) -> Row:
-        """The settings and constants as a row has them."""
+        """Returns the settings and constants as stored in a row."""
         return settings_record(self.settings, self.constants)
 
 
@@ -116,7 +116,7 @@ A separate covariance is all ΔR and Δs: there each Gaussian's own begins at on
 
 
 def variants(axes: Sequence[str] = (), most_iterations: int | None = None) -> list[Variant]:
-    """The settings of some axes, each once, the default first and always; none: all axes.
+    """Returns the settings of some axes without duplicates, the default first; all axes if none are given.
 
     Args:
         axes: of ``AXES``. most_iterations: leave out settings with more.
@@ -142,7 +142,7 @@ def measure_frontier(
     most_iterations: int | None = None,
     report: Report = print,
 ) -> list[Row]:
-    """Measures what is not on disk yet, the cheapest rows of all captures first.
+    """Measures the missing rows, the cheapest rows of all captures first.
 
     Args:
         captures: folders with test cameras. out: folder of the study.
@@ -164,7 +164,7 @@ def measure_frontier(
 def measure_variants(
     captures: Sequence[Path], chosen: Sequence[Variant], out: Path, *, updates: int = UPDATES, report: Report = print
 ) -> list[Row]:
-    """Measures the rows of some settings that are not on disk yet, see ``measure_frontier``."""
+    """Measures the missing rows of some settings, see ``measure_frontier``."""
     known = list(Store(out).rows())
     wanted = [(variant, capture) for variant in chosen for capture in captures]
     jobs = [
@@ -177,7 +177,7 @@ def measure_variants(
 
 
 def row_of(rows: Iterable[Row], variant: Variant, capture: str, updates: int) -> Row | None:
-    """The row of a setting on a capture; None where it is not measured.
+    """Returns the row of a setting on a capture, or None if it was not measured.
 
     A row belongs to a setting where its settings are, to the last number, those that the setting has today, and where
     it has exactly so many updates, or all of the capture.

@@ -1,4 +1,4 @@
-"""The page of the frontier: plots, advice, the comparison at equal seconds, and the tables behind."""
+"""The frontier page: plots, advice, the comparison at equal time, and the underlying tables."""
 
 from __future__ import annotations
 
@@ -55,11 +55,11 @@ COLUMNS = (
 
 
 class NothingMeasured(ValueError):
-    """The study has no row of the captures."""
+    """Raised if the study has no rows for the captures."""
 
 
 def write_page(out: Path, captures: Sequence[str], page: Path, updates: int = UPDATES) -> str:
-    """Draws the plots into a folder named like the page, and writes the page.
+    """Draws the plots into a folder named after the page, and writes the page.
 
     Args:
         out: folder of the study. captures: names; those without rows are left out.
@@ -84,7 +84,7 @@ def write_page(out: Path, captures: Sequence[str], page: Path, updates: int = UP
 
 
 def chosen(means: Sequence[Point]) -> dict[str, Point]:
-    """A setting for a preview, a live show and an archive, by the rules of the page.
+    """Returns a setting each for a preview, a live show and an archive, selected by the rules of the page.
 
     Args:
         means: points of every setting, on one capture or averaged; the default among them.
@@ -102,7 +102,7 @@ def chosen(means: Sequence[Point]) -> dict[str, Point]:
 
 
 def score_table(points: Sequence[Point], default: Point | None = None, counts: bool = False) -> str:
-    """A Markdown table, a line a setting, its time against ``default``'s; ``counts`` adds a column of Gaussians."""
+    """Returns a Markdown table of settings, with times relative to ``default``; ``counts`` adds Gaussian counts."""
     head = ["setting", *(["Gaussians"] if counts else []), "s/frame", "× default", *(h for h, _, _ in COLUMNS)]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for point in points:
@@ -121,7 +121,7 @@ def score_table(points: Sequence[Point], default: Point | None = None, counts: b
 
 
 def equal_table(compared: Sequence[EqualSeconds]) -> str:
-    """A Markdown table: a line a capture, a column a budget, "lead (ours against the baseline's)" in each cell."""
+    """Returns a Markdown table of captures by budgets, "lead (ours against the baseline's)" in each cell."""
     budgets = sorted({one.iterations for one in compared})
     head = ["capture", *(f"{count} iterations" for count in budgets)]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
@@ -132,7 +132,7 @@ def equal_table(compared: Sequence[EqualSeconds]) -> str:
 
 
 def equal_words(compared: Sequence[EqualSeconds]) -> str:
-    """Says in how many comparisons ``scas4d`` is ahead, and by how much at least."""
+    """Describes in how many comparisons ``scas4d`` leads, and its smallest lead."""
     leads = [one.lead for one in compared if one.lead is not None]
     missing = len(compared) - len(leads)
     if not leads:
@@ -145,7 +145,7 @@ def equal_words(compared: Sequence[EqualSeconds]) -> str:
 def _draw(
     out: Path, points: Sequence[Point], means: Sequence[Point], captures: Sequence[str], folder: Path, updates: int
 ) -> list[str]:
-    """Draws what there are rows for; the files' names."""
+    """Draws the plots for which rows exist; returns the file names."""
     words = f"mean of {', '.join(captures)}; first {updates} updates"
     plots.draw_frontier(means, words, folder / "frontier.png", _deviations(points, captures))
     plots.draw_captures(points, captures, folder / "captures.png")
@@ -164,7 +164,7 @@ def _draw(
 
 
 def _deviations(points: Sequence[Point], captures: Sequence[str]) -> dict[str, float]:
-    """dB, by method: standard deviation over seeds of a mean over captures, whose seeds are independent."""
+    """Returns, by method, the standard deviation in dB over seeds of a mean over captures with independent seeds."""
     deviations = {method: [spread(points, method, name) for name in captures] for method in METHODS}
     return {
         method: sum(one[0] ** 2 for one in each if one is not None) ** 0.5 / len(each)
@@ -283,7 +283,7 @@ def _choice(means: Sequence[Point], default: Point) -> str:
 
 
 def _axis_means(points: Sequence[Point], axis: str, captures: Sequence[str]) -> tuple[list[Point], Point | None]:
-    """The default's means over the captures that have an axis, and behind them the axis's; the default's alone."""
+    """Returns the means of the default and of an axis over the captures that have the axis."""
     on = _captures_of(points, axis, captures)
     if not on:
         return [], None
@@ -293,7 +293,7 @@ def _axis_means(points: Sequence[Point], axis: str, captures: Sequence[str]) -> 
 
 
 def _captures_of(points: Sequence[Point], axis: str, captures: Sequence[str]) -> list[str]:
-    """Those on which all of an axis was measured."""
+    """Returns the captures on which a whole axis was measured."""
     needed = set(AXES[axis])
 
     def has(capture: str) -> set[Variant]:
@@ -308,7 +308,7 @@ def _over(points: Sequence[Point], axis: str, captures: Sequence[str]) -> str:
 
 
 def _spreads(points: Sequence[Point], captures: Sequence[str]) -> str:
-    """The effect of chance: the standard deviation over the seeds of the updates."""
+    """Returns the random variation: the standard deviation over the seeds of the updates."""
     spreads = []
     for method in METHODS:
         by_capture = {name: spread(points, method, name) for name in captures}

@@ -1,4 +1,4 @@
-"""The plots of the frontier, as PNG files: accuracy over time, within an update, over frames; time by stage.
+"""Plots of the frontier as PNG files: accuracy over time, within an update and over frames, and time by stage.
 
 They are as wide as a column (``COLUMN``) or a page (``PAGE``) of a paper, with text of 6.5 to 8 points at that width.
 Colours are those of Okabe and Ito, distinguishable with any colour vision; shapes and labels repeat them. A colour is
@@ -94,7 +94,7 @@ LABEL_GAP = 8.5
 
 
 def draw_frontier(points: Sequence[Point], title: str, file: Path, deviations: Mapping[str, float]) -> None:
-    """Accuracy over seconds: both methods by iterations, who is not dominated; beside it settings about the default.
+    """Plots accuracy over seconds: both methods by iterations, and variations of the default's settings.
 
     Args:
         points: of one capture, or means over several.
@@ -148,7 +148,7 @@ def _draw_about_default(
     plt: Any, axes: Any, points: Sequence[Point], others: Mapping[str, list[Point]], best: Sequence[Point],
     deviation: float | None,
 ) -> None:  # fmt: skip
-    """One setting at a time, each named, with the curve that goes through the default."""
+    """Plots one setting at a time, with labels, and the curve through the default."""
     method = METHODS[0]
     _steps(axes, best)
     _curve(axes, points, method, best, deviation)
@@ -179,7 +179,7 @@ def _draw_about_default(
 
 
 def draw_captures(points: Sequence[Point], captures: Sequence[str], file: Path) -> None:
-    """Both methods by iterations, a panel a capture; bars where several seeds were measured."""
+    """Plots both methods by iterations, with one panel per capture and error bars over seeds."""
     plt = _pyplot()
     columns = min(3, len(captures))
     rows = -(-len(captures) // columns)
@@ -215,7 +215,7 @@ def draw_captures(points: Sequence[Point], captures: Sequence[str], file: Path) 
 
 
 def draw_convergence(row: Row, file: Path) -> None:
-    """The test cameras' PSNR within an update, what ``measure_convergence`` returned."""
+    """Plots the test cameras' PSNR within an update, from the result of ``measure_convergence``."""
     plt = _pyplot()
     figure, axes = plt.subplots(figsize=(COLUMN, 2.5))
     longest = max(drawn["iterations"][-1] for drawn in row["curves"])
@@ -240,7 +240,7 @@ def draw_convergence(row: Row, file: Path) -> None:
 
 
 def draw_drift(points: Sequence[Point], capture: str, file: Path) -> None:
-    """PSNR frame by frame through a whole capture."""
+    """Plots the PSNR per frame for a whole capture."""
     plt = _pyplot()
     figure, axes = plt.subplots(figsize=(COLUMN, 2.5))
     ends = []
@@ -259,7 +259,7 @@ def draw_drift(points: Sequence[Point], capture: str, file: Path) -> None:
 
 
 def draw_stages(points: Sequence[Point], title: str, file: Path) -> None:
-    """Draws the time of a frame by stage, a bar a setting.
+    """Plots the time of a frame by stage, with one bar per setting.
 
     Args:
         points: in the order of the bars, the first on top.
@@ -314,7 +314,7 @@ def _colour(preset: str) -> str:
 
 
 def _steps(axes: Any, best: Sequence[Point]) -> Any:
-    """The frontier, behind everything."""
+    """Draws the frontier in the background."""
     (line,) = axes.step(
         [p.seconds for p in best], [p.psnr for p in best], where="post", color="#d4d4d4", linewidth=4, zorder=1,
         solid_capstyle="round", label="not dominated",
@@ -325,7 +325,7 @@ def _steps(axes: Any, best: Sequence[Point]) -> Any:
 def _curve(
     axes: Any, points: Sequence[Point], method: str, best: Sequence[Point], deviation: float | None, size: float = 24
 ) -> Any:
-    """A method by iterations, with the deviation of the default's iterations; for the legend."""
+    """Draws a method by iterations, with error bars at the default's iterations; returns its legend entry."""
     line, colour = curve(points, method), COLOURS[method]
     axes.plot([p.seconds for p in line], [p.psnr for p in line], color=colour, linewidth=1.2, zorder=2)
     _markers(axes, line, best, MARKERS[method], colour, size)
@@ -338,7 +338,7 @@ def _curve(
 
 
 def _markers(axes: Any, points: Sequence[Point], best: Sequence[Point], marker: str, colour: str, size: float) -> None:
-    """Full markers for what is not dominated, hollow ones for the rest."""
+    """Draws filled markers for non-dominated points and hollow ones for the others."""
     axes.scatter(
         [p.seconds for p in points], [p.psnr for p in points], s=size, marker=marker, linewidths=1.0, zorder=3,
         facecolors=[colour if p in best else "white" for p in points], edgecolors=colour,
@@ -346,14 +346,14 @@ def _markers(axes: Any, points: Sequence[Point], best: Sequence[Point], marker: 
 
 
 def _key(plt: Any, marker: str, colour: str, words: str, line: bool = False) -> Any:
-    """An entry of the legend."""
+    """Returns a legend entry."""
     return plt.Line2D(
         [], [], linestyle="-" if line else "none", linewidth=1.2, marker=marker, color=colour, markersize=4, label=words
     )
 
 
 def _log_seconds(axes: Any, label: bool = True) -> None:
-    """A logarithmic axis; without a label it is a small panel's, with fewer ticks."""
+    """Creates a logarithmic axis; without a label, it is for a small panel and has fewer ticks."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.set_xscale("log")
@@ -371,7 +371,7 @@ def _whole_decibels(axes: Any) -> None:
 
 
 def _up_to(axes: Any, last: float) -> None:
-    """The axis ends at the last value; labels stand behind it."""
+    """Ends the axis at the last value, with space for labels after it."""
     from matplotlib.ticker import MaxNLocator
 
     axes.xaxis.set_major_locator(MaxNLocator(nbins=6, steps=[1, 2, 5, 10], integer=True))
@@ -379,7 +379,7 @@ def _up_to(axes: Any, last: float) -> None:
 
 
 def _beside(axes: Any, ends: Sequence[tuple[float, float, str, str]]) -> None:
-    """The names of curves behind their ends (x, y, name, colour), moved apart where they would touch."""
+    """Draws the names of curves at their ends (x, y, name, colour), without overlaps."""
     axes.figure.draw_without_rendering()
     scale = 72 / axes.figure.dpi
     heights = {end: scale * axes.transData.transform(end[:2])[1] for end in ends}
@@ -395,7 +395,7 @@ def _beside(axes: Any, ends: Sequence[tuple[float, float, str, str]]) -> None:
 
 
 def _name(axes: Any, named: Sequence[tuple[float, float, str, str]], avoided: Sequence[Any] = ()) -> None:
-    """Names beside points (x, y, name, colour): each on the side on which it hides least of points, names and lines.
+    """Draws names next to points (x, y, name, colour), on the side where they hide the fewest points and lines.
 
     Args:
         avoided: lines, x and y of their vertices.
@@ -436,14 +436,14 @@ def _name(axes: Any, named: Sequence[tuple[float, float, str, str]], avoided: Se
 
 
 def _along(line: tuple[Any, Any]) -> list[tuple[float, float]]:
-    """Points of a line, also between its vertices."""
+    """Returns points of a line, including points between its vertices."""
     x, y = (np.asarray(values, float) for values in line)
     where = np.linspace(0, len(x) - 1, 20 * len(x))
     return list(zip(np.interp(where, range(len(x)), x), np.interp(where, range(len(y)), y), strict=True))
 
 
 def _grouped_stages(points: Sequence[Point]) -> Mapping[str, list[float]]:
-    """Seconds of each stage, one a point, the slowest first; short ones together as "rest", the report's last."""
+    """Returns the seconds of each stage per point, the slowest stage first; short stages are combined as "rest"."""
     names = dict.fromkeys(name for point in points for name in point.stages)
     by_name = {name: [point.stages.get(name, 0.0) for point in points] for name in names}
     longest = max(sum(point.stages.values()) for point in points)

@@ -1,4 +1,4 @@
-"""Seconds of settings measured in turns, so that other load of the machine meets all of them alike.
+"""Times of settings that are measured in alternation, so that other load on the machine affects all equally.
 
 Every setting has a reconstruction of its own, all in one process, from the frame 0 that the rows of the study share.
 In each round every setting updates to the next frame, in an order that turns from round to round. The first round loads
@@ -35,7 +35,7 @@ MANY_ITERATIONS = 500
 
 @dataclass
 class TimedVariant:
-    """One setting under way: its reconstruction, and the seconds of each counted update."""
+    """A setting during the measurement: its reconstruction, and the seconds of each counted update."""
 
     variant: Variant
     reconstruction: Any
@@ -44,7 +44,7 @@ class TimedVariant:
     stages: list[dict[str, float]] = field(default_factory=list)
 
     def step(self, capture: Capture, index: int, *, counts: bool) -> float:
-        """Reads a frame and updates to it; the seconds of both, noted where it ``counts``."""
+        """Reads a frame and updates the reconstruction; records the seconds of both if it ``counts``."""
         started, cpu = time.perf_counter(), time.process_time()
         with all_varied(self.variant.constants):
             done = self.reconstruction.step(capture.frame(index))
@@ -59,7 +59,7 @@ class TimedVariant:
 def measure_times(
     folder: Path, variants: Sequence[Variant], out: Path, *, rounds: int = ROUNDS, report: Report = print
 ) -> Row:
-    """Times settings on a capture and leaves the answer in ``out/timing/<capture>.json``.
+    """Times settings on a capture and writes the result to ``out/timing/<capture>.json``.
 
     What was timed there before, and is not now, stays: its seconds times what the first setting's are to its own then.
 
@@ -115,12 +115,12 @@ def measure_times(
 
 
 def read_times(out: Path, capture: str) -> Row | None:
-    """Reads the times of ``measure_times`` for a capture; None where there are none."""
+    """Reads the times of ``measure_times`` for a capture, or returns None if there are none."""
     return read_row(out / "timing" / f"{capture}.json")
 
 
 def _timed_before(before: Row | None, now: Sequence[Row]) -> list[Row]:
-    """The answers of an earlier pass that the one of today lacks, in its seconds; none where it had another first."""
+    """Returns the results of an earlier run that are missing today, scaled to today's times; none if incompatible."""
     if before is None:
         return []
     first, *others = before["settings"]
@@ -142,7 +142,7 @@ def _timed_before(before: Row | None, now: Sequence[Row]) -> list[Row]:
 
 
 def time_of(times: Row | None, variant: Variant) -> Row | None:
-    """The entry of a setting, whatever its seeds; None where it was not timed."""
+    """Returns the entry of a setting, regardless of its seeds, or None if it was not timed."""
     today = variant.record
     for entry in times["settings"] if times else ():
         if _unseeded(entry["settings"]) == _unseeded(today):
@@ -152,7 +152,7 @@ def time_of(times: Row | None, variant: Variant) -> Row | None:
 
 
 def _distinct(variants: Sequence[Variant]) -> list[Variant]:
-    """One for each setting: seeds, and how many frames a row has, do not change the time of an update."""
+    """Selects one setting per group that differs only in seeds and frame counts, which do not affect the time."""
     by_settings = {json.dumps(_unseeded(v.record), sort_keys=True): v for v in variants[::-1]}
     chosen = set(by_settings.values())
     return [variant for variant in variants if variant in chosen]

@@ -1,4 +1,4 @@
-"""Rows and times of the frontier as points of PSNR and seconds, and the comparison at equal seconds.
+"""Rows and times of the frontier as points of PSNR and seconds, and the comparison at equal time.
 
 Accuracy is that of the rows, over the same updates for all of a capture. Seconds are those of ``bench.timing``; where
 there are none, those of the row: CPU seconds if it ran on one thread, for they mind little what else a machine does.
@@ -37,7 +37,7 @@ BUDGETS = (25, 50, 100, 200, 300)
 
 @dataclass(frozen=True)
 class Point:
-    """One setting on one capture, or its mean over several.
+    """One setting on one capture, or its mean over several captures.
 
     Attributes:
         capture: name, or what is averaged. updates: how many the scores cover.
@@ -60,14 +60,14 @@ class Point:
 
     @property
     def psnr(self) -> float:
-        """dB, mean over updates and test cameras."""
+        """PSNR in dB, the mean over updates and test cameras."""
         value = self.scores["psnr"]
         assert value is not None  # every row has it
         return value
 
 
 def read_points(out: Path, captures: Sequence[str], updates: int) -> list[Point]:
-    """Every setting of the study that was measured on these captures, in the order of the axes."""
+    """Returns every setting that was measured on these captures, in the order of the axes."""
     rows = list(Store(out).rows())
     points = []
     for capture in captures:
@@ -83,7 +83,7 @@ def read_points(out: Path, captures: Sequence[str], updates: int) -> list[Point]
 
 
 def mean_points(points: Iterable[Point], captures: Sequence[str]) -> list[Point]:
-    """The means over captures of the settings that were measured on all of them, with the same number of updates."""
+    """Returns the means over captures of settings that were measured on all of them, with equal numbers of updates."""
     by_variant: dict[Variant, dict[str, Point]] = {}
     for point in points:
         by_variant.setdefault(point.variant, {})[point.capture] = point
@@ -95,18 +95,18 @@ def mean_points(points: Iterable[Point], captures: Sequence[str]) -> list[Point]
 
 
 def of_axis(points: Iterable[Point], axis: str, capture: str | None = None) -> list[Point]:
-    """The points of an axis, on one capture or on all."""
+    """Returns the points of an axis, on one capture or on all."""
     return [p for p in points if p.variant in AXES[axis] and capture in (None, p.capture)]
 
 
 def curve(points: Iterable[Point], method: str, capture: str | None = None) -> list[Point]:
-    """A method by its number of iterations, ascending."""
+    """Returns the points of a method by ascending number of iterations."""
     points_of_method = [p for p in of_axis(points, "iterations", capture) if p.variant.preset == method]
     return sorted(points_of_method, key=lambda point: point.variant.iterations)
 
 
 def undominated(points: Sequence[Point]) -> list[Point]:
-    """Those that no other beats in PSNR without taking longer, by seconds ascending."""
+    """Returns the non-dominated points (no other has more PSNR in the same time), by ascending seconds."""
     best: list[Point] = []
     for point in sorted(points, key=lambda point: (point.seconds, -point.psnr)):
         if not best or point.psnr > best[-1].psnr:
@@ -115,7 +115,7 @@ def undominated(points: Sequence[Point]) -> list[Point]:
 
 
 def psnr_at(points: Sequence[Point], seconds: float) -> float | None:
-    """PSNR (dB) of a curve at so many seconds, on straight lines over log time; None outside the curve.
+    """Interpolates the PSNR (dB) of a curve at a time, linearly in log time; None outside the curve.
 
     A setting that takes longer than a better one is no part of it: with very few iterations, updates end so far off
     that the search for what was lost takes longer than the iterations that would have found it.
@@ -128,7 +128,7 @@ def psnr_at(points: Sequence[Point], seconds: float) -> float | None:
 
 @dataclass(frozen=True)
 class EqualSeconds:
-    """Both methods at the seconds that the baseline takes for so many iterations.
+    """Both methods at the time that the baseline takes for a number of iterations.
 
     Attributes:
         psnr: dB of ``scas4d``, interpolated; None where its curve does not reach there.
@@ -148,7 +148,7 @@ class EqualSeconds:
 
 
 def equal_seconds(points: Sequence[Point], captures: Sequence[str]) -> list[EqualSeconds]:
-    """Compares the methods at equal seconds, at every budget of ``BUDGETS`` that was measured."""
+    """Compares the methods at equal time, for every measured budget of ``BUDGETS``."""
     own, other = METHODS
     pairs = []
     for capture in captures:
@@ -163,7 +163,7 @@ def equal_seconds(points: Sequence[Point], captures: Sequence[str]) -> list[Equa
 
 
 def spread(points: Iterable[Point], method: str, capture: str, score: str = "psnr") -> tuple[float, int] | None:
-    """Standard deviation of a score over the seeds of a method at the default's iterations, and how many seeds."""
+    """Returns a score's standard deviation over a method's seeds at the default's iterations, and the seed count."""
     of_seeds = [p for p in of_axis(points, "seeds", capture) if p.variant.preset == method]
     first = [p for p in curve(points, method, capture) if p.variant.iterations == DEFAULT.iterations]
     values = [p.scores[score] for p in first + of_seeds]
@@ -172,7 +172,7 @@ def spread(points: Iterable[Point], method: str, capture: str, score: str = "psn
 
 
 def _own_seconds(row: Row) -> float:
-    """Of an update, as the row itself has them."""
+    """Returns the seconds of an update as stored in the row."""
     alone = row["machine"].get("threads") == 1 and "cpu_seconds_update" in row
     return float(row["cpu_seconds_update" if alone else "seconds_update"])
 
@@ -199,7 +199,7 @@ def _point(variant: Variant, row: Row, timed: Row | None, scale: float) -> Point
 
 
 def _mean(variant: Variant, points: Sequence[Point]) -> Point:
-    """Scores are averaged over the captures that have them."""
+    """Averages each score over the captures that have it."""
     cpu = [point.cpu_seconds for point in points]
     names = dict.fromkeys(name for point in points for name in point.stages)
     scores = {name: [p.scores[name] for p in points] for name in SCORES}

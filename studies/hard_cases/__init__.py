@@ -1,1 +1,1 @@
-"""Numerical hard cases of single functions, on every backend."""
+"""Numerical edge cases of individual functions, on every backend."""

@@ -1,4 +1,4 @@
-"""Hard cases as values, and the laws that all of them share."""
+"""Data model of hard cases, and the checks that all of them share."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CPU, TORCH = "cpu", "torch float32"
 
 @dataclass(frozen=True, eq=False)
 class BackendResult:
-    """Result of one backend on a case.
+    """Result of one backend for a case.
 
     Attributes:
         values, gradients: arrays by name.
@@ -31,13 +31,13 @@ class BackendResult:
 
 
 class SizedCase(Protocol):
-    """A case made in one size."""
+    """A case instantiated for one size."""
 
     def run(self, backend: str) -> BackendResult | None:
-        """Compute it; None where the backend has no such computation."""
+        """Runs the computation; returns None if the backend does not support it."""
 
     def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
-        """Laws that do not hold, in words."""
+        """Returns descriptions of the violated checks."""
 
 
 def _nothing_more(problem: Any, outcomes: Mapping[str, BackendResult]) -> list[str]:
@@ -46,7 +46,7 @@ def _nothing_more(problem: Any, outcomes: Mapping[str, BackendResult]) -> list[s
 
 @dataclass(frozen=True, eq=False)
 class HardCase:
-    """One line of the catalogue.
+    """One entry of the catalogue.
 
     Attributes:
         name: of the case.
@@ -68,7 +68,7 @@ class HardCase:
 
 
 def not_finite(outcome: BackendResult, backend: str) -> list[str]:
-    """A line for each array that holds NaN or infinity."""
+    """Returns a line for each array that contains NaN or infinity."""
     arrays = [*outcome.values.items(), *((f"gradient of {name}", a) for name, a in outcome.gradients.items())]
     return [
         f"{backend}: {name} holds {np.count_nonzero(~np.isfinite(array))} numbers that are not finite"
@@ -78,7 +78,7 @@ def not_finite(outcome: BackendResult, backend: str) -> list[str]:
 
 
 def beyond(outcome: BackendResult, backend: str, bound: float) -> list[str]:
-    """A line for each gradient with a number larger than a bound."""
+    """Returns a line for each gradient that exceeds a bound."""
     return [
         f"{backend}: gradient of {name} reaches {np.abs(array).max():.3g}, beyond {bound:.3g}"
         for name, array in outcome.gradients.items()
@@ -87,7 +87,7 @@ def beyond(outcome: BackendResult, backend: str, bound: float) -> list[str]:
 
 
 def apart(found: NDArray[Any], truth: NDArray[Any], least: float = 1e-30) -> float:
-    """Norm of the difference over the norm of the truth; 0 where both are 0."""
+    """Returns the norm of the difference divided by the norm of the reference; 0 if both are 0."""
     difference = np.linalg.norm((found - truth).astype(np.float64))
     return float(difference / max(float(np.linalg.norm(truth.astype(np.float64))), least)) if difference > 0 else 0.0
 
@@ -95,7 +95,7 @@ def apart(found: NDArray[Any], truth: NDArray[Any], least: float = 1e-30) -> flo
 def unexpected_counts(
     outcome: BackendResult, expected: Mapping[str, int] | None, silent: Sequence[str] = ()
 ) -> list[str]:
-    """A line where the CPU's guards acted otherwise than expected; None: anything goes."""
+    """Returns a line if the CPU's guards were triggered differently than expected; None accepts everything."""
     if expected is None:
         return []
     counts = {name: count for name, count in outcome.guards.items() if count and name not in silent}

@@ -1,4 +1,4 @@
-"""The catalogue's deformations: factors that saturate, folds, half turns, clusters of one or none."""
+"""Hard cases of deformations: saturated factors, folds, half turns, clusters with one Gaussian or none."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ COUNT, COARSE, FINE = 120, 3, 12
 
 
 def ordinary(count: int = COUNT, sizes: tuple[int, ...] = (COARSE, FINE), move: float = 0.05) -> Deforming:
-    """A cloud of 1 m in nested clusters of about equal size, every parameter a little off the identity."""
+    """Creates a cloud of 1 m in nested clusters of similar size, with every parameter slightly off the identity."""
     rng = np.random.default_rng(count)
     means = rng.uniform(-0.5, 0.5, (count, 3))
     fine = np.arange(count) * sizes[-1] // count if sizes else np.zeros(count)
@@ -34,7 +34,7 @@ def ordinary(count: int = COUNT, sizes: tuple[int, ...] = (COARSE, FINE), move: 
 
 
 def first_cluster(column: slice | int, to: Any, **changes: Any) -> Deforming:
-    """Ordinary, but for a parameter of the first cluster of the finest layer."""
+    """Creates an ordinary case with one parameter of the first cluster of the finest layer replaced."""
     made = ordinary()
     made.clusters[-1][0, column] = to
     return replace(made, **changes)
@@ -44,7 +44,7 @@ R, T, C, S = slice(0, 3), slice(3, 6), slice(6, 9), 9
 
 
 def members(made: Deforming) -> int:
-    """Gaussians of the first cluster of the finest layer."""
+    """Returns the Gaussians of the first cluster of the finest layer."""
     return int(np.count_nonzero(made.labels[-1] == 0))
 
 
@@ -55,7 +55,7 @@ def _saturated(exponent: float) -> Deforming:
 
 
 def _alive(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[str]:
-    """The factor and its gradient are not 0 before the clamp: a cluster that shrank can grow again."""
+    """Checks that factor and gradient are not 0 before the clamp, so that a shrunk cluster can grow again."""
     exponent = float(problem.clusters[-1][0, S])
     rows = problem.labels[-1] == 0
     faults = []
@@ -68,7 +68,7 @@ def _alive(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[st
 
 
 def _fold(strength: float) -> Deforming:
-    """One cluster about its pivot with c·y from −strength to strength; beyond 1 the map folds."""
+    """Creates one cluster about its pivot with c·y from −strength to strength; above 1 the map folds."""
     rng = np.random.default_rng(8)
     made = ordinary(64, (1,), 0.0)
     means = rng.uniform(-1, 1, (64, 3)).astype(np.float32)
@@ -78,7 +78,7 @@ def _fold(strength: float) -> Deforming:
 
 
 def _folds_are_counted(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[str]:
-    """As many as have a negative determinant in float64."""
+    """Counts the Gaussians with negative determinant in float64."""
     before, after = problem.factors.astype(np.float64), outcomes[REFERENCE].values["factors"]
     folded = int(np.count_nonzero(np.linalg.det(before) * np.linalg.det(after) < 0))
     counted = outcomes[CPU].guards["folded"]
@@ -86,7 +86,7 @@ def _folds_are_counted(problem: Deforming, outcomes: Mapping[str, BackendResult]
 
 
 def _straight_back(steepness: float) -> Deforming:
-    """Exactly along c, and back: a half turn without a plane to turn in, or (steepness 2) without a cosine either."""
+    """Creates a map that folds along c: a half turn without a plane, or (steepness 2) without a cosine either."""
     made = ordinary(2, (1,), 0.0)
     means = np.array([[-1, 0, 0], [1, 0, 0]], np.float32)
     made.clusters[0][0, C] = (steepness, 0, 0)
@@ -113,7 +113,7 @@ def _own_turn(r: float) -> Deforming:
 
 
 def _through_a_half_turn(sign: float) -> Deforming:
-    """Two layers turn by 100° each, just beyond 180° together: the turn is stored with w ≥ 0, as q or as −q."""
+    """Creates two layers that rotate by 100° each, so that the product passes 180° and must keep w ≥ 0."""
     made = ordinary()
     angle = np.tan(np.radians(50.0) * sign)
     for clusters in made.clusters:
@@ -151,14 +151,14 @@ def _of_one(sizes: tuple[int, ...]) -> Deforming:
 
 
 def _unbalanced(count: int) -> Deforming:
-    """One cluster of nearly all, and ten of one."""
+    """Creates one cluster with nearly all Gaussians, and ten with one each."""
     made = ordinary(count, (1, 11))
     labels = np.maximum(0, np.arange(count) - (count - 11)).astype(np.int32)
     return replace(made, labels=[np.zeros(count, np.int32), labels])
 
 
 def _place(metres: float) -> Deforming:
-    """The cloud far from the origin of the inside world: float32 resolves metres · 6e-8 there."""
+    """Moves the cloud far from the origin of the internal world, where float32 has a resolution of metres · 6e-8."""
     made = ordinary()
     # Pivots and offsets are differences of large numbers; all agree to the spacing there, times the layers.
     spacing = max(1e-5, 1e-6 * metres)
@@ -169,7 +169,7 @@ def _place(metres: float) -> Deforming:
 
 
 def _size(metres: float) -> Deforming:
-    """The cloud, its Gaussians and shifts times a length; c is per metre."""
+    """Scales the cloud, its Gaussians and displacements by a length; c is per metre."""
     made = ordinary()
     for clusters in made.clusters:
         clusters[:, T] *= metres
@@ -203,13 +203,13 @@ def _not_finite(value: float, what: str = "means", count: int = 3) -> Deforming:
 
 
 def _apart(problem: Deforming, outcomes: Mapping[str, BackendResult]) -> list[str]:
-    """The others move as in float64 without the bad rows, which ``violations`` checks; nor have those a gradient."""
+    """Checks that the other Gaussians move as in float64 without the invalid rows, which get no gradient."""
     own = outcomes[CPU].gradients["own"][problem.bad]
     return [] if np.all(own == 0) else ["cpu: a row that is held back has a gradient of its own"]
 
 
 def _empty(count: int) -> Deforming:
-    """Every Gaussian of ``count`` clusters of the finest layer is not finite."""
+    """Makes every Gaussian of ``count`` clusters of the finest layer invalid."""
     made = ordinary()
     made.bad[:] = made.labels[-1] < count
     made.means[made.bad] = np.nan

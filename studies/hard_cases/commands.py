@@ -1,4 +1,4 @@
-"""`scripts/bench stability`: the catalogue of hard cases, hard frames, and the soak."""
+"""The command `scripts/bench stability`: the catalogue of hard cases, hard frames, and the soak test."""
 
 from __future__ import annotations
 

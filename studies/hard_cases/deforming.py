@@ -1,4 +1,4 @@
-"""A deformation applied and differentiated, on every backend."""
+"""Forward and backward pass of a deformation, on every backend."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Deforming:
     kind: Literal["centred", "published"] = "centred"
 
     def weights(self) -> tuple[Array, Array]:
-        """Of means [M, 3] and factors [M, 3, 3]."""
+        """Returns the extent of means [M, 3] and factors [M, 3, 3]."""
         rng = np.random.default_rng(7)
         pulls = rng.normal(size=(len(self.means), 3)), rng.normal(size=(len(self.means), 3, 3))
         by_mean, by_factor = (pull.astype(np.float32) for pull in pulls)
@@ -70,7 +70,7 @@ class Deforming:
         return by_mean, by_factor
 
     def neighbours(self) -> Neighbours | None:
-        """Of the sound ones, in metres of the cloud's size; None for a single one."""
+        """Returns the size of the cloud of valid Gaussians in metres, or None for a single one."""
         sound = ~self.bad if self.bad.size else np.ones(len(self.means), bool)
         if sound.sum() < 2:
             return None
@@ -153,7 +153,7 @@ class Deforming:
         return BackendResult(values, {name: np.zeros(1) if g is None else g.numpy() for name, g in gradients.items()})
 
     def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
-        """See ``Problem``: finite, bounded, unit turns, bad rows held and apart, in agreement."""
+        """See ``Problem``: checks finite and bounded values, unit rotations, isolated invalid rows, and agreement."""
         faults = []
         for backend, outcome in outcomes.items():
             sound = ~self.bad if self.bad.size else np.ones(len(self.means), bool)
@@ -194,11 +194,11 @@ class Deforming:
 
 
 def no_turn(count: int) -> Array:
-    """[count, 4] unit quaternions of no rotation."""
+    """Returns [count, 4] identity quaternions."""
     return np.tile(np.array([1, 0, 0, 0], np.float32), (count, 1))
 
 
 def state(means: Array, factors: Array) -> Gaussians:
-    """Θ of which all moves."""
+    """Returns a state in which all Gaussians move."""
     ones = np.ones(len(means), np.float32)
     return Gaussians(means, factors, no_turn(len(means)), ones, np.zeros_like(means), ones, np.arange(len(means)))

@@ -1,4 +1,4 @@
-"""The catalogue's Gaussians: unusual places, sizes and opacities, and numbers that are none."""
+"""Hard cases of Gaussians: unusual positions, sizes and opacities, and values that are not finite."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ COUNT = 40
 def camera(
     width: int = WIDTH, height: int = HEIGHT, focal: float = 50.0, centre: tuple[float, float] | None = None
 ) -> Camera:
-    """At the origin, looking along z."""
+    """Returns a camera at the origin that looks along z."""
     cx, cy = centre or (0.47 * width, 0.53 * height)
     return Camera("c", np.array([[focal, 0, cx], [0, 1.1 * focal, cy], [0, 0, 1]]), np.eye(4), width, height)
 
 
 def ordinary(count: int = COUNT, seed: int = 0, scale: float = 1.0, before: Camera | None = None) -> Rendering:
-    """Gaussians of 1 to 6 pixels, 2 to 3 m before the camera; all lengths times ``scale``."""
+    """Creates Gaussians of 1 to 6 pixels, 2 to 3 m in front of the camera; all lengths times ``scale``."""
     rng = np.random.default_rng(seed)
     seen = before or camera()
     pixels = rng.uniform(0, (seen.width, seen.height), (count, 2))
@@ -52,7 +52,7 @@ def among(
     hard: int, means: Any = None, factors: Any = None, opacities: Any = None, features: Any = None, bad: bool = False,
     count: int = COUNT, before: Camera | None = None, **changes: Any,
 ) -> Rendering:  # fmt: skip
-    """Ordinary Gaussians, of which some are replaced by hard ones; arrays are broadcast over those."""
+    """Creates ordinary Gaussians and replaces some by hard ones; arrays are broadcast over those."""
     base = ordinary(count + hard, before=before)
     rows = np.random.default_rng(1).permutation(count + hard)[:hard]
     arrays: dict[str, Any] = {}
@@ -68,7 +68,7 @@ def among(
 
 
 def left_out(hard: int, guard: str = "not_finite", **given: Any) -> Rendering:
-    """Hard ones that cannot be drawn."""
+    """Creates hard Gaussians that cannot be rendered."""
     return among(hard, bad=True, guards={guard: hard}, **given)
 
 
@@ -80,7 +80,7 @@ def _culled_as_behind(count: int) -> Rendering:
 
 
 def _near_plane(near: float) -> Rendering:
-    """One just before the plane, one on it, one just behind; wide as it is near."""
+    """Places Gaussians just in front of the near plane, on it, and just behind it, each as wide as its depth."""
     z = np.float32(near)
     depths = np.array([np.nextafter(z, np.float32(0)), z, np.nextafter(z, np.float32(9))])
     limits = Rendering.limits._replace(near=float(z))
@@ -105,7 +105,7 @@ def _needle(length: float) -> Rendering:
 
 
 def _along_the_ray(length: float) -> Rendering:
-    """Needles that point at the camera; the longest reach behind it."""
+    """Creates needles that point at the camera; the longest ones extend behind it."""
     return among(6, means=(0, 0, 2.5), factors=np.diag([1e-3, 1e-3, length]), value=1e-3, gradient=1e-2)
 
 
@@ -124,7 +124,7 @@ def _at_one_pixel(count: int) -> Rendering:
 
 
 def _opaque(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> list[str]:
-    """Behind the middle of an opaque Gaussian little is seen: the cap keeps it drawn, at alpha 1 the stop would not."""
+    """Hides Gaussians behind the centre of an opaque one: with the alpha cap, they are still rendered."""
     rows = np.flatnonzero(problem.opacities >= 0.98)
     places, _ = problem.camera.project(problem.means[rows])
     columns, lines = np.floor(places).astype(int).T
@@ -138,7 +138,7 @@ def _opaque(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> list[s
 
 
 def _on_a_pixel(seed: int) -> Culled:
-    """Supports that end, to a rounding, on the one pixel that they have in a block."""
+    """Creates supports that end, up to rounding, at the only pixel that they cover in a block."""
     rng = np.random.default_rng(seed)
     count, depth, focal, low_pass = 2000, 2.0, 64.0, float(np.float32(Rendering.limits.low_pass))
     reach = rng.integers(2, 20, count)
@@ -165,7 +165,7 @@ TOGETHER = 100
 
 
 def _culling_is_exact(problem: Rendering) -> list[str]:
-    """The same bits as from tile lists that hold every Gaussian in every block."""
+    """Checks for the same bits as with tile lists that contain every Gaussian in every block."""
     changed = 0
     for first in range(0, len(problem.means), TOGETHER):
         rows = slice(first, first + TOGETHER)
@@ -187,7 +187,7 @@ def _culling_is_exact(problem: Rendering) -> list[str]:
 
 
 class Culled(Rendering):
-    """Gaussians of which only the culling is checked, on the CPU."""
+    """A case in which only culling is checked, on the CPU."""
 
     def run(self, backend: str) -> BackendResult | None:
         """See ``Problem``."""
@@ -205,7 +205,7 @@ def _equal_depths(count: int) -> Rendering:
 
 
 def _by_row(problem: Rendering, outcomes: Mapping[str, BackendResult]) -> list[str]:
-    """Ties are drawn in row order: with the rows of a tie swapped, the picture is another; twice the same bits."""
+    """Checks that ties follow the row order: swapping tied rows changes the picture, and repetition does not."""
     again = problem.run(CPU)
     assert again is not None
     same = np.array_equal(again.values["features"], outcomes[CPU].values["features"])
@@ -249,7 +249,7 @@ def _far_and_near(far: float) -> Rendering:
 
 
 def _few(count: int) -> Rendering:
-    """The last group of sixteen is not full, and its last Gaussian is none."""
+    """Creates a last group of sixteen that is incomplete and ends with an invalid Gaussian."""
     made = ordinary(count)
     made.means[-1] = np.nan
     made.bad[-1] = True
@@ -257,7 +257,7 @@ def _few(count: int) -> Rendering:
 
 
 def _steep(weight: float) -> Rendering:
-    """Pixels' weights so large that gradients overflow in float32, and only there."""
+    """Uses pixel weights that are so large that gradients overflow in float32, and only there."""
     return replace(
         ordinary(), weight=weight, bound=1e38, value=2e-4, gradient=None, guards=None, why="float32 ends before it"
     )
@@ -276,7 +276,7 @@ def _small_picture(size: tuple[int, int]) -> Rendering:
 
 
 def _principal_point(offset: float) -> Rendering:
-    """The principal point so many pictures beside the picture."""
+    """Places the principal point outside the picture, by a number of picture widths."""
     before = camera(centre=(offset * WIDTH, 0.5 * HEIGHT))
     return replace(ordinary(before=before), value=1e-3, gradient=1e-2, bound=1e8)
 
@@ -286,7 +286,7 @@ def _focal(pixels: float) -> Rendering:
 
 
 def _scaled(scale: float) -> Rendering:
-    """The scene and the near plane times a length; gradients by length the other way."""
+    """Scales the scene and the near plane by a length; gradients with respect to lengths scale inversely."""
     made = ordinary(scale=scale)
     return replace(made, limits=made.limits._replace(near=0.01 * scale), bound=1e7 / min(scale, 1.0))
 

@@ -1,4 +1,4 @@
-"""Takes away each guard, in a copy of the sources and a process of its own, and notes the cases that fail then.
+"""Mutation test of guards: disables each one in a copy of the sources, and records which cases fail.
 
 The value in the copy's ``guards.py`` is replaced by the row's ``without``; where a comparison does the work and no
 value, the line in ``PATCHES`` is. Compiled kernels of the copies are not kept. Results are, by the digest of the
@@ -80,17 +80,17 @@ print("\\n" + json.dumps(found))
 
 
 class MutationError(RuntimeError):
-    """A mutation that cannot be made or measured: the message says which and why."""
+    """Raised if a mutation cannot be made or measured; the message names the mutation and the reason."""
 
 
 def mutants() -> Iterator[Guard]:
-    """Every guard and convention."""
+    """Returns every guard and convention."""
     yield from GUARDS.values()
     yield from CONVENTIONS.values()
 
 
 def take_away(guard: Guard, core: Path) -> None:
-    """Edit a copy of ``scas4d_core`` so that a guard does nothing.
+    """Edits a copy of ``scas4d_core`` to disable a guard.
 
     Raises:
         MutationError: the place to edit is not there once.
@@ -115,12 +115,12 @@ def take_away(guard: Guard, core: Path) -> None:
 
 
 def sections_of(guard: Guard) -> list[str]:
-    """The modules of cases that look at a guard."""
+    """Returns the modules of cases that exercise a guard."""
     return [section for names, section in SECTIONS if any(name in guard.where for name in names)]
 
 
 def failing_without(guard: Guard | None, sections: list[str]) -> list[str]:
-    """The cases that fail when a guard is taken away; a process that dies or hangs is one of them."""
+    """Returns the cases that fail without a guard, including those whose process crashes or hangs."""
     with tempfile.TemporaryDirectory(prefix="scas4d-mutation-") as folder:
         copy = Path(folder) / "scas4d_core"
         shutil.copytree(CORE, copy, ignore=shutil.ignore_patterns("__pycache__"))
@@ -156,7 +156,7 @@ LOOKED_AT = (
 
 
 def sources() -> str:
-    """Digest of the files that decide what the mutations find."""
+    """Returns a digest of the files that determine the result of the mutations."""
     hasher = hashlib.sha256()
     for path in sorted({path for pattern in LOOKED_AT for path in CORE.parent.glob(pattern)}):
         hasher.update(str(path.relative_to(CORE.parent)).encode() + path.read_bytes())
@@ -164,7 +164,7 @@ def sources() -> str:
 
 
 def known(store: Path) -> dict[str, list[str]] | None:
-    """Results of ``study`` for these sources; None where it has not been run to its end."""
+    """Returns the results of ``study`` for these sources, or None if it has not finished."""
     file = store / f"mutations-{sources()}.json"
     results: dict[str, list[str]] = json.loads(file.read_text()) if file.exists() else {}
     stored = {guard.name: results[guard.name] for guard in mutants() if guard.name in results}
@@ -172,7 +172,7 @@ def known(store: Path) -> dict[str, list[str]] | None:
 
 
 def study(store: Path, echo: Callable[[str], None] = print) -> dict[str, list[str]]:
-    """Takes every guard away in turn; the failing cases by guard.
+    """Disables each guard in turn; returns the failing cases by guard.
 
     Args:
         store: folder of the results; those of the same sources are taken from there.

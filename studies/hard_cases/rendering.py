@@ -1,4 +1,4 @@
-"""A set of Gaussians rendered and carried back, on every backend."""
+"""Forward and backward pass of rendering a set of Gaussians, on every backend."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ KINK_SHARE = 0.005
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """Gaussians before a camera.
+    """Gaussians in front of a camera.
 
     The loss is a sum of the picture's features and of the light that is left, each pixel with a random weight.
 
@@ -54,7 +54,7 @@ class Rendering:
     why: str = ""
 
     def weights(self) -> tuple[Array, Array]:
-        """[4, H, W] of the features and [H, W] of alpha."""
+        """Returns the features [4, H, W] and alpha [H, W]."""
         rng = np.random.default_rng(5)
         shape = (4, self.camera.height, self.camera.width)
         return (
@@ -109,7 +109,7 @@ class Rendering:
         )
 
     def without(self, rows: NDArray[np.bool_]) -> Rendering:
-        """The same without some Gaussians."""
+        """Returns the problem without some Gaussians."""
         kept = ~rows
         return replace(
             self, means=self.means[kept], factors=self.factors[kept], opacities=self.opacities[kept],
@@ -117,7 +117,7 @@ class Rendering:
         )  # fmt: skip
 
     def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
-        """See ``Problem``: finite, bounded, within the hull of the colours, bad rows apart, in agreement."""
+        """See ``Problem``: checks finite, bounded values, colours in their hull, isolated invalid rows, agreement."""
         faults = []
         for backend, outcome in outcomes.items():
             faults += not_finite(outcome, backend) + beyond(outcome, backend, self.bound * self.weight)

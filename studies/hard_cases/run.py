@@ -1,4 +1,4 @@
-"""The catalogue run on every backend that is here, and its table."""
+"""Runs the catalogue on every available backend, and formats its table."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ BEGIN, END = "<!-- scripts/bench stability: begin -->", "<!-- scripts/bench stab
 
 @dataclass
 class CaseResult:
-    """Result of a case in one size: backends that ran, guards that acted on the CPU, laws that do not hold."""
+    """Result of a case in one size: tested backends, guards triggered on the CPU, violated checks."""
 
     case: str
     size: str
@@ -42,12 +42,12 @@ class CaseResult:
 
 
 def backends() -> list[str]:
-    """Those that are here: torch twins in float64 first."""
+    """Returns the available backends, the float64 references in PyTorch first."""
     return [CPU] if find_spec("torch") is None else [REFERENCE, CPU, TORCH]
 
 
 def selected(names: Sequence[str] | None, slow: bool) -> list[HardCase]:
-    """The cases whose name holds one of ``names`` (all without names); slow ones where asked for, or named.
+    """Returns cases whose name contains one of ``names``, or all; slow ones only if requested or named.
 
     Raises:
         ValueError: no case has such a name.
@@ -61,7 +61,7 @@ def selected(names: Sequence[str] | None, slow: bool) -> list[HardCase]:
 
 
 def run_case(case: HardCase, size: Any, on: Iterable[str]) -> CaseResult:
-    """One case in one size; what raises does not hold."""
+    """Runs one case in one size; an exception counts as a violation."""
     line = CaseResult(case.name, str(size))
     started = time.perf_counter()
     try:
@@ -79,7 +79,7 @@ def run_case(case: HardCase, size: Any, on: Iterable[str]) -> CaseResult:
 
 
 def run(names: Sequence[str] | None = None, *, slow: bool = True, echo: Echo = print) -> list[CaseResult]:
-    """All sizes of the selected cases; reports each as it is done."""
+    """Runs all sizes of the selected cases; reports each result immediately."""
     on = backends()
     lines = []
     for case in selected(names, slow):
@@ -95,12 +95,12 @@ def run(names: Sequence[str] | None = None, *, slow: bool = True, echo: Echo = p
 
 
 def in_words(guards: dict[str, int]) -> str:
-    """Counts of guards, most first."""
+    """Formats the counts of guards, largest first."""
     return ", ".join(f"{name} {count:,}" for name, count in sorted(guards.items(), key=lambda item: -item[1]))
 
 
 def catalogue_table(lines: Sequence[CaseResult]) -> str:
-    """One row per section: its cases, with and without their sizes, and those that do not hold."""
+    """Returns one row per section: its number of cases, with and without sizes, and the failing ones."""
     text = ["| section | cases | with sizes | do not hold |", "|" + "---|" * 4]
     for title, cases in SECTIONS:
         names = {case.name for case in cases}
@@ -111,7 +111,7 @@ def catalogue_table(lines: Sequence[CaseResult]) -> str:
 
 
 def guards_table(guards: Iterable[Guard]) -> str:
-    """One row per guard: its value, and the first clause of its reason."""
+    """Returns one row per guard: its value, and the first clause of its reason."""
     lines = ["| guard | value | acts on | counts |", "|" + "---|" * 4]
     for guard in guards:
         clause = guard.reason.split(":")[0].split(". ")[0].rstrip(".")
@@ -120,7 +120,7 @@ def guards_table(guards: Iterable[Guard]) -> str:
 
 
 def page(lines: Sequence[CaseResult], failing: dict[str, list[str]] | None, on: str, date: str) -> str:
-    """The generated part of docs/stability.md."""
+    """Returns the generated part of docs/stability.md."""
     count, failed = len({line.case for line in lines}), sum(bool(line.violations) for line in lines)
     tried = "" if failing is None else (
         f" `scripts/bench stability --mutate` removes each guard and each convention in turn: "
@@ -149,5 +149,5 @@ Conventions act all the time and are not counted: {conventions}.
 
 
 def here() -> tuple[str, str]:
-    """The machine, in words, and the date."""
+    """Describes the machine and the date."""
     return in_words_of(machine()), datetime.now(UTC).date().isoformat()

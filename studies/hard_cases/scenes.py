@@ -1,4 +1,4 @@
-"""The catalogue's whole scenes: rigs and units that are unusual, from frame 0 through two updates."""
+"""Hard cases of whole scenes: unusual rigs and units, from frame 0 through two updates."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SIZE, BALL = 32, 400
 
 @dataclass(frozen=True, eq=False)
 class HardScene:
-    """A ball that moves over a floor, for two updates from the true frame 0.
+    """A ball that moves over a floor, for two updates that start from the true frame 0.
 
     Attributes:
         rig: of the world in which the ball is 0.25 m; pictures are taken with it.
@@ -37,7 +37,7 @@ class HardScene:
     least: float = 0.0
 
     def run(self, backend: str) -> BackendResult | None:
-        """See ``Problem``: on the CPU."""
+        """See ``Problem``; runs on the CPU."""
         if backend != CPU:
             return None
         from scas4d_core.first_frame.static_result import StaticResult
@@ -71,7 +71,7 @@ class HardScene:
         return BackendResult(values)
 
     def violations(self, outcomes: Mapping[str, BackendResult]) -> list[str]:
-        """See ``Problem``: finite, unit turns, what stands stands, nothing flies off, the pictures are met."""
+        """See ``Problem``: checks finite values, unit rotations, unchanged static Gaussians, fit to the pictures."""
         values = outcomes[CPU].values
         faults = [f"{name} is not finite" for name, array in values.items() if not np.isfinite(array).all()]
         lengths = np.linalg.norm(values["rotations"], axis=1)
@@ -103,7 +103,7 @@ def _six() -> Rig:
 
 
 def _with(changes: Mapping[int, Any]) -> Rig:
-    """The six cameras, some of them with other intrinsics."""
+    """Returns the six cameras, some of them with other intrinsics."""
     cameras = list(_six().cameras)
     for k, intrinsics in changes.items():
         cameras[k] = replace(cameras[k], intrinsics=np.array(intrinsics))
@@ -115,12 +115,12 @@ def _lens(focal: float, cx: float = SIZE / 2, cy: float = SIZE / 2) -> list[list
 
 
 def _scaled(scale: float) -> HardScene:
-    """The user's unit is 1/scale metres, and the user says so with metres_per_unit "auto"."""
+    """Uses a user unit of 1/scale metres, with metres_per_unit "auto"."""
     return HardScene(_six(), WorldFrame(np.zeros(3), 1 / scale), "auto", least=37.5)
 
 
 def _unsaid(scale: float) -> HardScene:
-    """The same, and the user says nothing: rates and bounds in metres are others then."""
+    """Uses a user unit of 1/scale metres without declaring it, so that rates and bounds in metres differ."""
     return HardScene(_six(), WorldFrame(np.zeros(3), 1 / scale), 1.0)
 
 

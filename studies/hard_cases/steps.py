@@ -1,4 +1,4 @@
-"""The catalogue's steps between rendering and deforming: Adam, frame 0's parameters, neighbours, losses, clustering."""
+"""Hard cases of the remaining steps: Adam, parameters of frame 0, neighbours, losses, clustering."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ Array = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class HardStep:
-    """A function of arrays, on the CPU and where there is one in float64.
+    """A function of arrays, on the CPU and, if available, in float64.
 
     Attributes:
         compute: by backend.
@@ -73,7 +73,7 @@ LARGEST = EXPONENT * np.log(2.0)
 
 
 def _adam(gradient: Callable[[int, Array], None], acted: int, flushed: int = 0, **changes: Any) -> HardStep:
-    """Twenty steps over a table of which ``gradient(step, table)`` spoils some numbers."""
+    """Runs twenty steps on a table in which ``gradient(step, table)`` replaces some values."""
 
     def start() -> tuple[Array, list[Array]]:
         rng = np.random.default_rng(11)
@@ -121,7 +121,7 @@ def _spoil(value: float, once: bool) -> Callable[[int, Array], None]:
 
 
 def _tiny(value: float) -> Callable[[int, Array], None]:
-    """A whole table of tiny gradients: no number of it, and no moment, may be denormal."""
+    """Uses a whole table of tiny gradients, for which no value and no moment may be denormal."""
 
     def spoil(step: int, table: Array) -> None:
         table[:] = value
@@ -130,7 +130,7 @@ def _tiny(value: float) -> Callable[[int, Array], None]:
 
 
 def denormal(array: NDArray[Any]) -> int:
-    """Count of numbers that are neither 0 nor normal in float32."""
+    """Returns the number of values that are neither 0 nor normal in float32."""
     return int(np.count_nonzero((array != 0) & (np.abs(array) < np.finfo(np.float32).tiny)))
 
 
@@ -147,7 +147,7 @@ def _decaying(outcomes: Mapping[str, BackendResult]) -> list[str]:
 def _activation(
     columns: slice, value: Any, guards: dict[str, int], agreement: float | None = 1e-4, pull: float = 1.0
 ) -> HardStep:
-    """A tenth of 300 rows of frame 0's parameters take a value in some columns."""
+    """Replaces some columns in a tenth of 300 rows of the parameters of frame 0."""
     rng = np.random.default_rng(12)
     table = rng.normal(size=(300, activation.COLUMNS)).astype(np.float32)
     table[::10, columns] = value
@@ -187,7 +187,7 @@ def _activation(
 
 
 def _opposite(scale: float) -> HardStep:
-    """Q and −q, of any length: the same Gaussian, and opposite gradients."""
+    """Compares q and −q of any length, which must give the same Gaussian and opposite gradients."""
     rng = np.random.default_rng(13)
     table = rng.normal(size=(64, activation.COLUMNS)).astype(np.float32)
     table[:, 3:7] *= np.float32(scale)
@@ -213,7 +213,7 @@ def _opposite(scale: float) -> HardStep:
 
 
 def _pictures(rendered: Any, target: Any, size: tuple[int, int] = (40, 37), agreement: float | None = 2e-3) -> HardStep:
-    """The image loss of two pictures, arrays or numbers that fill them; no pixel pulls with more than its own share."""
+    """Evaluates the image loss of two pictures (arrays or constants) and bounds the gradient of each pixel."""
     height, width = size
     shape = (3, height, width)
     image = np.broadcast_to(np.asarray(rendered, np.float32), shape).copy()
@@ -257,7 +257,7 @@ def _noise(seed: int) -> Array:
 
 
 def _clustering(points: Callable[[np.random.Generator], NDArray[Any]], wished: tuple[int, ...]) -> HardStep:
-    """Every finite Gaussian in one cluster of each layer, each cluster whole and nested, the same twice."""
+    """Checks that every finite Gaussian is in one cluster per layer, and that clusters are nested and reproducible."""
 
     def on_cpu() -> BackendResult:
         means = points(np.random.default_rng(14)).astype(np.float32)
@@ -285,7 +285,7 @@ MILLION_MB = 600
 
 
 def _megabytes_of_clustering(count: int) -> float:
-    """Peak memory of ``build_hierarchy`` on a surface of so many points, beyond what the process held before."""
+    """Returns the peak memory of ``build_hierarchy`` on a surface of a number of points, above the initial memory."""
     rng = np.random.default_rng(16)
     means = rng.normal(size=(count, 3)).astype(np.float32)
     means /= np.linalg.norm(means, axis=1, keepdims=True)
@@ -308,7 +308,7 @@ def _million(count: int) -> HardStep:
 
 
 def _graph(points: NDArray[Any]) -> HardStep:
-    """Neighbours with finite weights and distances, and no one its own."""
+    """Checks that neighbours have finite weights and distances, and that no Gaussian is its own neighbour."""
 
     def on_cpu() -> BackendResult:
         graph = build_neighbours(points, 20, 2000.0)
@@ -323,7 +323,7 @@ def _graph(points: NDArray[Any]) -> HardStep:
 
 
 def _split(lengths: tuple[float, float, float]) -> HardStep:
-    """Factors split into a rotation and lengths for export: Σ again, also where lengths are nearly equal."""
+    """Splits factors into rotation and lengths for export, and checks Σ, also for nearly equal lengths."""
 
     def on_cpu() -> BackendResult:
         rng = np.random.default_rng(15)

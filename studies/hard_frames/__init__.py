@@ -1,1 +1,1 @@
-"""Faulty pictures and cameras, and long runs."""
+"""Studies of faulty pictures and cameras, and long runs."""

@@ -1,4 +1,4 @@
-"""Faults of one camera among good ones: what is sent, and that an alarm names the camera.
+"""Faults of a single camera: the frames that are sent, and checks that an alarm names the camera.
 
 Lenses lose their focus and get dirty, gains and white balances jump, a grabber repeats its last picture. The update
 need not suffer much by it; a person must hear of it while the recording can still be saved.
@@ -28,7 +28,7 @@ Fault = Callable[[Picture, Any], Picture]
 
 
 def camera_faults(footage: Footage) -> tuple[FrameCase, ...]:
-    """The faults, all of the same camera of a footage."""
+    """Returns the faults, all for the same camera of a footage."""
     name = two_cameras(footage)[0]
 
     def case(title: str, what: str, sizes: tuple[Any, ...], fault: Fault) -> FrameCase:
@@ -58,7 +58,7 @@ def camera_faults(footage: Footage) -> tuple[FrameCase, ...]:
 
 
 def reports_alarm(name: str, soon: int) -> Holds:
-    """An alarm names the camera by frame ``soon`` of the fault, none names another, and no damage is done."""
+    """Checks that only this camera raises an alarm, by frame ``soon`` of the fault, and that no damage is done."""
 
     def holds(steps: Sequence[FrameStep], size: Any) -> list[str]:
         faults = [] if any(_names(step, name) for step in steps[:soon]) else [f"no alarm of it within {soon} frames"]
@@ -77,25 +77,25 @@ def _names(step: FrameStep, name: str) -> bool:
 
 
 def blurred(picture: Picture, pixels: float) -> Picture:
-    """Out of focus: blurred by so many pixels, standard deviation."""
+    """Blurs a picture, as if out of focus, by a standard deviation in pixels."""
     picture_blurred: Picture = gaussian_filter(picture.astype(np.float32), (pixels, pixels, 0)).round().astype(np.uint8)
     return picture_blurred
 
 
 def scaled(picture: Picture, factor: Any) -> Picture:
-    """Times a factor, or one of each colour; saturated at 255."""
+    """Multiplies a picture by one factor or a factor per colour, saturated at 255."""
     picture_scaled: Picture = (picture * np.asarray(factor)).round().clip(0, 255).astype(np.uint8)
     return picture_scaled
 
 
 def noisy(picture: Picture, levels: float) -> Picture:
-    """With noise of so many levels, standard deviation; another in each picture."""
+    """Adds noise with a standard deviation in levels, different in each picture."""
     rng = np.random.default_rng(int(picture.sum()))
     return (picture + rng.normal(0, levels, picture.shape)).round().clip(0, 255).astype(np.uint8)
 
 
 def dirty(picture: Picture, white: float) -> Picture:
-    """With dirt on the lens before the middle ninth: blurred, with a share of white by light that is scattered."""
+    """Simulates dirt on the lens over the middle ninth: blurred, and whitened by scattered light."""
     height, width = picture.shape[:2]
     middle = slice(height // 3, 2 * height // 3), slice(width // 3, 2 * width // 3)
     smeared = gaussian_filter(picture[middle].astype(np.float32), (SMEARED * width, SMEARED * width, 0))

@@ -1,4 +1,4 @@
-"""Cost of the checks: share of an update by its stage timers, against the target."""
+"""Cost of the checks: their share of an update according to its stage timers, compared with the target."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Share = tuple[float, float, float]
 
 
 def shares(reports: Sequence[FrameReport]) -> Share:
-    """Medians over updates: seconds of one, share of the checks, share of comparing its start and its end.
+    """Medians over updates: seconds of an update, share of the checks, share of comparing its start and end.
 
     The checks are the stage ``judge``: the light of the pictures, the gate, plausibility, fits, and views of
     cameras that are left out. Start and end are compared on the probe views, which are a part of the update: it may
@@ -33,7 +33,7 @@ def shares(reports: Sequence[FrameReport]) -> Share:
 
 
 def cost(footage: AnyFootage, updates: int = 8) -> Share:
-    """Of so many updates of a footage after the first, which starts cold."""
+    """Returns the cost over a number of updates of a footage, without the first one, which starts cold."""
     with TemporaryDirectory() as folder:
         scene = footage.start(Path(folder) / "states")
         reports = [scene.step(footage.frame(index)) for index in range(1, updates + 2)]
@@ -41,7 +41,7 @@ def cost(footage: AnyFootage, updates: int = 8) -> Share:
 
 
 def in_words(footage: AnyFootage, found: Share) -> str:
-    """One line."""
+    """Formats the cost as one line."""
     seconds, checks, probes = found
     verdict = f"{'reached' if checks <= TARGET else 'missed'}: {100 * TARGET:.0f} %"
     return (

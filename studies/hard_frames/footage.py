@@ -1,4 +1,4 @@
-"""Footage for the frame cases: synthetic, which can show anything, and captures."""
+"""Footage for the frame cases: a synthetic scene, which can show anything, and captures."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ RATE = 30.0
 
 
 class SyntheticFootage:
-    """A ball that goes around over a floor, beside one that lies there; frame 0 is known, but for a few millimetres.
+    """A ball that circles over a floor next to a resting ball; frame 0 is known up to a few millimetres.
 
     Attributes:
         name, rig, held_out, settings, count: of the footage.
@@ -60,7 +60,7 @@ class SyntheticFootage:
 
     @property
     def held_out(self) -> tuple[Camera, ...]:
-        """Between those of the rig."""
+        """Returns cameras between those of the rig."""
         return self._others.cameras
 
     def frame(self, index: int) -> Frame:
@@ -72,23 +72,23 @@ class SyntheticFootage:
         return self._shown(index, (0.0, 0.0, 0.0))[1]
 
     def jumped(self, index: int, sizes: float) -> tuple[Frame, Pictures]:
-        """See ``frames.Footage``; it jumps to where it is seen by all cameras."""
+        """See ``frames.Footage``; the ball jumps to a place that all cameras see."""
         return self._shown(index, (-0.8 * sizes * 2 * BALL, 0.0, -0.6 * sizes * 2 * BALL))
 
     @property
     def points(self) -> InitialPoints:
-        """For who fits frame 0."""
+        """Returns the frame for fitting frame 0."""
         true = self._true
         return InitialPoints(true.means.astype(np.float64), true.colours.copy(), true.foreground.copy())
 
     def start(self, folder: Path) -> Reconstruction:
-        """Frame 0 committed."""
+        """Returns a reconstruction with frame 0 committed."""
         history, static = History.open(folder), StaticResult(self._fitted(), {}, [])
         with all_varied(self.constants):
             return Reconstruction.start(self.rig, self.frame(0), self.settings, history=history, static=static)
 
     def _fitted(self) -> Gaussians:
-        """The truth of frame 0 as a fit would leave it: nearly."""
+        """Returns the true frame 0 with small errors, as after a fit."""
         rng, true = np.random.default_rng(1), self._true
         means = true.means + rng.normal(0, 0.004, true.means.shape)
         factors = true.factors * np.exp(rng.normal(0, 0.1, (len(true), 1, 3)))
@@ -108,7 +108,7 @@ class SyntheticFootage:
 
 
 class CapturedFootage:
-    """A capture with test cameras; its frame 0 is fitted once and kept.
+    """A capture with test cameras, whose frame 0 is fitted once and kept.
 
     Args:
         settings: of the scene. study: folder of a study, which keeps frame 0, as that of ``scripts/bench quality``.
@@ -138,11 +138,11 @@ class CapturedFootage:
         return self._capture.test_frame(index).images
 
     def jumped(self, index: int, sizes: float) -> tuple[Frame, Pictures] | None:
-        """Nobody has filmed that."""
+        """See ``frames.Footage``; None, since no such footage was recorded."""
         return None
 
     def start(self, folder: Path) -> Reconstruction:
-        """Frame 0 committed."""
+        """Returns a reconstruction with frame 0 committed."""
         return started(self._capture, self.settings, self._study, folder)
 
 

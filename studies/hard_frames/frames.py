@@ -1,4 +1,4 @@
-"""Faulty frames: the frames that each case sends, and the laws that its result must keep.
+"""Cases of faulty frames: the frames that each case sends, and the checks that its result must pass.
 
 A case takes a footage that goes as it should, and says what is sent in place of its frames from one on: first the
 faulty ones, then good ones. What must hold in every case: all is finite, what is not as it should be is explained in
@@ -31,21 +31,21 @@ JUMPED_DB = 3.0
 
 
 class Footage(Protocol):
-    """A sequence that goes as it should, with cameras held out."""
+    """An undisturbed sequence with held-out cameras."""
 
     def frame(self, index: int) -> Frame:
-        """The training pictures."""
+        """Returns the training pictures."""
 
     def truth(self, index: int) -> Pictures:
-        """True pictures of the held-out cameras."""
+        """Returns the true pictures of the held-out cameras."""
 
     def jumped(self, index: int, sizes: float) -> tuple[Frame, Pictures] | None:
-        """The same with the object moved by so many times its own size; None where that cannot be had."""
+        """Returns the pictures with the object moved by a multiple of its size, or None if unavailable."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sent:
-    """One frame as it is sent.
+    """A frame as it is sent.
 
     Attributes:
         frame: its index and time are set when it is sent. like: frame of the footage that it should look like, which
@@ -83,7 +83,7 @@ Holds = Callable[[Sequence[FrameStep], Any], list[str]]
 
 @dataclass(frozen=True)
 class FrameCase:
-    """One line of the catalogue.
+    """One entry of the catalogue.
 
     Attributes:
         name, what, source: of the case; where in the literature or in users' reports it comes from. sizes: in which it
@@ -102,7 +102,7 @@ class FrameCase:
 
 
 def violations(case: FrameCase, steps: Sequence[FrameStep], size: Any) -> list[str]:
-    """Laws that do not hold, a sentence each."""
+    """Returns the violated checks, one sentence each."""
     faults = [f"frame {step.report.index}: not finite, or a rotation is no unit" for step in steps if not step.sound]
     faulty = [step for step in steps if not step.sent.good]
     faults += case.holds(faulty, size)
@@ -122,13 +122,13 @@ def violations(case: FrameCase, steps: Sequence[FrameStep], size: Any) -> list[s
 
 
 def held(steps: Sequence[FrameStep], size: Any) -> list[str]:
-    """The state stays as it was, and the report says why."""
+    """Checks that the state is unchanged and the report explains why."""
     faults = [f"frame {step.report.index}: the state has changed" for step in steps if not step.kept]
     return faults + [f"frame {s.report.index}: not said to be held" for s in steps if not s.report.outcome.rejected]
 
 
 def left_out(names: Callable[[Any], Sequence[str]], first: int = 0, may: Sequence[str] = ()) -> Holds:
-    """These cameras are left out, no others but those that ``may`` be, and no damage is done.
+    """Checks that these cameras are excluded, no others except those that ``may`` be, and that no damage is done.
 
     Args:
         first: number of the faulty frame from which on they have to be.
@@ -149,7 +149,7 @@ def left_out(names: Callable[[Any], Sequence[str]], first: int = 0, may: Sequenc
 
 
 def near(steps: Sequence[FrameStep], size: Any) -> list[str]:
-    """The frames are followed nearly as well as usual."""
+    """Checks that the frames are tracked nearly as well as usual."""
     return [
         f"frame {step.report.index}: {step.psnr - step.usual:+.2f} dB against the undisturbed run"
         for step in steps
@@ -158,13 +158,13 @@ def near(steps: Sequence[FrameStep], size: Any) -> list[str]:
 
 
 def unchanged(steps: Sequence[FrameStep], size: Any) -> list[str]:
-    """Nothing is moved, and the report says so."""
+    """Checks that nothing moved and the report states this."""
     faults = [f"frame {step.report.index}: the state has changed" for step in steps if not step.kept]
     return faults + [f"frame {s.report.index}: not said to stand" for s in steps if s.report.iterations]
 
 
 def jumped(steps: Sequence[FrameStep], size: Any) -> list[str]:
-    """Degraded at first, and explained; then found again."""
+    """Checks that the first frames are degraded and explained, and that tracking recovers."""
     faults = [] if steps[0].report.degraded else [f"frame {steps[0].report.index}: not degraded"]
     last = steps[-1]
     if not last.psnr >= last.usual - JUMPED_DB:
@@ -173,7 +173,7 @@ def jumped(steps: Sequence[FrameStep], size: Any) -> list[str]:
 
 
 def explained(steps: Sequence[FrameStep], size: Any) -> list[str]:
-    """Each is degraded, or left cameras out, and says why."""
+    """Checks that each frame is degraded or excluded cameras, with an explanation."""
     return [f"frame {s.report.index}: not explained" for s in steps if not (s.report.degraded or s.report.dropped)]
 
 
@@ -181,12 +181,12 @@ def explained(steps: Sequence[FrameStep], size: Any) -> list[str]:
 
 
 def good(footage: Footage, index: int) -> Sent:
-    """A frame as it should be."""
+    """Returns an undisturbed frame."""
     return Sent(footage.frame(index), index, footage.truth(index), True)
 
 
 def replaced(footage: Footage, at: int, count: int, change: Callable[[int, Frame], Frame]) -> list[Sent]:
-    """So many frames from ``at`` on changed, the truth going on behind them; then good ones."""
+    """Returns a number of changed frames from ``at``, during which the scene continues, then good frames."""
     faulty = [
         Sent(change(number, footage.frame(at + number)), at + number, footage.truth(at + number), False)
         for number in range(count)
@@ -195,20 +195,20 @@ def replaced(footage: Footage, at: int, count: int, change: Callable[[int, Frame
 
 
 def each(frame: Frame, change: Callable[[str, Picture], Picture]) -> Frame:
-    """All pictures changed; the masks stay."""
+    """Replaces all pictures; the masks stay."""
     images = {name: change(name, np.asarray(frame.images[name])) for name in frame.images}
     return Frame(frame.index, frame.time, images, frame.masks)
 
 
 def filled(value: int) -> Make:
-    """Pictures of one value, for as many frames as the size says."""
+    """Sends constant pictures, for as many frames as the size specifies."""
     return lambda footage, at, size: replaced(
         footage, at, size, lambda number, frame: each(frame, lambda name, picture: np.full_like(picture, value))
     )
 
 
 def noise(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """Pixels of 0 or 255 at random."""
+    """Sets random pixels to 0 or 255."""
     rng = np.random.default_rng(0)
 
     def saturated(name: str, picture: Picture) -> Picture:
@@ -218,7 +218,7 @@ def noise(footage: Footage, at: int, size: Any) -> list[Sent]:
 
 
 def brighter(factors: Callable[[Any, int], float], count: Callable[[Any], int]) -> Make:
-    """Pictures times a factor, saturated at 255."""
+    """Multiplies pictures by a factor, saturated at 255."""
 
     def make(footage: Footage, at: int, size: Any) -> list[Sent]:
         def changed(number: int, frame: Frame) -> Frame:
@@ -231,7 +231,7 @@ def brighter(factors: Callable[[Any, int], float], count: Callable[[Any], int]) 
 
 
 def swapped(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """The pictures of two cameras, each in the other's place."""
+    """Swaps the pictures of two cameras."""
     one, two = two_cameras(footage)
 
     def change(number: int, frame: Frame) -> Frame:
@@ -245,7 +245,7 @@ def swapped(footage: Footage, at: int, size: Any) -> list[Sent]:
 
 
 def bumped(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """One camera's pictures shifted by so many pixels, for good: four frames are sent."""
+    """Shifts one camera's pictures permanently by a number of pixels; four frames are sent."""
     name = two_cameras(footage)[0]
 
     def change(number: int, frame: Frame) -> Frame:
@@ -257,7 +257,7 @@ def bumped(footage: Footage, at: int, size: Any) -> list[Sent]:
 
 
 def capped(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """So many cameras show nothing, for two frames."""
+    """Blanks a number of cameras for two frames."""
     names = capped_names(footage, size)
     return replaced(
         footage, at, 2,
@@ -266,23 +266,23 @@ def capped(footage: Footage, at: int, size: Any) -> list[Sent]:
 
 
 def capped_names(footage: Footage, size: int) -> list[str]:
-    """The first of the rig."""
+    """Returns the first camera of the rig."""
     return sorted(footage.frame(0).images)[:size]
 
 
 def still(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """The frame before again, so many times; then it goes on."""
+    """Repeats the previous frame a number of times, then continues."""
     return _again(footage, at, size, lambda frame: frame)
 
 
 def stuck(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """The pictures of the frame before so many times, while the world goes on."""
+    """Repeats the pictures of the previous frame a number of times while the scene continues."""
     before = footage.frame(at - 1)
     return replaced(footage, at, size, lambda number, frame: before)
 
 
 def still_noisy(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """The frame before again, twice, with noise of so many levels."""
+    """Repeats the previous frame twice, with noise of a standard deviation in levels."""
     rng = np.random.default_rng(0)
 
     def change(name: str, picture: Picture) -> Picture:
@@ -297,7 +297,7 @@ def _again(footage: Footage, at: int, count: int, change: Callable[[Frame], Fram
 
 
 def dropping(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """One camera less in each frame, until so many are left; then all are back."""
+    """Removes one more camera in each frame until a minimum number remains; then all return."""
     names = sorted(footage.frame(0).images)
     count = min(len(names) - size, 7)
     steps = np.linspace(1, len(names) - size, count).round().astype(int)
@@ -315,14 +315,14 @@ def dropping(footage: Footage, at: int, size: Any) -> list[Sent]:
 
 
 def elsewhen(footage: Footage, at: int, size: Any) -> list[Sent]:
-    """One frame shows what is so many frames later."""
+    """Inserts one frame that shows the scene a number of frames later."""
     wrong = footage.frame(at + size)
     faulty = Sent(Frame(at, 0.0, wrong.images, wrong.masks), at + size, footage.truth(at + size), False)
     return [faulty, *(good(footage, at + 1 + number) for number in range(AFTER))]
 
 
 def teleported(footage: Footage, at: int, size: Any) -> list[Sent] | None:
-    """The object is moved by so many times its own size, and goes on from there: four frames are sent."""
+    """Moves the object by a multiple of its size and continues from there; four frames are sent."""
     sent = []
     for number in range(4):
         jump = footage.jumped(at + number, size)
@@ -333,7 +333,7 @@ def teleported(footage: Footage, at: int, size: Any) -> list[Sent] | None:
 
 
 def two_cameras(footage: Footage) -> tuple[str, str]:
-    """A camera, and one that sees the object from elsewhere."""
+    """Returns a camera, and one that sees the object from a different direction."""
     names = sorted(footage.frame(0).images)
     return names[1], names[len(names) // 2 + 1]
 
@@ -359,7 +359,7 @@ CASES = (
 
 
 def named(footage: Footage) -> tuple[FrameCase, ...]:
-    """All cases; some name cameras of the footage."""
+    """Returns all cases; some refer to cameras of the footage."""
     one, two = two_cameras(footage)
     return (
         *CASES,

@@ -1,4 +1,4 @@
-"""``scripts/bench timing``: cameras that take their pictures before or after the others, and what is found of it.
+"""``scripts/bench timing``: cameras that are not synchronized, and how well their time offsets are estimated.
 
 A capture is played there and back, as a stream of every second, third or fourth of its frames; two cameras get the
 pictures of the frames between, one after the others', one before them: their offsets are exact. The stream moves twice
@@ -55,7 +55,7 @@ _TRUE = first_state(resting_may_move=False)
 
 
 class Case(NamedTuple):
-    """Every so many frames of a capture, and by how many of its frames two cameras are late and early; 0: none is."""
+    """A case: the frame step through a capture, and the frame offsets of a late and an early camera; 0: none."""
 
     step: int
     shift: int
@@ -74,7 +74,7 @@ def run(
     again: bool = False,
     report: Report = print,
 ) -> list[Row]:
-    """Updates each capture in each case, prints the table and leaves it in ``out/timing.md``.
+    """Updates each capture in each case, prints the table and writes it to ``out/timing.md``.
 
     Args:
         captures: folders. out: a file a finished run goes here; run again to go on. updates: of each.
@@ -111,7 +111,7 @@ def _row(key: str, folder: Path, out: Path, settings: Settings, updates: int, ca
 
 
 def played(capture: Capture, index: int, step: int, shifts: Mapping[str, int]) -> Frame:
-    """Frame ``index`` of a stream of every so many frames of a capture, there and back.
+    """Returns frame ``index`` of a stream that plays a subsampled capture back and forth.
 
     Args:
         shifts: by camera, frames of the capture after the others'.
@@ -128,7 +128,7 @@ def played(capture: Capture, index: int, step: int, shifts: Mapping[str, int]) -
 
 @contextmanager
 def clocked() -> Iterator[list[float]]:
-    """Seconds that the looks of each frame take, while this lasts."""
+    """Records the seconds that the timing checks of each frame take, inside the context."""
     spent, looked = list[float](), timing.record_timing
 
     def record_timing(*given: Any) -> Any:
@@ -142,7 +142,7 @@ def clocked() -> Iterator[list[float]]:
 
 
 def shown_out_of_step(footage: SyntheticFootage, index: int, offsets: Mapping[str, float]) -> Frame:
-    """A frame of the synthetic footage in which some cameras are so many frames after the others (+) or before (−)."""
+    """Returns a synthetic frame in which some cameras are a number of frames ahead (+) or behind (−)."""
     frame, rng = footage.frame(index), np.random.default_rng([index, 1])
     images, masks = dict(frame.images), dict(frame.masks)
     for name, offset in offsets.items():
@@ -153,7 +153,7 @@ def shown_out_of_step(footage: SyntheticFootage, index: int, offsets: Mapping[st
 
 
 def summary(reports: Sequence[FrameReport], true: Mapping[str, float]) -> Row:
-    """Row of a run, from its reports.
+    """Returns the row of a run, from its reports.
 
     Args:
         true: frames by which cameras are off; the others are in step.

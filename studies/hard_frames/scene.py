@@ -1,4 +1,4 @@
-"""The small scene of the frame cases and of the soak: a ball goes around over a floor, another lies there."""
+"""The small scene of the frame cases and the soak test: a ball circles over a floor, another one rests."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ GOES, RESTS, STANDS = 220, 160, 64
 
 
 def first_state(*, resting_may_move: bool) -> Gaussians:
-    """Θ_0, in metres of the inside world.
+    """Returns Θ_0, in metres of the internal world.
 
     Args:
         resting_may_move: whether the ball that lies there is labelled as moving.
@@ -50,7 +50,7 @@ def first_state(*, resting_may_move: bool) -> Gaussians:
 
 
 def gone(state: Gaussians, angle: float, shift: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Gaussians:
-    """The ball that goes, turned by ``angle`` radians about the vertical axis through the origin, then shifted."""
+    """Returns the moving ball, rotated about the vertical axis by ``angle`` radians, then shifted."""
     means, factors = state.means.copy(), state.factors.copy()
     turn = np.eye(3)
     if angle != 0:
@@ -62,6 +62,6 @@ def gone(state: Gaussians, angle: float, shift: tuple[float, float, float] = (0.
 
 
 def rows() -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """[N] which Gaussians are of the ball that goes, and which of the one that lies."""
+    """Returns masks [N] of the Gaussians of the moving and of the resting ball."""
     index = np.arange(GOES + RESTS + STANDS)
     return index < GOES, (index >= GOES) & (index < GOES + RESTS)

@@ -1,4 +1,4 @@
-"""Thousands of frames of a small scene: resting Gaussians, rotations, sizes and memory must not drift.
+"""Soak test with thousands of frames of a small scene: static Gaussians, rotations, sizes and memory must not drift.
 
 A ball goes six times around a vertical axis in 500 frames and turns about itself as often, then all the way back, and
 again. Beside it lies a ball that is labelled as moving and never moves, and a floor that stands. After each way there
@@ -67,7 +67,7 @@ MEMORY = 1.1
 
 @dataclass(frozen=True)
 class Row:
-    """The scene after a frame.
+    """The state of the scene after a frame.
 
     Attributes:
         frame: index. seconds: of an update, mean since the row before. psnr: dB, training views of the update.
@@ -92,14 +92,14 @@ class Row:
 
 
 def true_state(state: Gaussians, index: int) -> Gaussians:
-    """The truth of frame ``index``; ``state`` is that of frame 0."""
+    """Returns the ground truth of frame ``index``; ``state`` is that of frame 0."""
     on = index % (2 * OUT)
     share = min(on, 2 * OUT - on) / OUT
     return gone(state, 2 * np.pi * ROUNDS * (1 - np.cos(np.pi * share)) / 2)
 
 
 class Soak:
-    """A run in a folder; made again over the same folder it goes on where it was."""
+    """A run in a folder, which continues if it is created again for the same folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -116,23 +116,23 @@ class Soak:
 
     @property
     def done(self) -> int:
-        """Frames after the first."""
+        """Number of frames after the first."""
         return self.scene.history.indices[-1]
 
     @property
     def rows(self) -> list[Row]:
-        """Those up to where the scene is."""
+        """Rows up to the current frame of the scene."""
         file = self.folder / "rows.jsonl"
         rows = [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
         return [Row(**row) for row in rows if row["frame"] <= self.done]
 
     def frame(self, index: int) -> Frame:
-        """Pictures of all cameras."""
+        """Returns the pictures of all cameras."""
         shown = photograph(true_state(self.first, index), self._rig)
         return Frame(index, index / RATE, shown.images, shown.masks)
 
     def run(self, frames: int, every: int = 100, echo: Callable[[Row], None] = lambda row: None) -> list[Row]:
-        """Go on until so many frames after the first are done, a row every so many of them; all rows."""
+        """Continues up to a number of frames after the first, with a row at regular intervals; returns all rows."""
         rows, began, degraded, since = self.rows, 0.0, 0, 0
         while self.done < frames:
             frame, began = self.frame(self.done + 1), began - perf_counter()
@@ -175,7 +175,7 @@ class Soak:
 
 
 def violations(rows: Sequence[Row]) -> list[str]:
-    """Targets that are missed, a sentence each."""
+    """Returns the missed targets, one sentence each."""
     faults = []
     for row in rows:
         at = f"frame {row.frame}: "
@@ -216,7 +216,7 @@ def _rms(distances: NDArray[np.float64]) -> float:
 
 
 def table(rows: Sequence[Row], most: int = 10) -> str:
-    """As Markdown; of many rows so many, spread evenly."""
+    """Formats at most a number of evenly spread rows as Markdown."""
     lines = [
         "| frame | ms | degraded | what rests, mm off | what moves, mm off | norm of rotations | axes | MB |",
         "|" + "---|" * 8,

@@ -1,4 +1,4 @@
-"""Runs the frame cases: each goes on from the same committed state, and is compared with an undisturbed run."""
+"""Runs the frame cases, each from the same committed state, and compares them with an undisturbed run."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class FrameCaseResult:
 
 
 def cases_of(footage: AnyFootage) -> tuple[FrameCase, ...]:
-    """All cases: faults of frames, and of one camera."""
+    """Returns all cases: faults of frames and of one camera."""
     return (*named(footage), *camera_faults(footage))
 
 
@@ -66,14 +66,14 @@ class FrameStudy:
         self._scene = self._branch("undisturbed")
 
     def undisturbed(self, index: int) -> float:
-        """DB of the held-out cameras in the run that nothing disturbs."""
+        """Returns the PSNR in dB of the held-out cameras in the undisturbed run."""
         for at in range(max(self.usual) + 1, index + 1):
             self._scene.step(self.footage.frame(at))
             self.usual[at] = self._measured(self._scene, at, self.footage.truth(at))
         return self.usual[index]
 
     def run(self, case: FrameCase, size: Any) -> FrameCaseResult | None:
-        """None where the footage cannot show it, or is too short."""
+        """Returns the frames of a case, or None if the footage cannot show it or is too short."""
         try:
             sent = case.make(self.footage, AT, size)
         except IndexError:
@@ -103,7 +103,7 @@ class FrameStudy:
         return steps
 
     def _branch(self, name: str) -> Reconstruction:
-        """The scene as it was before the case; taken up again, it goes on with the same bits."""
+        """Returns the scene in its state before the case; it continues with the same bits."""
         folder = self.folder / name
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(self.folder / "before", folder)
@@ -122,7 +122,7 @@ def study(
     names: Sequence[str] = (),
     echo: Callable[[str], None] = print,
 ) -> list[FrameCaseResult]:
-    """All cases whose name holds one of ``names``, or all, in all sizes; reports each as it is done."""
+    """Runs the cases whose name contains one of ``names``, or all, in all sizes; reports each immediately."""
     of, lines = FrameStudy(footage, folder), []
     echo(f"{footage.name}, undisturbed: {', '.join(f'{of.undisturbed(index):.1f}' for index in range(1, AT + 4))} dB")
     for case in of.cases:
@@ -143,7 +143,7 @@ def study(
 
 
 def table(lines: Sequence[FrameCaseResult]) -> str:
-    """As Markdown, one row a case and size."""
+    """Formats the results as Markdown, with one row per case and size."""
     rows = ["| case | size | what | the reports say | dB against undisturbed | holds |", "|" + "---|" * 6]
     for line in lines:
         verdict = "yes" if not line.violations else f"**no**: {'; '.join(line.violations)}"
@@ -159,7 +159,7 @@ def _decibels(values: Sequence[float]) -> str:
 
 
 def _said(step: FrameStep) -> str:
-    """A frame's report in one line."""
+    """Formats a frame's report as one line."""
     report = step.report
     words = [] if report.degraded is None else [report.degraded]
     if report.dropped:
@@ -175,7 +175,7 @@ def _same(before: Gaussians, after: Gaussians) -> bool:
 
 
 def sound(state: Gaussians) -> bool:
-    """True where a state is finite and its rotations are units."""
+    """Returns whether a state is finite and its rotations have unit length."""
     finite = all(bool(np.isfinite(array).all()) for array in state.arrays().values())
     norms = np.linalg.norm(state.rotations.astype(np.float64), axis=1)
     return finite and bool(np.abs(norms - 1).max() <= UNIT)

@@ -1,1 +1,1 @@
-"""Cost of the kernels, and of the start of the service."""
+"""Studies of the cost of the kernels and of the service's start."""

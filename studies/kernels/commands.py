@@ -1,4 +1,4 @@
-"""`scripts/bench kernels`, `moving` and `startup`."""
+"""The commands `scripts/bench kernels`, `moving` and `startup`."""
 
 from __future__ import annotations
 

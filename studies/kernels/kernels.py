@@ -1,4 +1,4 @@
-"""``scripts/bench kernels``: cost of the kernels against their bare arithmetic.
+"""``scripts/bench kernels``: cost of the kernels, compared with their arithmetic alone.
 
 1. The rasterizer, forward and backward, against a micro-kernel that does the arithmetic of as many blended pairs and
    nothing else (``bench.pairs``); both in turn, in this process, on the same threads. On all views of frame 0, and on a
@@ -50,7 +50,7 @@ CLOUD_WIDTH = 2.1
 def study(
     folder: Path, settings: Settings, store: Path, *, frames: int = 8, repeats: int = 9, report: Report = print
 ) -> Row:
-    """Measures all three on a capture, prints them, and leaves them in ``store/kernels.json``.
+    """Measures all three on a capture, prints them, and writes them to ``store/kernels.json``.
 
     Args:
         folder: of the capture.
@@ -101,7 +101,7 @@ def study(
 
 
 def measure_rasterizer(gaussians: Gaussians, cameras: Sequence[Camera], repeats: int, limits: Limits = DEFAULT) -> Row:
-    """Nanoseconds a pair of the rasterizer (colour and label: four channels) and of the micro-kernel.
+    """Returns nanoseconds per pair for the rasterizer (four channels: colour and label) and the micro-kernel.
 
     Args:
         gaussians: what is rendered. cameras: of the inside world. repeats: each gives one figure.
@@ -158,7 +158,7 @@ def measure_rasterizer(gaussians: Gaussians, cameras: Sequence[Camera], repeats:
 
 
 def make_cloud(seed: int = 0) -> tuple[Gaussians, Camera]:
-    """Round Gaussians spread evenly over a picture, at depths of 3 to 5 m, opacities 0.1 to 0.9; and its camera."""
+    """Creates a camera and round Gaussians spread evenly over its picture, at 3 to 5 m with opacities 0.1 to 0.9."""
     rng = np.random.default_rng(seed)
     focal, middle = float(CLOUD_SIZE), CLOUD_SIZE / 2
     depth = rng.uniform(3, 5, CLOUD_GAUSSIANS)
@@ -177,7 +177,7 @@ def make_cloud(seed: int = 0) -> tuple[Gaussians, Camera]:
 
 
 def update_figures(updates: Sequence[Row]) -> Row:
-    """Seconds of updates and of their rasterizer passes, and their ratio; the first update is left out.
+    """Returns the seconds of updates and of their rasterizer passes, and their ratio, without the first update.
 
     Args:
         updates: ``seconds`` of the whole step and ``stages`` by name, in order.
@@ -197,12 +197,12 @@ def update_figures(updates: Sequence[Row]) -> Row:
 
 
 def spread(values: Any) -> dict[str, float]:
-    """Smallest and median."""
+    """Returns minimum and median."""
     return {"min": float(np.min(values)), "median": float(np.median(values))}
 
 
 def table(row: Row) -> str:
-    """The figures as one Markdown table."""
+    """Formats the figures as one Markdown table."""
     targets = {target.metric: target for target in TARGETS if target.run == KERNELS}
 
     def line(what: str, of: dict[str, float], unit: str, metric: str | None = None, digits: int = 2) -> str:
@@ -242,7 +242,7 @@ BEGIN, END = "<!-- scripts/bench kernels: begin -->", "<!-- scripts/bench kernel
 
 
 def page(row: Row) -> str:
-    """The generated part of docs/kernels.md: command, machine, date, tables, and what was measured."""
+    """Returns the generated part of docs/kernels.md: command, machine, date, tables and measured quantities."""
     stages = sorted(row["seconds_stages"].items(), key=lambda item: -item[1])
     names = "|".join(f" {name} " for name, _ in stages)
     seconds = "|".join(f" {value:.3f} " for _, value in stages)
@@ -281,7 +281,7 @@ def _scene_words(on: Row) -> str:
 
 
 def run_and_time(folder: Path, settings: Settings, frames: int, first_file: Path) -> Row:
-    """Reconstructs so many frames, keeps frame 0, and reports seconds by update and this process's peak memory."""
+    """Reconstructs a number of frames, keeps frame 0, and reports seconds per update and peak memory."""
     capture = open_source(folder)
     count = min(frames, capture.frame_count)
     updates: list[Row] = []

@@ -1,4 +1,4 @@
-"""Time of an update against the share of the pixels that show something that moves, on made-up footage.
+"""Time of an update versus the share of moving pixels, on synthetic footage.
 
 A textured wall is seen by a row of cameras; a square in its middle slides, as large as the share asks for.
 All variants have the same Gaussians, cameras and settings; they are updated in turns.
@@ -36,7 +36,7 @@ class MovingTime:
 
 
 def measure(shares: Sequence[float], frames: int, settings: Settings | None = None) -> list[MovingTime]:
-    """Updates all variants in turns, frame by frame.
+    """Updates all variants in alternation, frame by frame.
 
     Args:
         shares: 0…1. frames: updates of each; the first one, which looks for the motion, does not count.
@@ -65,7 +65,7 @@ def measure(shares: Sequence[float], frames: int, settings: Settings | None = No
 
 
 def table(results: Sequence[MovingTime]) -> str:
-    """The results in Markdown; ratios to the last one."""
+    """Formats the results as Markdown, with ratios to the last one."""
     last = results[-1].seconds
     lines = ["| pixels that move | Gaussians that move | s an update | of the last | PSNR |", "|---|---|---|---|---|"]
     lines += [

@@ -47,7 +47,7 @@ SUMS = 6 + CHANNELS
 def blended_pairs(
     splats: Array, counts: NDArray[np.int32], width: int, height: int, limits: Limits = DEFAULT
 ) -> tuple[int, int, Array]:
-    """Count the pairs of a picture, Gaussian by Gaussian in depth order, without tiles.
+    """Counts the pairs of a picture, Gaussian by Gaussian in depth order, without tiles.
 
     Args:
         splats: [N, 16], counts: [N] of ``CpuRasterizer`` after ``forward``. width, height: pixels.
@@ -98,7 +98,7 @@ def _count(splats: Any, order: Any, limits: Any, alive: Any, light: Any, last_me
 
 
 class MicroKernel:
-    """The arithmetic of pairs alone; ``run`` does ``rounds`` of ``PAIRS`` pairs on each of ``tasks`` threads."""
+    """Arithmetic of the pairs alone; ``run`` performs ``rounds`` of ``PAIRS`` pairs on each of ``tasks`` threads."""
 
     def __init__(self, tasks: int, seed: int = 0) -> None:
         rng = np.random.default_rng(seed)
@@ -116,7 +116,7 @@ class MicroKernel:
         self.sums = np.zeros((tasks, GAUSSIANS, SUMS, lanes.COUNT), np.float32)
 
     def run(self, rounds: int) -> int:
-        """Forward and backward; returns the pairs."""
+        """Runs forward and backward pass; returns the number of pairs."""
         _micro(self.splats, self.features, self.limits, rounds, self.image, self.sums)
         return rounds * self.tasks * PAIRS
 

@@ -1,4 +1,4 @@
-"""The first minutes of a service: from an empty cache of kernels to the first committed update.
+"""Startup of a service, from an empty kernel cache to the first committed update.
 
 A service starts with no compiled kernel. As soon as it is ready, as a rig would, the study sends it a capture's first
 two frames. Two checkouts are measured in turns, because the time of a shared machine drifts.
@@ -53,7 +53,7 @@ class Start:
 
 
 def measure(capture: Path, checkouts: list[Path], repeats: int, echo: Echo) -> list[Start]:
-    """Starts a service of each checkout so many times, in turns.
+    """Starts a service of each checkout several times, in alternation.
 
     Raises:
         RuntimeError: a service or what it started did not end, or no update came.
@@ -100,7 +100,7 @@ def _start(capture: Path, checkout: Path) -> Start:
 
 
 def table(starts: list[Start]) -> str:
-    """Returns medians by checkout, and each one's ratio to the first, as Markdown."""
+    """Formats medians by checkout, and their ratios to the first one, as Markdown."""
     lines = [
         f"{in_words(machine())}; medians of {sum(one.checkout == starts[0].checkout for one in starts)} starts each, "
         "in turns.",
@@ -164,7 +164,7 @@ def _check(process: subprocess.Popen[bytes], began: float) -> None:
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
-    """Ends the service, and waits for all that it started: their time counts once they have ended."""
+    """Stops the service and waits for all its processes, whose CPU time is counted only after they end."""
     if process.poll() is None:
         process.send_signal(signal.SIGTERM)
     process.wait()
@@ -178,6 +178,6 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _spent() -> float:
-    """Seconds of processor time of all processes that have ended."""
+    """Returns the CPU seconds of all child processes that have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime

@@ -1,1 +1,1 @@
-"""The paper's experiments on our captures."""
+"""Studies that repeat the paper's experiments on our captures."""

@@ -1,4 +1,4 @@
-"""`scripts/bench paper`."""
+"""The command `scripts/bench paper`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The paper's own figures (SCas4D, TMLR 06/2025), by scene, as its tables print them.
+"""Figures of the paper (SCas4D, TMLR 06/2025) by scene, as printed in its tables.
 
 Only the scenes that have a counterpart among the captures: five of FastParticle, and Basketball of Panoptic. They are
 other pictures of other motions under the same names.
@@ -15,7 +15,7 @@ SCENES = ("robot", "spring", "wheel", "pendulums", "cloth", "basketball")
 
 
 def _scenes(*values: float) -> Figures:
-    """In the order of ``SCENES``; without the last where the table is of FastParticle alone."""
+    """Maps figures to scenes in the order of ``SCENES``; the last one is missing in tables of FastParticle only."""
     return dict(zip(SCENES, values, strict=False))
 
 

@@ -1,4 +1,4 @@
-"""The page of the paper's tables: each experiment beside the paper's figures, and whether the two agree."""
+"""The page of the paper's tables: each experiment next to the paper's figures, and whether they agree."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DIGITS: Mapping[str, int] = {"psnr": 2, "ssim": 3, "mte_2d_oracle": 2, "parts_ar
 def write_paper_page(
     out: Path, captures: Sequence[str], page: Path, updates: int = UPDATES, quality: Path | None = None
 ) -> str:
-    """Writes the page from what the study holds; the page's text.
+    """Writes the page from the rows of the study; returns the text.
 
     Args:
         out: folder of the frontier. captures: names. page: Markdown file. updates: that the rows cover.
@@ -84,7 +84,7 @@ def section(
     captures: Sequence[str],
     ratio: float | None,
 ) -> str:
-    """An experiment as Markdown: table and note."""
+    """Formats an experiment as Markdown: table and note."""
     names = [name for name in SCENES if name in captures]
     digits = DIGITS[experiment.score]
     unit = f" {experiment.unit}" if experiment.unit else ""
@@ -107,7 +107,7 @@ def section(
 
 
 def summary(outcomes: Sequence[ClaimResult], by_title: Mapping[str, Sequence[ClaimResult]]) -> str:
-    """Counts, and a table of all claims."""
+    """Returns counts and a table of all claims."""
     known = [outcome for outcome in outcomes if outcome.agrees != "not measured"]
     counts = {word: sum(o.agrees == word for o in known) for word in ("sign and size", "sign", "no")}
     lines = [
@@ -131,7 +131,7 @@ def summary(outcomes: Sequence[ClaimResult], by_title: Mapping[str, Sequence[Cla
 
 
 def _commands(captures: Sequence[str], there: Sequence[str], page: Path) -> str:
-    """The commands that measure the rows and write the page."""
+    """Returns the commands that measure the rows and write the page."""
     command = "scripts/bench paper " + " ".join(f"CAPTURES/{name}" for name in there)
     more = " ".join(f"CAPTURES/{name}" for name in captures if name not in there)
     if not more:
@@ -140,7 +140,7 @@ def _commands(captures: Sequence[str], there: Sequence[str], page: Path) -> str:
 
 
 def _elsewhere(captures: Sequence[str], there: Sequence[str]) -> str:
-    """The source of figures for captures that the study has no rows of."""
+    """Describes the source of figures for captures without rows in the study."""
     others = [name for name in captures if name not in there]
     if not others:
         return ""
@@ -149,7 +149,7 @@ def _elsewhere(captures: Sequence[str], there: Sequence[str]) -> str:
 
 
 def needed() -> list[Variant]:
-    """The settings that the experiments compare, each once."""
+    """Returns the settings that the experiments compare, without duplicates."""
     return list(dict.fromkeys(side.variant for experiment in EXPERIMENTS for side in experiment.sides))
 
 

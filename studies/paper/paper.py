@@ -1,4 +1,4 @@
-"""``scripts/bench paper``: each experiment of the paper, on the captures at hand, beside the paper's own figures.
+"""``scripts/bench paper``: each experiment of the paper on the available captures, next to the paper's figures.
 
 Every experiment is a comparison: of a setting with another one, by one score. The outcome agrees in sign where the
 difference of the means points the same way as the paper's, and in size where it is also within a factor of two of it.
@@ -32,7 +32,7 @@ SMALL: Mapping[str, float] = {
 
 
 def variant(label: str) -> Variant:
-    """The setting of the frontier with a label; not one through a whole capture."""
+    """Returns the frontier setting with a label, except those for whole captures."""
     return next(v for axis in AXES.values() for v in axis if v.label == label and not v.whole)
 
 
@@ -47,7 +47,7 @@ class ClaimSetting:
 
 @dataclass(frozen=True)
 class Claim:
-    """A comparison that the paper draws: what ``first`` gains over ``second``, by their names.
+    """A comparison made in the paper: the gain of ``first`` over ``second``, by their names.
 
     Attributes:
         expected: of the gain, where the paper has no figures: its sign, or 0 for the same.
@@ -194,7 +194,7 @@ AgreementWord = Literal["sign and size", "sign", "no", "not measured"]
 
 @dataclass(frozen=True)
 class ClaimResult:
-    """A claim of the paper beside our figures.
+    """A claim of the paper next to our figures.
 
     Attributes:
         paper: the paper's mean gain over the captures that both have; None where it prints none.
@@ -212,7 +212,7 @@ class ClaimResult:
 
 
 def measured(out: Path, captures: Sequence[str], updates: int, quality: Path | None = None) -> Measured:
-    """Our figures: rows of the frontier; for captures without any, rows of the study of quality over shared updates."""
+    """Returns our figures from the frontier, or from the quality study over the shared updates."""
     by_variant: dict[tuple[Variant, str], dict[str, float]] = {}
     for point in read_points(out, captures, updates):
         for score in SMALL:
@@ -234,7 +234,7 @@ def measured(out: Path, captures: Sequence[str], updates: int, quality: Path | N
 
 
 def compare(experiment: Experiment, ours: Measured) -> list[ClaimResult]:
-    """Each claim of an experiment against what was measured."""
+    """Compares each claim of an experiment with the measurements."""
     return [_outcome(experiment, claim, ours) for claim in experiment.claims]
 
 
@@ -262,7 +262,7 @@ def _outcome(experiment: Experiment, claim: Claim, ours: Measured) -> ClaimResul
 
 
 def _agrees(own: float, paper: float, small: float) -> AgreementWord:
-    """Both small is the same size; no difference does not agree with one, even of the same sign."""
+    """Returns whether two gains agree: both small, or both of the same sign."""
     if abs(own) < small and abs(paper) < small:
         return "sign and size"
     if own * paper <= 0:
@@ -277,7 +277,7 @@ def _sign(value: float, small: float) -> int:
 
 
 def iteration_ratio(points: Sequence[Point]) -> float | None:
-    """Seconds of the baseline's 100 iterations over those of ``scas4d``, mean over the captures that have both."""
+    """Returns the time ratio of the baseline's 100 iterations to ``scas4d``, averaged over captures that have both."""
     own = {p.capture: p.seconds for p in points if p.variant == DEFAULT}
     base = {p.capture: p.seconds for p in points if p.variant == BASE_100}
     ratios = [base[name] / own[name] for name in own if name in base]

@@ -1,1 +1,1 @@
-"""Reconstruction quality: captures, settings and seeds against the ground truth."""
+"""Studies of reconstruction quality: captures, settings and seeds compared with the ground truth."""

@@ -1,4 +1,4 @@
-"""The studies of quality, as commands of `scripts/bench`: `quality`, `refit`, `effects`, and others."""
+"""The quality studies as commands of `scripts/bench`: `quality`, `refit`, `effects`, and others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``scripts/bench effects``: what each effect is worth and costs, against `auto`, in turns.
+"""``scripts/bench effects``: benefit and cost of each effect compared with `auto`, measured in alternation.
 
 Two reconstructions start from the same frame 0 and are updated in turns, frame by frame, in one process: one as
 `auto` decides, one with effects pinned. An effect that waits for evidence is tried "on", "off" and "removed": without
@@ -64,7 +64,7 @@ def run(
     options: CaptureOptions = DEFAULT_OPTIONS,
     report: Report = print,
 ) -> list[Row]:
-    """Measures every variant of each capture; prints the table and leaves it in ``out/effects.md``.
+    """Measures every variant of each capture; prints the table and writes it to ``out/effects.md``.
 
     Args:
         captures: folders. out: a file a finished run goes here; run again to go on.
@@ -95,7 +95,7 @@ def run(
 
 
 def variants(names: Sequence[str], settings: Settings) -> list[Pins]:
-    """The pins of single effects that the settings allow; where an effect is on in every scene, "off" alone.
+    """Returns the pins of single effects that the settings allow; only "off" for effects that are always on.
 
     Raises:
         ValueError: an effect is unknown.
@@ -118,7 +118,7 @@ def variants(names: Sequence[str], settings: Settings) -> list[Pins]:
 
 
 def pinned(settings: Settings, pins: Pins) -> Settings:
-    """The settings with effects pinned; what is removed is not named in them.
+    """Returns the settings with effects pinned; removed effects are not included.
 
     Raises:
         ValueError: an effect or a mode is unknown.
@@ -130,7 +130,7 @@ def pinned(settings: Settings, pins: Pins) -> Settings:
 
 @contextmanager
 def without(pins: Pins) -> Iterator[None]:
-    """Takes the lines of the effects that are "removed" out of the registry for a while.
+    """Temporarily removes the effects that are marked "removed" from the registry.
 
     >>> with without({"entering": "removed"}):
     ...     "entering" in EFFECTS
@@ -156,7 +156,7 @@ def _row(
     again: bool,
     options: CaptureOptions,
 ) -> Row:
-    """The row of a variant, measured where it is not on disk yet."""
+    """Returns the row of a variant, and measures it if it is missing."""
     capture = open_measured(folder, options)
     count = min(frames or capture.frame_count, capture.frame_count)
     if count < 2:
@@ -171,7 +171,7 @@ def _row(
 
 
 def _compared(capture: Capture, out: Path, settings: Settings, pins: Pins, count: int) -> Row:
-    """Figures of a variant against auto."""
+    """Returns the figures of a variant relative to auto."""
     given = (settings, pinned(settings, pins))
     scenes, psnr = [], np.zeros((2, count - 1))
     wall, cpu = np.zeros((2, count - 1)), np.zeros((2, count - 1))
@@ -213,7 +213,7 @@ def _compared(capture: Capture, out: Path, settings: Settings, pins: Pins, count
 
 
 def _words(scene: Reconstruction, pins: Pins) -> str:
-    """The switches of these effects in auto at the end, and since when they are on."""
+    """Returns the final switches of these effects in auto, and since when they are on."""
     record: Any = scene.history.report(scene.history.indices[-1]).get("effects", {})
     switches = {name: record[name] for name in pins if name in record}
     return ", ".join(f"on since {one['since']}" if one["on"] else "off" for one in switches.values())

@@ -1,4 +1,4 @@
-"""Frame 0, fitted once and shared by all rows of a capture that ask for the same one.
+"""Frame 0, fitted once and shared by all rows of a capture with the same inputs.
 
 What is compared then differs in its updates alone, and only the first row pays for frame 0.
 """
@@ -33,7 +33,7 @@ ARRAYS = tuple(field.name for field in fields(Gaussians))
 
 
 def first_frame_key(capture: Capture, settings: Settings) -> str:
-    """Names the frame 0 of a capture; other cameras, pictures, masks, points or settings have another name.
+    """Names the frame 0 of a capture; the name depends on cameras, pictures, masks, points and settings.
 
     Args:
         capture: as the method gets it: without what is withheld.
@@ -58,7 +58,7 @@ def first_frame_key(capture: Capture, settings: Settings) -> str:
 
 
 def load_first_frame(path: Path) -> tuple[StaticResult, float] | None:
-    """A frame 0 and the seconds that it took; None where it was not kept yet."""
+    """Returns a stored frame 0 and the seconds that it took, or None if it is not stored."""
     if not path.exists():
         return None
     with np.load(path, allow_pickle=False) as file:
@@ -72,7 +72,7 @@ def load_first_frame(path: Path) -> tuple[StaticResult, float] | None:
 
 
 def save_first_frame(path: Path, result: StaticResult, seconds: float) -> None:
-    """Keeps a frame 0; the file is whole or not there."""
+    """Stores a frame 0 atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     names, evidence = sorted(result.exposures), result.evidence or {}
     beside = path.with_suffix(f".{os.getpid()}.part")
@@ -92,7 +92,7 @@ def save_first_frame(path: Path, result: StaticResult, seconds: float) -> None:
 
 
 def first_of(capture: Capture, out: Path, settings: Settings) -> StaticResult:
-    """Frame 0, from the folder of a study, where it is fitted once; gloss is a part of it, so its pin counts too."""
+    """Returns frame 0 from the folder of a study, fitted once; its settings include the pin of gloss."""
     key = first_frame_key(capture, settings)
     gloss = settings.effects.get("direction", "auto")
     path = out / "first" / f"{key}{'' if gloss == 'auto' else f'-direction-{gloss}'}.npz"
@@ -108,7 +108,7 @@ def first_of(capture: Capture, out: Path, settings: Settings) -> StaticResult:
 
 
 def started(capture: Capture, settings: Settings, out: Path, states: Path | None = None) -> Reconstruction:
-    """A reconstruction after frame 0, which is read from the study or, the first time, fitted and kept there.
+    """Returns a reconstruction after frame 0, which is read from the study or fitted and stored on first use.
 
     Args:
         states: empty folder to commit to; None: in memory.

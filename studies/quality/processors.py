@@ -1,4 +1,4 @@
-"""``scripts/bench processors``: spread of a capture's result over processors and seeds.
+"""``scripts/bench processors``: variation of a capture's result over processors and seeds.
 
 The first frames of a capture on this processor, on it as one with AVX2 alone, and as one of 2008, where kernels
 (``NUMBA_CPU_NAME``), numpy (``NPY_DISABLE_CPU_FEATURES``) and BLAS (``OPENBLAS_CORETYPE``) are concerned; beside them
@@ -79,13 +79,13 @@ def run(
 
 
 def same_bits(rows: Sequence[Row], capture: str) -> bool:
-    """True where the states of a capture are the same on all processors that were measured."""
+    """Returns whether the states of a capture are bit-identical on all measured processors."""
     own = [row for row in rows if row["capture"] == capture and row["seed"] == 0]
     return len({json.dumps(row["states"]) for row in own}) == 1
 
 
 def table(rows: Sequence[Row]) -> str:
-    """A line a capture: decibels by target, whether the bits are the same, and the spread over seeds."""
+    """Returns a line per capture: PSNR in dB by target, whether the bits agree, and the spread over seeds."""
     lines = [
         f"| capture | {' | '.join(PROCESSORS)} | states | seeds: spread (standard deviation) |",
         "|---" * (len(PROCESSORS) + 3) + "|",
@@ -105,7 +105,7 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def measure(capture: Path, frames: int, seed: int, changes: Sequence[str]) -> Row:
-    """Frame 0 and updates in this process: test cameras' mean PSNR of each update, and a digest of each state."""
+    """Runs frame 0 and updates in this process; returns the mean test PSNR and a digest of the state of each update."""
     from scas4d_core.reconstruction import Reconstruction
     from scas4d_core.warm_up import compile_in_processes
 

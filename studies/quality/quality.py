@@ -1,4 +1,4 @@
-"""``scripts/bench quality``: scores of the pictures, tracks and parts of captures, and seconds of an update.
+"""``scripts/bench quality``: scores of pictures, tracks and parts of captures, and seconds per update.
 
 One row for every capture, preset, number of iterations and seed. Each row runs in a process of its own, so that peak
 memory is that row's; rows that are on disk already are not run again. Rows of a capture with the same settings of
@@ -46,7 +46,7 @@ def run(
     options: CaptureOptions = DEFAULT_OPTIONS,
     report: Report = print,
 ) -> list[Row]:
-    """Measures every capture under every preset; prints the table and leaves it in ``out/table.md``.
+    """Measures every capture with every preset; prints the table and writes it to ``out/table.md``.
 
     Args:
         captures: folders; those without test cameras are measured on their training cameras, and the rows say so.
@@ -91,7 +91,7 @@ def run(
 
 
 def run_jobs(jobs: Sequence[Job], out: Path, *, again: bool = False, report: Report = print) -> list[Row]:
-    """Measures what is not on disk yet, one process a row; prints the table and leaves it in ``out/table.md``."""
+    """Measures the missing rows, one process per row; prints the table and writes it to ``out/table.md``."""
     store = Store(out)
     if jobs:
         compile_in_processes()
@@ -139,7 +139,7 @@ def measure(job: Job, folder: Path, report: Report = print) -> Row:
 
 
 def with_means(rows: Sequence[Row], over: Sequence[str] = OBJECT_CAPTURES, label: str = "mean of objects") -> list[Row]:
-    """The rows, and behind them the means of each variant that has all captures in ``over``.
+    """Returns the rows, followed by the means of each variant that has all captures in ``over``.
 
     A variant is what has the same ``variant`` value; only numbers that every row of it has are averaged.
     """
@@ -162,7 +162,7 @@ def with_means(rows: Sequence[Row], over: Sequence[str] = OBJECT_CAPTURES, label
 
 
 def _apart(job: Job, folder: Path) -> Row:
-    """Runs ``measure`` in a fresh process; what goes wrong there becomes the row's ``error``."""
+    """Runs ``measure`` in a new process; a failure is stored as the row's ``error``."""
     failed: Row = {
         "key": job.key,
         "variant": job.variant,

@@ -1,4 +1,4 @@
-"""``scripts/bench refit``: the ceiling of the updates, the method of frame 0 on a later frame alone.
+"""``scripts/bench refit``: upper bound for updates, from fitting a later frame alone with the method of frame 0.
 
 A later frame is reconstructed from scratch, with the same settings and effects, and measured on the test cameras. How
 far the updates are below it at that frame says how much is still missing: what no effect explains, what was lost on the
@@ -48,7 +48,7 @@ def run(
     options: CaptureOptions = DEFAULT_OPTIONS,
     report: Report = print,
 ) -> list[Row]:
-    """Fits a frame of each capture from scratch; prints the table and leaves it in ``out/refit.md``.
+    """Fits a frame of each capture from scratch; prints the table and writes it to ``out/refit.md``.
 
     Args:
         captures: folders. out: folder of the study of quality. Run again to continue.
@@ -85,7 +85,7 @@ def _refitted(
     again: bool,
     options: CaptureOptions,
 ) -> Row:
-    """The row of one frame, fitted where it is not on disk yet."""
+    """Returns the row of one frame, and fits it if it is missing."""
     capture = open_measured(folder, options, use_points=points)
     index = range(capture.frame_count)[frame] if -capture.frame_count <= frame < capture.frame_count else None
     if index is None:
@@ -97,7 +97,7 @@ def _refitted(
 
 
 def _measured(capture: Capture, index: int, settings: Settings) -> Row:
-    """The row of a frame that is fitted alone."""
+    """Returns the row of a frame that is fitted alone."""
     from scas4d_core.metrics.evaluation import measure_pictures
 
     scene = Reconstruction.start(capture.rig, capture.frame(index), settings, points=capture.points)
@@ -117,7 +117,7 @@ def _measured(capture: Capture, index: int, settings: Settings) -> Row:
 
 
 def _beside(row: Row, settings: Settings, preset: str, store: Store) -> Row:
-    """The updates' figure for the same frame, and how far it is below; nothing where it was not measured."""
+    """Returns the updates' figure for the same frame and its deficit, or nothing if it was not measured."""
     wanted = settings_record(settings, ())
     for other in store.rows():
         frames = other.get("psnr_by_frame", [])

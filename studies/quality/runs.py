@@ -25,7 +25,7 @@ OTHER_MAP = "published" if preset("scas4d").update.cluster_map == "centred" else
 
 @dataclass(frozen=True)
 class Run:
-    """One way to reconstruct, over some captures.
+    """One way to reconstruct some captures.
 
     Attributes:
         captures: names of folders. preset: name. iterations: of an update.
@@ -43,11 +43,11 @@ class Run:
     frames: int | None = None
 
     def settings(self, capture: str) -> Settings:
-        """Complete settings of the run on a capture."""
+        """Returns the complete settings of the run for a capture."""
         return settings_of(self.preset, self.iterations, changes=[*CAPTURE_CHANGES.get(capture, ()), *self.changes])
 
     def job(self, folder: Path, frames: int | None = None) -> Job:
-        """The row of one capture, of at most so many frames."""
+        """Returns the row of one capture, with at most a number of frames."""
         limits = [limit for limit in (frames, self.frames) if limit is not None]
         return Job(
             capture=folder,
@@ -83,7 +83,7 @@ def measure_runs(
     again: bool = False,
     report: Report = print,
 ) -> list[Row]:
-    """Measures runs on the captures that are there; rows that are on disk are not measured again.
+    """Measures runs on the available captures; existing rows are not measured again.
 
     Args:
         captures: folder of the captures' folders.
@@ -125,7 +125,7 @@ FIRST_FRAME = "scas4d_core.first_frame."
 
 
 def measured_runs(store: Store) -> dict[tuple[str, str], Row]:
-    """The rows on disk by run and capture; of several, the one with most frames. Rows with other settings are left out.
+    """Returns the stored rows with these settings by run and capture; if there are several, the longest.
 
     A row belongs to a run where its settings are, to the last number, those the run has today; where only frame 0 is
     asked for, those of updates do not count.

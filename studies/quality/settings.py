@@ -16,7 +16,7 @@ def settings_of(
     seed: int = 0,
     changes: Sequence[str] = (),
 ) -> Settings:
-    """A preset with changes; the time of frame 0 has no limit, so that a study does not depend on the machine's load.
+    """Returns a preset with changes, without a time limit for frame 0, so that results do not depend on machine load.
 
     Args:
         name: of the preset.

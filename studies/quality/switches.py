@@ -1,4 +1,4 @@
-"""``scripts/bench switches``: which effects a stream calls for, and how often each is switched.
+"""``scripts/bench switches``: the effects that a stream activates, and how often each is switched.
 
 A capture is played forwards and backwards, so that a stream may be longer than the capture.
 """
@@ -43,7 +43,7 @@ def run(
     again: bool = False,
     report: Report = print,
 ) -> list[Row]:
-    """Updates each capture so many times, prints the table and leaves it in ``out/switches.md``.
+    """Updates each capture for a number of frames, prints the table and writes it to ``out/switches.md``.
 
     Args:
         captures: folders. out: a file a finished run goes here; run again to go on. updates: of each.
@@ -80,7 +80,7 @@ def _row(folder: Path, out: Path, key: str, settings: Settings, seed: int, updat
 
 
 def _played(capture: Capture, out: Path, settings: Settings, updates: int) -> Row:
-    """The switches of the effects that wait for evidence."""
+    """Returns the switches of the effects that need evidence."""
     scene = started(capture, settings, out)
     auto = [name for name in EFFECTS if effect(name).auto]
     on = [{name: bool(scene.history.report(0)["effects"].get(name, {}).get("on")) for name in auto}]
@@ -103,7 +103,7 @@ def _played(capture: Capture, out: Path, settings: Settings, updates: int) -> Ro
 
 
 def played(capture: Capture, index: int) -> Frame:
-    """Frame ``index`` of a capture that is played forwards and backwards without an end.
+    """Returns frame ``index`` of a capture that is played back and forth endlessly.
 
     >>> capture = open_source("samples/robot")
     >>> last = capture.frame_count - 1

@@ -1,4 +1,4 @@
-"""The targets that the method has to reach, as data, compared with measured rows."""
+"""The targets of the method, as data, compared with measured rows."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ Rows = Mapping[tuple[str, str], Row]
 
 @dataclass(frozen=True)
 class Target:
-    """One figure that has to be reached.
+    """One figure to be reached.
 
     Attributes:
         what: in words.
@@ -137,7 +137,7 @@ class Verdict:
 
     @property
     def word(self) -> str:
-        """Of the verdict."""
+        """Returns the text of the verdict."""
         if self.value is None:
             return "not measured"
         return "" if self.reached is None else "reached" if self.reached else "**missed**"
@@ -145,7 +145,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Figure:
-    """A target's figure on one capture: the value, the two it is the difference of, and the updates covered."""
+    """A target's figure on one capture: the value, its two operands if it is a difference, and the covered updates."""
 
     value: float
     parts: tuple[float, float] | None
@@ -153,7 +153,7 @@ class Figure:
 
 
 def compare(rows: Rows, targets: Sequence[Target] = TARGETS) -> list[Verdict]:
-    """Every target, one verdict a capture, or one for a mean."""
+    """Evaluates every target, with one verdict per capture, or one for a mean."""
     verdicts = []
     for target in targets:
         figures = {capture: figure_of(target, capture, rows) for capture in target.captures}
@@ -165,7 +165,7 @@ def compare(rows: Rows, targets: Sequence[Target] = TARGETS) -> list[Verdict]:
 
 
 def figure_of(target: Target, capture: str, rows: Rows) -> Figure | None:
-    """The figure of a capture; None where a row that is needed is missing or lacks the value."""
+    """Returns the figure of a capture, or None if a required row or value is missing."""
     needed = [rows.get((run, capture)) for run in (target.run, *target.over)]
     there = [row for row in needed if row is not None]
     if len(there) < len(needed):
@@ -183,7 +183,7 @@ def figure_of(target: Target, capture: str, rows: Rows) -> Figure | None:
 
 
 def target_table(verdicts: Sequence[Verdict]) -> str:
-    """A Markdown table of the verdicts that are measured, and a sentence that lists the others."""
+    """Formats the measured verdicts as a Markdown table, and lists the others in a sentence."""
     lines = ["| figure | capture | target | measured | | updates |", "|---|---|---|---|---|---|"]
     for verdict in verdicts:
         if verdict.value is None:
@@ -215,7 +215,7 @@ def count_words(verdicts: Sequence[Verdict]) -> str:
 
 
 def read_study(folder: Path) -> dict[tuple[str, str], Row]:
-    """The rows of the runs in the folder of a study and, where it was made, of the study of the kernels."""
+    """Reads the rows of the runs in a study's folder and, if available, those of the kernel study."""
     rows = measured_runs(Store(folder))
     file = folder / f"{KERNELS}.json"
     if file.exists():
@@ -225,13 +225,13 @@ def read_study(folder: Path) -> dict[tuple[str, str], Row]:
 
 
 def left_out(folder: Path, rows: Rows) -> int:
-    """Counts finished rows that belong to no run as it is set today, or are not its longest."""
+    """Counts finished rows that belong to no current run, or are not the longest of their run."""
     used = {row.get("key") for row in rows.values()}
     return sum("error" not in row and row["key"] not in used for row in Store(folder).rows())
 
 
 def page(rows: Rows) -> str:
-    """The page of the documentation: commands, machine, date, the table of the targets, and the rows behind it."""
+    """Returns the documentation page: commands, machine, date, the table of the targets, and the underlying rows."""
     verdicts = compare(rows)
     known = list(rows.values())
     days = sorted({str(row["measured"])[:10] for row in known if "measured" in row})
@@ -286,7 +286,7 @@ def _value(row: Row, metric: str, updates: int) -> float | None:
 
 
 def _updates(metric: str, rows: Sequence[Row], shared: int) -> str:
-    """The updates that a figure covers; those of each row where values are not taken over the shared ones."""
+    """Returns the updates that a figure covers; those of each row if values do not use the shared ones."""
     if metric == "psnr_first":
         return "frame 0"
     if "capture_frames" not in rows[0]:
@@ -313,7 +313,7 @@ def _verdict(target: Target, capture: str, figure: Figure | None) -> Verdict:
 
 
 def _reached(target: Target, value: float) -> bool | None:
-    """Figures are compared as measured, not as they are rounded for the table."""
+    """Compares figures as measured, without the rounding of the table."""
     if target.threshold is None:
         return None
     return {

@@ -1,1 +1,1 @@
-"""Rigs of other people, calibrations that are off, cameras that drift."""
+"""Studies of third-party rigs, wrong calibrations and drifting cameras."""

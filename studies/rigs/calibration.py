@@ -1,4 +1,4 @@
-"""``scripts/bench calibration``: rigs with faults: what frame 0 reports of them, and what refining them is worth.
+"""``scripts/bench calibration``: what frame 0 reports about faulty rigs, and the benefit of refining them.
 
 Faults are put into the calibration; the pictures stay. Test cameras keep theirs.
 """
@@ -52,7 +52,7 @@ FITTED = (
 
 
 def faulty(camera: Camera, kind: str, size: float) -> Camera:
-    """A camera with a fault in its calibration.
+    """Returns a camera with a fault in its calibration.
 
     Args:
         kind: "across" and "down": turned by ``size`` pixels; "centre": its principal point is off by so many; "focal":
@@ -70,7 +70,7 @@ def faulty(camera: Camera, kind: str, size: float) -> Camera:
 
 
 def faulty_rig(rig: Rig, way: str, pixels: float, seed: int = 7) -> Rig:
-    """A rig of which one camera, or each, is turned; see ``RIGS``."""
+    """Returns a rig with one or all cameras rotated; see ``RIGS``."""
     rng, cameras = np.random.default_rng(seed), []
     for index, camera in enumerate(rig.cameras):
         across, down = (
@@ -89,7 +89,7 @@ def run(
     again: bool = False,
     report: Report = print,
 ) -> list[Row]:
-    """Measures each capture, prints two tables and leaves them in ``out/calibration.md``.
+    """Measures each capture, prints two tables and writes them to ``out/calibration.md``.
 
     Args:
         captures: folders. out: a file a finished run goes here; run again to go on. fit: also frame 0 of faulty rigs.
@@ -125,7 +125,7 @@ def _row(known: Row, folder: Path, rig: Rig, changes: Sequence[str]) -> Row:
 
 
 def _measured(name: str, matches: Matches) -> list[Row]:
-    """Residuals of the rig as it is given, and of each camera in turn with each fault."""
+    """Returns the residuals of the given rig, and of each camera in turn with each fault."""
     given, off = measure_residuals(matches)
     known = np.array([fit.pixels for fit in given.values()])
     rows: list[Row] = [_told_row(name, "none", known, f"{len(off)} of {len(known)}", 0)]
@@ -151,7 +151,7 @@ def _told_row(capture: str, fault: str, residual: NDArray[np.float64], named: st
 
 
 def _fitted(folder: Path, rig: Rig, changes: Sequence[str]) -> Mapping[str, Any]:
-    """PSNR of the test cameras in frame 0, with the rig as it is and refined."""
+    """Returns the PSNR of the test cameras in frame 0, with the given and with the refined rig."""
     capture, row = open_source(folder), dict[str, Any]()
     for refine in (False, True):
         settings = settings_of("scas4d", None, 0, [*changes, f"static.refine_calibration={str(refine).lower()}"])

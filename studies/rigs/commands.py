@@ -1,4 +1,4 @@
-"""The studies of rigs, as commands of `scripts/bench`: `rigs`, `calibration` and `drift`."""
+"""The rig studies as commands of `scripts/bench`: `rigs`, `calibration` and `drift`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tracks against optical flow, for captures without truth: does what a track says stay under the same pixels?
+"""Comparison of tracks with optical flow, for captures without ground truth.
 
 Corners of frame 0 are followed in each camera by themselves (Lucas-Kanade, kept where following them back leads to
 where they came from), and as tracks of the scene. A track that is right stays on its corner; and where a second camera
@@ -35,7 +35,7 @@ FEWEST = 20
 
 
 def flow_consistency(scene: Reconstruction, capture: Capture, count: int) -> Row:
-    """Median pixels by which tracks leave moving corners, and moving corners their epipolar lines; and how many count.
+    """Returns the median pixel error of tracks at moving corners, that of epipolar lines, and the number of corners.
 
     Args:
         scene: has committed ``count`` frames. capture: as rendered; its training cameras are asked.
@@ -73,7 +73,7 @@ def flow_consistency(scene: Reconstruction, capture: Capture, count: int) -> Row
 
 
 def followed(film: Grey, start: Float) -> Float:
-    """[T, Q, 2] pixels of points followed through the pictures [T] of a camera; NaN once one is lost.
+    """Tracks points through the pictures [T] of a camera: [T, Q, 2] pixels; NaN after a point is lost.
 
     Args:
         film: grey pictures [H, W]. start: [Q, 2] pixels in the first, in which the middle of the first pixel is 0.5.
@@ -95,13 +95,13 @@ def followed(film: Grey, start: Float) -> Float:
 def _flow(
     picture: NDArray[np.uint8], after: NDArray[np.uint8], points: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """[Q, 2] the places in the next picture of points of this one, and [Q] those that were found."""
+    """Returns the positions [Q, 2] of points in the next picture, and [Q] whether they were found."""
     where, status, _ = cv2.calcOpticalFlowPyrLK(picture, after, points, points.copy())
     return np.asarray(where, np.float32), np.asarray(status).ravel() > 0
 
 
 def _corners(film: Grey) -> Float:
-    """[T, Q, 2] corners of the first picture that move and are followed to the last."""
+    """Returns [T, Q, 2] corners of the first picture that move and are tracked to the last picture."""
     start = np.asarray(cv2.goodFeaturesToTrack(film[0], CORNERS, 0.01, APART), np.float64)  # of None, NaN
     paths = followed(film, start.reshape(-1, 2) + 0.5 if start.ndim else np.zeros((0, 2)))
     moves = np.linalg.norm(paths[-1] - paths[0], axis=1) >= MOVING  # False for NaN
@@ -109,7 +109,7 @@ def _corners(film: Grey) -> Float:
 
 
 def _from_lines(scene: Reconstruction, pair: tuple[Camera, Camera], points: Float, flow: Float, film: Grey) -> Float:
-    """Pixels by which corners of a second camera leave the epipolar lines of the first one's, frame by frame.
+    """Returns the pixel distances of a second camera's corners from the first one's epipolar lines, frame by frame.
 
     Args:
         points: [Q, 3] in frame 0. flow: [T, Q, 2] in the first camera. film: of the second.

@@ -1,4 +1,4 @@
-"""``scripts/bench drift``: captures of which two cameras drift, with poses that follow and without.
+"""``scripts/bench drift``: captures with two drifting cameras, with and without pose tracking.
 
 The pictures of a drifting camera are those that it would take if it turned: a turn needs no depth. One turns across,
 one down, by so many pixels a frame and up to so many. Test cameras stand.
@@ -59,7 +59,7 @@ def run(
     again: bool = False,
     report: Report = print,
 ) -> list[Row]:
-    """Updates each capture in four ways, prints the table and leaves it in ``out/drift.md``.
+    """Updates each capture in four ways, prints the table and writes it to ``out/drift.md``.
 
     Args:
         captures: folders. out: a file a finished run goes here; run again to go on. updates: of each.
@@ -115,7 +115,7 @@ def _played(folder: Path, out: Path, settings: Settings, updates: int, drift: tu
 
 
 def _pixels(scene: Reconstruction, name: str, twist: NDArray[np.float64]) -> NDArray[np.float64]:
-    """[3] of the reconstruction's pictures; what is seen is taken to be as far away as the rig's middle."""
+    """Returns [3] pixel offsets of the reconstruction's pictures, for content at the distance of the rig's middle."""
     camera = scene.rig[name]
     return pixel_offset(CameraArrays.of(camera).lens, twist, float(np.linalg.norm(camera.centre)))
 
@@ -125,7 +125,7 @@ def _words(offsets: Mapping[str, NDArray[np.float64]]) -> str:
 
 
 def turned(capture: Capture, index: int, offsets: Mapping[str, NDArray[np.float64]]) -> Frame:
-    """A frame as some cameras see it that have turned by pixels across, down and round (``pixel_offset``)."""
+    """Returns a frame with some cameras rotated by pixels across, down and around the axis (``pixel_offset``)."""
     frame = capture.frame(index)
     images, masks = dict(frame.images), dict(frame.masks)
     for name, offset in offsets.items():
@@ -138,7 +138,7 @@ def turned(capture: Capture, index: int, offsets: Mapping[str, NDArray[np.float6
 def _seen(
     picture: NDArray[np.uint8], camera: Camera, offset: NDArray[np.float64], order: Literal[0, 3]
 ) -> NDArray[np.uint8]:
-    """A picture [H, W] or [H, W, 3] of a camera that turns, to splines of an order; its rim is repeated."""
+    """Resamples a picture [H, W] or [H, W, 3] for a rotated camera, with splines of an order and repeated borders."""
     twist = np.concatenate([np.zeros(3), turn_from_pixels(CameraArrays.of(camera).lens) @ offset])
     back = camera.intrinsics @ twist_to_matrix(twist)[:3, :3].T @ np.linalg.inv(camera.intrinsics)
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)

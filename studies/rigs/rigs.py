@@ -1,4 +1,4 @@
-"""``scripts/bench rigs``: captures of other people's rigs, straight from their folders, with default settings.
+"""``scripts/bench rigs``: captures of third-party rigs, read from their folders, with default settings.
 
 Frame 0 has its limit of time here, for its seconds are what is asked: run it on a machine that does nothing else. With
 five cameras or more one is held out, and its picture compared with the nearest training picture, shown in its place.
@@ -70,7 +70,7 @@ def run(
     options: CaptureOptions,
     report: Report = print,
 ) -> list[Row]:
-    """Reconstructs captures; prints the table and leaves it in ``out/rigs.md``.
+    """Reconstructs captures; prints the table and writes it to ``out/rigs.md``.
 
     Args:
         captures: folders. out: folder of the study. Run again to continue.
@@ -97,7 +97,7 @@ def run(
 def measured(
     folder: Path, options: CaptureOptions, frames: int, longer: int, changes: Sequence[str], pictures: Path
 ) -> Row:
-    """The row of one capture; the arguments are those of ``run``, ``pictures`` takes truth, render and difference."""
+    """Returns the row of one capture; arguments as in ``run``, ``pictures`` gets truth, rendering and difference."""
     names = options.open(folder).full_rig.names
     if not options.test and len(names) >= ENOUGH_TO_HOLD_OUT:
         options = replace(options, test=(names[len(names) // 2],))
@@ -156,14 +156,14 @@ def measured(
 
 
 def _psnr(scene: Reconstruction, rig: Rig, frame: Frame) -> float:
-    """Mean dB of a rig's cameras, rendered without the gains that the scene found for them."""
+    """Returns the mean PSNR in dB of a rig's cameras, rendered without their estimated gains."""
     return float(
         np.mean([metrics.psnr(scene.render(rig[n], frame.index).colour, image) for n, image in frame.images.items()])
     )
 
 
 def _nearest_psnr(truth: Capture, unseen: Rig, index: int) -> float:
-    """Mean dB of the pictures of the training cameras nearest to those held out, each shown in their place."""
+    """Returns the mean PSNR in dB if each held-out picture is replaced by that of the nearest training camera."""
     pictures, seen, scores = truth.test_frame(index).images, truth.frame(index).images, []
     centres = np.array([camera.centre for camera in truth.rig.cameras])
     for camera in unseen.cameras:
@@ -174,14 +174,14 @@ def _nearest_psnr(truth: Capture, unseen: Rig, index: int) -> float:
 
 
 def _resized(image: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.uint8]:
-    """The nearest pixels of a picture, as [H, W, 3] of another shape."""
+    """Resizes a picture [H, W, 3] with nearest-neighbour sampling."""
     lines, columns = (np.arange(want) * have // want for want, have in zip(shape[:2], image.shape[:2], strict=True))
     resized: NDArray[np.uint8] = image[lines[:, None], columns[None]]
     return resized
 
 
 def _joints(path: Path, scene: Reconstruction, rig: Rig, count: int) -> Row:
-    """Median pixels of the full pictures by which joints followed from frame 0 are off, over cameras and frames."""
+    """Returns the median error in full-resolution pixels of joints tracked from frame 0, over cameras and frames."""
     with np.load(path) as file:
         true = file["points3d"][:count].astype(np.float64)
     tracks = scene.tracks_of_points(true[0], 0, list(range(count))).positions

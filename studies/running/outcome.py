@@ -1,4 +1,4 @@
-"""One row of the fault table, and the table."""
+"""One row of the fault table, and the table itself."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 @dataclass
 class ScenarioResult:
-    """A fault, the target, and what was found; with `faults` the target is missed."""
+    """A fault, its target and the outcome; with `faults`, the target is missed."""
 
     name: str
     target: str
@@ -17,12 +17,12 @@ class ScenarioResult:
 
     @property
     def reached(self) -> bool:
-        """True where nothing went wrong."""
+        """Whether there are no faults."""
         return not self.faults
 
 
 def table(outcomes: Sequence[ScenarioResult]) -> str:
-    """As Markdown."""
+    """Formats the outcomes as Markdown."""
     rows = ["| fault | target | found | |", "|---|---|---|---|"]
     for outcome in outcomes:
         summary = "; ".join([*outcome.faults, *([outcome.found] if outcome.found else [])])

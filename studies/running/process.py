@@ -1,4 +1,4 @@
-"""A service as a process of its own, to be killed, and the few requests that a study makes of it."""
+"""A service in its own process, which can be killed, and the requests that studies need."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ EVERY_S = 0.05
 
 
 class StudyError(RuntimeError):
-    """The service did not do what the study needs."""
+    """Raised if the service does not do what the study needs."""
 
 
 def wait_until(done: Callable[[], bool], fault: str, seconds: float = PATIENCE_S) -> None:
-    """Waits until something holds.
+    """Waits until a condition holds.
 
     Raises:
         StudyError: with the fault, where it does not within so long.
@@ -43,7 +43,7 @@ def wait_until(done: Callable[[], bool], fault: str, seconds: float = PATIENCE_S
 
 
 class Service:
-    """A service over one data folder; `start` and `kill` may be called again and again.
+    """A service on one data folder; `start` and `kill` may be called repeatedly.
 
     Args:
         data: its folder. environment: further variables, as SCAS4D_TOKEN.
@@ -63,12 +63,12 @@ class Service:
 
     @property
     def pid(self) -> int:
-        """Of the process that answers."""
+        """Process id of the service that answers."""
         assert self._process is not None
         return self._process.pid
 
     def start(self) -> None:
-        """Starts it and waits until it answers."""
+        """Starts the service and waits until it answers."""
         program = [sys.executable, "-m", "client.cli.main", "serve"]
         with (self.data.parent / f"{self.data.name}.log").open("ab") as log:
             self._process = subprocess.Popen(
@@ -84,14 +84,14 @@ class Service:
             time.sleep(EVERY_S)
 
     def kill(self) -> None:
-        """`kill -9`."""
+        """Kills the service with `kill -9`."""
         if self._process is not None:
             self._process.kill()
             self._process.wait()
             self._process = None
 
     def stop(self) -> None:
-        """Asks it to end, as Ctrl-C would; for good."""
+        """Stops the service permanently, as Ctrl-C would."""
         self.http.close()
         if self._process is not None:
             self._process.send_signal(signal.SIGTERM)
@@ -99,7 +99,7 @@ class Service:
             self._process = None
 
     def worker_pid(self, scene: str) -> int | None:
-        """Of the worker of a scene, or None while there is none."""
+        """Returns the process id of a scene's worker, or None if it has none."""
         try:
             pid = int(DataFolder(self.data).scene(scene).worker_lock.read_text())
             os.kill(pid, 0)
@@ -108,7 +108,7 @@ class Service:
         return pid
 
     def create(self, rig: Rig, settings: Mapping[str, Any], **more: Any) -> str:
-        """A new scene's id."""
+        """Creates a scene and returns its id."""
         body = {"rig": RigModel.of(rig).model_dump(mode="json"), "settings": settings, **more}
         answer = self.http.post("/v1/scenes", json=body)
         if answer.status_code != 201:
@@ -116,33 +116,33 @@ class Service:
         return str(answer.json()["id"])
 
     def put_points(self, scene: str, points: InitialPoints) -> None:
-        """Sends the first cloud of a scene."""
+        """Sends the initial points of a scene."""
         call = put_points(scene, points)
         answer = self.http.request(call.method, call.path, **call.arguments)
         if not answer.is_success:
             raise StudyError(answer.text)
 
     def put(self, scene: str, index: int, images: Mapping[str, bytes], masks: Mapping[str, bytes]) -> httpx.Response:
-        """One try."""
+        """Sends one frame, with one attempt."""
         body = b"".join(frame_chunks(index, images, masks))
         return self.http.put(
             f"/v1/scenes/{scene}/frames/{index}", content=body, headers={"Content-Type": FRAME_MEDIA_TYPE}
         )
 
     def status(self, scene: str) -> SceneStatus:
-        """Of a scene."""
+        """Returns the status of a scene."""
         return SceneStatus.model_validate_json(self.http.get(f"/v1/scenes/{scene}").content)
 
     def frame(self, scene: str, index: int) -> FrameReportModel:
-        """The report of a frame."""
+        """Returns the report of a frame."""
         return FrameReportModel.model_validate_json(self.http.get(f"/v1/scenes/{scene}/frames/{index}").content)
 
     def deaths(self, scene: str) -> int:
-        """Of workers, that frames of a scene are held to blame for."""
+        """Returns the number of worker deaths in the journal of a scene."""
         return DataFolder(self.data).scene(scene).journal.read_bytes().count(b'"type":"worker_died"')
 
     def finish(self, scene: str, frames: int, every: float = EVERY_S) -> SceneStatus:
-        """Waits until so many frames are finished; looks every so many seconds."""
+        """Waits until a number of frames are finished, with a given polling interval."""
         until = time.monotonic() + PATIENCE_S
         while time.monotonic() < until:
             status = self.status(scene)

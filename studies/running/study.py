@@ -1,4 +1,4 @@
-"""Frames of a study of the service, their sender, and the states that are compared."""
+"""Frames of a service study, their sender, and the compared states."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ Files = tuple[dict[str, bytes], dict[str, bytes]]
 
 @dataclass(frozen=True)
 class Study:
-    """Frames to be sent, and the service that takes them.
+    """Frames to be sent, and the service that receives them.
 
     Attributes:
         folder: for data folders and logs. frames: encoded pictures and masks of each. settings: of the scene.
@@ -42,20 +42,20 @@ class Study:
     environment: Mapping[str, str]
 
     def service(self, name: str, environment: Mapping[str, str] | None = None) -> Service:
-        """Over a new folder; `environment`: more of it."""
+        """Creates a service on a new folder; `environment` is added to its environment."""
         data = self.folder / name
         shutil.rmtree(data, ignore_errors=True)
         data.mkdir(parents=True)
         return Service(data, {**self.environment, **(environment or {})})
 
     def create(self, service: Service, **more: Any) -> str:
-        """A scene that keeps all its pictures."""
+        """Creates a scene that keeps all its pictures."""
         rules = {"keep_frames": {}, "queue_frames": 100, **more}
         return service.create(self.capture.full_rig, self.settings, ingest=rules)
 
 
 def encoded_frames(capture: Capture, count: int) -> list[Files]:
-    """So many frames of a capture; where it has fewer, it goes back and forth, so that the motion stays one."""
+    """Returns a number of frames of a capture, played back and forth if it is too short to keep motion smooth."""
     indices = [ping_pong(number, capture.frame_count) for number in range(count)]
     read = {index: _files(capture, index) for index in dict.fromkeys(indices)}
     return [read[index] for index in indices]
@@ -69,7 +69,7 @@ def _files(capture: Capture, index: int) -> Files:
 
 
 def digests(states: Path) -> dict[int, str]:
-    """SHA-256 over every array of each committed state, and what its report says of decisions."""
+    """Returns a SHA-256 over all arrays of each committed state, and the decisions in its report."""
     history = History.load(states)
     by_frame = {}
     for index in history.indices:
@@ -84,7 +84,7 @@ def digests(states: Path) -> dict[int, str]:
 
 
 def compare(found: Mapping[int, str], expected: Mapping[int, str], but: Sequence[int] = ()) -> list[str]:
-    """Faults of a run's states against the undisturbed one's; those in `but` may be gone."""
+    """Returns differences of a run's states from the undisturbed run; frames in `but` may be missing."""
     wrong = [index for index in expected if index not in but and found.get(index) != expected[index]]
     missing = [index for index in wrong if index not in found]
     faults = [f"frames {missing} are not committed"] if missing else []
@@ -96,7 +96,7 @@ def compare(found: Mapping[int, str], expected: Mapping[int, str], but: Sequence
 
 
 class Updates:
-    """Frames of a capture that are sent to a scene, some at a time, back and forth as `encoded_frames` has them.
+    """Sends frames of a capture to a scene in portions, in the order of `encoded_frames`.
 
     Attributes:
         next: index of the frame that is sent next.
@@ -107,7 +107,7 @@ class Updates:
         self.next = 0
 
     def run(self, count: int) -> list[float]:
-        """Sends so many frames at once and waits until they are committed; seconds that each took."""
+        """Sends a number of frames at once and waits for the commits; returns the seconds of each."""
         first = self.next
         for index in range(first, first + count):
             answer = self._service.put(self._scene, index, *self._frames[ping_pong(index, len(self._frames))])
@@ -123,7 +123,7 @@ class Updates:
 
 
 class FrameSender:
-    """Sends frames as a rig would that never gives up, and keeps what was acknowledged."""
+    """Sends frames like a rig that never gives up, and records the acknowledgements."""
 
     def __init__(self, study: Study, service: Service, scene: str) -> None:
         self.study, self.service, self.scene = study, service, scene
@@ -131,7 +131,7 @@ class FrameSender:
         self.faults: list[str] = []
 
     def send(self, index: int) -> None:
-        """Until it is acknowledged."""
+        """Repeats a request until it is acknowledged."""
         until = time.monotonic() + PATIENCE_S
         while time.monotonic() < until:
             try:
@@ -149,7 +149,7 @@ class FrameSender:
         self.faults.append(f"frame {index} was never acknowledged")
 
     def check(self) -> list[str]:
-        """Every acknowledged frame is committed and has the identity that was acknowledged; faults."""
+        """Checks that every acknowledged frame is committed with the acknowledged identity; returns the faults."""
         faults = list(self.faults)
         for index, receipt in self.receipts.items():
             report = self.service.frame(self.scene, index)
@@ -167,7 +167,7 @@ class FrameSender:
 def running(
     study: Study, name: str, environment: Mapping[str, str] | None = None, **rules: Any
 ) -> Iterator[tuple[Service, str, FrameSender]]:
-    """A service over a new folder, a scene of it, and its sender; the service ends with this.
+    """Provides a service on a new folder, a scene, and its sender; stops the service at the end.
 
     Args:
         environment: more of the service's. rules: of the scene, as in `Study.create`.
@@ -182,7 +182,7 @@ def running(
 
 
 def undisturbed(study: Study) -> tuple[dict[int, str], float]:
-    """States of a run that nothing disturbs, and the seconds that an update took."""
+    """Returns the states of an undisturbed run, and the seconds per update."""
     with running(study, "undisturbed") as (service, scene, sender):
         sender.send(0)
         service.finish(scene, 1)

@@ -1,1 +1,1 @@
-"""Cost against size: pixels, Gaussians, cameras, share of moving pixels, frames."""
+"""Studies of cost versus size: pixels, Gaussians, cameras, share of moving pixels, frames."""

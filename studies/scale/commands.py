@@ -1,4 +1,4 @@
-"""`scripts/bench scale`."""
+"""The command `scripts/bench scale`."""
 
 from __future__ import annotations
 

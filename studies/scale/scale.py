@@ -1,4 +1,4 @@
-"""``scripts/bench scale``: seconds and memory against one size at a time; each size in a process of its own."""
+"""``scripts/bench scale``: seconds and memory versus one size at a time, each measured in its own process."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ KEPT = {"a folder": True, "the process": False}
 
 @dataclass(frozen=True)
 class Cost:
-    """Of one size.
+    """Measurements of one size.
 
     Attributes:
         update: seconds of an update, median. view: seconds of a view. frame_0: seconds of frame 0 from its pictures and
@@ -65,14 +65,14 @@ class Cost:
 
 
 def amount(name: str, size: Size) -> float:
-    """The number that rises in a sweep."""
+    """The size that varies in a sweep."""
     if name.startswith("pixels"):
         return float(size.width * size.height)
     return float({"Gaussians": size.gaussians, "cameras": size.cameras, "share that moves": size.moving}[name])
 
 
 def slope(amounts: Sequence[float], costs: Sequence[float]) -> float:
-    """Exponent of the cost: the slope of its logarithm by least squares.
+    """Returns the exponent of the cost: the least-squares slope in a log-log plot.
 
     >>> round(slope([1, 10, 100], [2, 20, 200]), 6)
     1.0
@@ -108,7 +108,7 @@ def cost(size: Size) -> Cost:
 
 
 def growth(frames: Sequence[int], *, folder: bool) -> dict[int, float]:
-    """Peak memory, MB, of a process after so many frames of a small scene.
+    """Returns the peak memory in MB of a process after a number of frames of a small scene.
 
     Args:
         frames: numbers of frames after which it is looked at. folder: states are kept in one, as by the service; else
@@ -133,7 +133,7 @@ def growth(frames: Sequence[int], *, folder: bool) -> dict[int, float]:
 
 
 def run(work: Path, sweeps: Sequence[str], frames: Sequence[int], echo: Echo) -> dict[str, Any]:
-    """Measures what ``work`` does not hold yet; a run that was stopped goes on."""
+    """Measures the sizes that are missing in ``work``; an interrupted run is resumed."""
     work.mkdir(parents=True, exist_ok=True)
     for name in sweeps:
         for size in SWEEPS[name]:
@@ -146,7 +146,7 @@ def run(work: Path, sweeps: Sequence[str], frames: Sequence[int], echo: Echo) ->
 
 
 def summarize(found: Mapping[str, Any]) -> str:
-    """Tables of costs and slopes, as Markdown."""
+    """Formats tables of costs and slopes as Markdown."""
     lines = []
     for name, costs in found["sweeps"].items():
         amounts = [amount(name, size) for size in SWEEPS[name]]
@@ -170,7 +170,7 @@ def summarize(found: Mapping[str, Any]) -> str:
 
 
 def plot(found: Mapping[str, Any], path: Path) -> None:
-    """Seconds of an update against each size, relative to the smallest, on logarithmic axes."""
+    """Plots the seconds of an update versus each size, relative to the smallest, on logarithmic axes."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -190,7 +190,7 @@ def plot(found: Mapping[str, Any], path: Path) -> None:
 
 
 def _kept(work: Path, asked: Mapping[str, Any]) -> Any:
-    """The figures of a size, or of frames, from the folder; measured in a new process where it has none."""
+    """Reads the figures of a size or frame count from the folder, or measures them in a new process."""
     name = "-".join(f"{key}_{value}" for key, value in asked.items()).replace(" ", "").replace("[", "").replace("]", "")
     ways = crc32(json.dumps([SCENE, ITERATIONS, FIRST_ITERATIONS, UPDATES]).encode())  # what was measured otherwise
     file = work / f"{name}-{ways:08x}.json"

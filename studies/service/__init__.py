@@ -1,1 +1,1 @@
-"""The service under load, faults and hostile requests."""
+"""Studies of the service under load, faults and hostile requests."""

@@ -21,7 +21,7 @@ EVERY_S = 0.2
 
 @dataclass
 class Hold:
-    """One connection: its first bytes, and how many bytes of header follow."""
+    """One connection: its first bytes, and the number of header bytes that follow."""
 
     connection: socket.socket
     first: bytes
@@ -29,7 +29,7 @@ class Hold:
 
 
 def upload(path: str) -> bytes:
-    """The begin of a body that never ends."""
+    """Returns the start of a body that never ends."""
     return (
         (
             f"PUT {path} HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/vnd.scas4d.frame\r\n"
@@ -41,7 +41,7 @@ def upload(path: str) -> bytes:
 
 
 def attack(port: int, path: str, header: int, halves: int, uploads: int, patience: float) -> dict[str, float]:
-    """Opens all, and waits until the service has closed them.
+    """Opens all connections, and waits until the service has closed them.
 
     Args:
         port: of the service, on the loopback. path: of the uploads. header: bytes of the endless header; 0 is none.

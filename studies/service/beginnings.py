@@ -1,4 +1,4 @@
-"""The reconstruction of a scene is begun anew again and again, and the service killed meanwhile: no bit may differ."""
+"""Repeated restarts of a scene's reconstruction, with kills of the service meanwhile: no bit may differ."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SPREADS_S = (0.1, 1.0)
 
 
 def beginnings(study: Study, expected: Mapping[int, str], count: int, seed: int, echo: Echo) -> ScenarioResult:
-    """`kill -9` of the whole service, once in each of `count` beginnings, at random moments of them.
+    """Kills the whole service with `kill -9` at a random moment of each of `count` restarts.
 
     Half of the frames are here before the first beginning, one more comes with each.
     """
@@ -70,7 +70,7 @@ def beginnings(study: Study, expected: Mapping[int, str], count: int, seed: int,
 
 
 def _begin(service: Service, scene: str, number: int) -> None:
-    """Asks until it is acknowledged, as a client does that gets no answer."""
+    """Repeats a request until it is acknowledged, like a client without an answer."""
     until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
         try:

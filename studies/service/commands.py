@@ -1,4 +1,4 @@
-"""`scripts/bench faults`, `ingest`, `views`, `memory` and `crossing`."""
+"""The commands `scripts/bench faults`, `ingest`, `views`, `memory`, `sleeping` and `crossing`."""
 
 from __future__ import annotations
 

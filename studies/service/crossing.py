@@ -1,4 +1,4 @@
-"""Files of the three packages that one frame crosses between PUT and commit, and one render between request and answer.
+"""Source files that a frame passes through between PUT and commit, and a render between request and answer.
 
 Both bound how much a reader has to open to follow a frame. A file counts when a function of it runs, in whatever
 process, for each of two frames, or of two renders: what a process happens to do meanwhile is ignored. So are
@@ -65,7 +65,7 @@ sys.setprofile(profile)
 
 
 def crossed(folder: Path, capture: Capture) -> dict[str, list[str]]:
-    """Paths from the checkout's root, sorted, of the files that a later "frame" crosses, and a "render".
+    """Returns sorted paths, relative to the checkout, of the files that a later "frame" and a "render" pass through.
 
     Args:
         folder: for the service's data; made when missing.
@@ -142,7 +142,7 @@ def _files(folder: Path, phase: str, root: Path) -> Iterator[str]:
 
 
 def run(sample: Path, echo: Callable[[str], None] = print) -> bool:
-    """Prints both lists; answers whether both are short enough."""
+    """Prints both lists; returns whether both are short enough."""
     with tempfile.TemporaryDirectory(prefix="scas4d-crossing-") as folder:
         files = crossed(Path(folder), open_measured(sample))
     for phase, most in (("frame", MOST_OF_A_FRAME), ("render", MOST_OF_A_RENDER)):

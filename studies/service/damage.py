@@ -1,4 +1,4 @@
-"""Single flipped bits, wherever they are: each must be noticed or harmless, and no picture wrong.
+"""Single bit flips in stored files: each must be detected or harmless, and no picture may be wrong.
 
 One scene, frame after frame. Before each frame one bit of one file is flipped, under the service as it runs, or while
 it is down; then views are asked for, the next frame is sent, and all is compared with a run that nothing disturbed.
@@ -43,7 +43,7 @@ Pictures = dict[int, bytes]
 
 @dataclass
 class Flips:
-    """Outcome of the flipped bits.
+    """Outcome of the bit flips.
 
     Attributes:
         counts: noticed or harmless, by kind. recomputed, lost: frames whose state is another one, or gone.
@@ -59,12 +59,12 @@ class Flips:
 
 
 def frames_for(count: int) -> int:
-    """Number of frames that a study of so many flips sends."""
+    """Returns the number of frames that a study with a number of flips sends."""
     return BEFORE + count
 
 
 def undisturbed(study: Study) -> tuple[dict[int, str], Pictures]:
-    """States and views of a run that nothing disturbs."""
+    """Returns the states and views of an undisturbed run."""
     with running(study, "undisturbed_views") as (service, scene, sender):
         for index in range(len(study.frames)):
             sender.send(index)
@@ -74,7 +74,7 @@ def undisturbed(study: Study) -> tuple[dict[int, str], Pictures]:
 
 
 def flips(study: Study, count: int, seed: int, echo: Callable[[str], None]) -> Flips:
-    """Flips `count` bits, as many of each kind, half of them while the service is down."""
+    """Flips `count` bits, equally many of each kind, half of them while the service is down."""
     random_ = random.Random(seed)
     expected, views = undisturbed(study)
     counts = Flips()
@@ -119,7 +119,7 @@ class _Flip:
         self.faults: list[str] = []
 
     def _choose(self, random_: random.Random) -> tuple[int, Path]:
-        """A file of the kind, and the frame that it is of."""
+        """Returns a file of the kind, and the frame to which it belongs."""
         newest, states = self.frames - 1, self.folder.states
         match self.kind:
             case "state":
@@ -136,7 +136,7 @@ class _Flip:
                 return newest, random_.choice(sorted(self.folder.frames.glob("*.frame")))
 
     def run(self, down: bool, found: Flips, views: Pictures) -> str:
-        """Flips it, asks for everything, and puts it right where the service has not."""
+        """Flips the bit, requests everything, and repairs the file if the service has not."""
         service = self.service
         if down:
             service.kill()
@@ -168,7 +168,7 @@ class _Flip:
         return outcome
 
     def _harmless(self) -> bool:
-        """True where everything that can be read of the file is what was written."""
+        """Returns whether everything that can be read from the file equals what was written."""
         try:
             if self.kind == "frame":
                 return bool(read_pictures(self.file.parent, self.file.name).images)
@@ -180,7 +180,7 @@ class _Flip:
             return False
 
     def _look(self, index: int, found: Flips, views: Pictures) -> None:
-        """A view of a frame and its report: as undisturbed, or marked, or refused with a reason."""
+        """Checks that a view and a report are unchanged, marked, or refused with a reason."""
         until = time.monotonic() + NOTICED_S
         while (answer := _view(self.service, self.study, self.scene, index)).status_code == 503:
             self._no_path(answer)
@@ -211,7 +211,7 @@ class _Flip:
             self.faults.append("an answer names a path of the server")
 
     def _put_right(self, flipped: bytes) -> None:
-        """Restores what the service could not mend, so that the next bit is the only one."""
+        """Restores what the service could not repair, so that the next flip is the only one."""
         try:
             with self.file.open("r+b") as opened:
                 opened.seek(self.at)

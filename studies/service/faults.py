@@ -1,4 +1,4 @@
-"""Kills, cuts, flipped bits, a full disk and strangers: none may cost an acknowledged frame or a bit of the states.
+"""Kills, truncation, bit flips, a full disk and attackers: no acknowledged frame and no bit may be lost.
 
 Each scenario runs the whole service as a process of its own. The undisturbed run comes first; the others are compared
 with it, state by state and bit by bit.
@@ -43,7 +43,7 @@ PARTS = ("kills", "beginnings", "log", "disk", "bits", "strangers")
 def kills(
     study: Study, expected: Mapping[int, str], update_s: float, count: int, seed: int, echo: Echo
 ) -> ScenarioResult:
-    """`kill -9` of the worker or the whole service, `count` times, at random moments of the capture."""
+    """Kills the worker or the whole service with `kill -9` `count` times, at random moments of the capture."""
     random_ = random.Random(seed)
     moments: dict[int, list[str]] = {}
     while sum(map(len, moments.values())) < count:
@@ -82,7 +82,7 @@ def kills(
 
 
 def _kill_worker(service: Service, scene: str, killed: Counter[int]) -> None:
-    """As soon as there is one (after a death it is away for a moment) and its frame has not had its share of kills."""
+    """Kills the scene's worker as soon as it is at a frame with fewer than the maximum number of kills."""
     until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
         status = service.status(scene)
@@ -100,7 +100,7 @@ def _kill_worker(service: Service, scene: str, killed: Counter[int]) -> None:
 def damaged_log(
     study: Study, expected: Mapping[int, str], cuts: int, flips: int, seed: int, echo: Echo
 ) -> ScenarioResult:
-    """Files of the log cut, or a bit flipped, under a service that is down; then it starts, says so, and goes on.
+    """Truncates log files or flips a bit while the service is down; then it must start, report this and continue.
 
     Half of the frames are committed, the other half wait, as after a kill.
     """
@@ -152,7 +152,7 @@ def damaged_log(
 
 
 def _damage(folder: SceneFolder, kind: str, random_: random.Random, half: int) -> tuple[str, int | None]:
-    """Damages the journal or the record of a frame that waits; says how, and which frame is hit."""
+    """Damages the journal or the record of a waiting frame; returns a description and the affected frame."""
     journal = folder.journal
     taken = {event.index: event for event in read_journal(journal).events if isinstance(event, FrameAccepted)}
     waiting = [index for index in taken if index >= half]
@@ -182,7 +182,7 @@ def _check_damaged(service: Service, scene: str, sender: FrameSender, hit: int |
 
 
 def full_disk(study: Study, expected: Mapping[int, str], echo: Echo) -> ScenarioResult:
-    """No file may grow: first for the service, then for the worker; then there is room again.
+    """Prevents files from growing, first for the service, then for the worker; then makes room again.
 
     The limit on the size of files is set on the running processes (RLIMIT_FSIZE), so that every write fails where a
     full disk would make it fail.
@@ -231,7 +231,7 @@ def _no_room(pid: int) -> Any:
 
 
 def flipped_bits(study: Study, count: int, seed: int, echo: Echo) -> ScenarioResult:
-    """Single bits over everything on disk, with and without a restart (`studies.service.damage`)."""
+    """Flips single bits in all files on disk, with and without a restart (`studies.service.damage`)."""
     longer = replace(study, frames=encoded_frames(study.capture, damage.frames_for(count)))
     flipped = damage.flips(longer, count, seed, echo)
     counts = Counter(kind.rpartition(" ")[2] for kind in flipped.counts.elements())
@@ -258,7 +258,7 @@ def run(
     parts: Sequence[str] = PARTS,
     echo: Echo = print,
 ) -> list[ScenarioResult]:
-    """The scenarios of `parts`.
+    """Runs the scenarios of `parts`.
 
     Args:
         study: what is sent, and where to. moments: kills, and beginnings. cuts, flips: damaged files.

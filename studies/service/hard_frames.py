@@ -1,4 +1,4 @@
-"""The frame cases pushed through a running service: no answer above 499, no dead worker, explained, and recovered.
+"""The frame cases on a running service: no status above 499, no dead worker, every failure explained and recovered.
 
 All cases go into one scene, one after the other with good frames between them; a scene beside it gets the good frames
 alone. What was committed is read from the scenes' folders and held against each other.
@@ -43,7 +43,7 @@ AGAIN_S = 0.05
 
 
 class BackAndForth:
-    """A footage played back and forth without an end."""
+    """A footage that is played back and forth endlessly."""
 
     def __init__(self, footage: AnyFootage) -> None:
         self._footage = footage
@@ -68,7 +68,7 @@ class BackAndForth:
 
 @dataclass
 class ServiceCaseResult:
-    """Result of a case in one size, through the service."""
+    """Result of a case in one size, on the service."""
 
     case: FrameCase
     size: Any
@@ -79,7 +79,7 @@ class ServiceCaseResult:
 
 @dataclass(frozen=True)
 class SentCase:
-    """Frames sent for one case, from an index of the scene on."""
+    """Frames sent for one case, starting at an index of the scene."""
 
     case: FrameCase
     size: Any
@@ -88,7 +88,7 @@ class SentCase:
 
 
 def script(footage: BackAndForth, cases: Sequence[FrameCase]) -> tuple[list[Sent], list[SentCase]]:
-    """All that is sent, and the parts of it that are cases; a jump for good is followed by one back."""
+    """Returns all frames to send, and the ranges that are cases; a permanent jump is followed by one back."""
     sent = [good(footage, index) for index in range(AT)]
     parts: list[SentCase] = []
     for case in cases:
@@ -108,7 +108,7 @@ def script(footage: BackAndForth, cases: Sequence[FrameCase]) -> tuple[list[Sent
 def study(
     footage: AnyFootage, folder: Path, names: Sequence[str] = (), echo: Echo = print
 ) -> tuple[list[ServiceCaseResult], list[str]]:
-    """Runs the cases whose name holds one of ``names``, or all.
+    """Runs the cases whose name contains one of ``names``, or all.
 
     Returns:
         Each case, and what went wrong with the service itself.
@@ -146,18 +146,18 @@ class Pushed:
     count: int
 
     def state(self, index: int) -> Gaussians:
-        """Of a frame."""
+        """Returns the report of a frame."""
         return self.committed.history.gaussians(index)
 
     def report(self, index: int) -> FrameReport:
-        """Of a frame, as it was committed."""
+        """Returns the committed state of a frame."""
         record = self.committed.history.report(index)
         known = {item.name: record[item.name] for item in fields(FrameReport) if item.name in record}
         alarms = [Alarm(AlarmKind(one["kind"]), one["camera"], one["evidence"]) for one in known.pop("alarms", [])]
         return FrameReport(**{**known, "outcome": FrameOutcome(record["outcome"]), "alarms": alarms})
 
     def psnr(self, footage: AnyFootage, index: int, truth: Pictures) -> float:
-        """DB of the held-out cameras."""
+        """Returns the PSNR in dB of the held-out cameras."""
         return float(
             np.mean(
                 [psnr(self.committed.render(camera, index).colour, truth[camera.name]) for camera in footage.held_out]
@@ -166,7 +166,7 @@ class Pushed:
 
 
 def _push(service: Service, footage: AnyFootage, sent: Sequence[Sent], echo: Echo) -> tuple[Pushed, list[str]]:
-    """Frames pushed into a new scene, one after the other; and what went wrong on the way."""
+    """Sends frames to a new scene one after the other; returns the scene and any errors."""
     faults: list[str] = []
     scene = service.create(
         footage.rig,
@@ -205,7 +205,7 @@ def _push(service: Service, footage: AnyFootage, sent: Sequence[Sent], echo: Ech
 def _send(
     service: Service, scene: str, index: int, whole: bool, images: dict[str, bytes], masks: dict[str, bytes]
 ) -> httpx.Response:
-    """A frame of all cameras, or what there is of one camera by camera; the first answer that is no success."""
+    """Sends a frame with all cameras, or each available camera; returns the first answer that is not successful."""
     if whole:
         return service.put(scene, index, images, masks)
     address = f"/v1/scenes/{scene}/frames/{index}"
@@ -218,7 +218,7 @@ def _send(
 
 
 def encoded(frame: Frame) -> tuple[dict[str, bytes], dict[str, bytes]]:
-    """Its pictures and masks as PNG files."""
+    """Encodes a frame's pictures and masks as PNG."""
     images = {name: _png(np.asarray(frame.images[name])) for name in frame.images}
     return images, {name: _png(255 * np.asarray(frame.masks[name])) for name in frame.masks}
 
@@ -230,7 +230,7 @@ def _png(picture: NDArray[np.uint8]) -> bytes:
 
 
 def _result(part: SentCase, scene: Pushed, usual: Pushed, footage: AnyFootage) -> ServiceCaseResult:
-    """The frames of one case, against the same of the undisturbed scene."""
+    """Compares the frames of one case with those of the undisturbed scene."""
     steps = []
     for number, sent in enumerate(part.sent):
         index = part.first + number
@@ -259,7 +259,7 @@ def _result(part: SentCase, scene: Pushed, usual: Pushed, footage: AnyFootage) -
 
 
 def table(lines: Sequence[ServiceCaseResult]) -> str:
-    """As Markdown."""
+    """Formats the results as Markdown."""
     rows = ["| case | size | the reports say | dB, last frame | holds |", "|" + "---|" * 5]
     for line in lines:
         verdict = "yes" if not line.violations else f"**no**: {'; '.join(line.violations)}"

@@ -1,4 +1,4 @@
-"""Rate of ingest over the loopback, against plain fsynced writes of the same records.
+"""Ingest rate over the loopback interface, compared with plain fsynced writes of the same records.
 
 All in one run and in turns, because a disk's speed drifts and what follows heavy writing pays for it: a record is the
 encoded pictures of one frame. The scene is paused, so that ingest alone is measured: receive, check each picture's
@@ -32,19 +32,19 @@ UNANSWERED = 2
 
 @dataclass(frozen=True)
 class IngestTimes:
-    """Megabytes a second of plain writes, over HTTP and over a WebSocket, one number a round."""
+    """Megabytes per second of plain writes, over HTTP and over a WebSocket, one value per round."""
 
     plain: list[float]
     ingest: list[float]
     socket: list[float]
 
     def share(self, ingest: Sequence[float]) -> float:
-        """Median of the rounds' ratios."""
+        """Median of the ratios of all rounds."""
         return statistics.median(took / plain for took, plain in zip(ingest, self.plain, strict=True))
 
 
 def jpeg(size_bytes: int, seed: int, side: int = 1024) -> bytes:
-    """A JPEG of noise of about so many bytes: its quality is searched, the rest is a comment."""
+    """Creates a noise JPEG of a given size: its quality is searched, and a comment fills the rest."""
     rng = np.random.default_rng(seed)
     picture = Image.fromarray(rng.integers(0, 256, (side, side, 3), dtype=np.uint8))
     best = b""
@@ -63,7 +63,7 @@ def jpeg(size_bytes: int, seed: int, side: int = 1024) -> bytes:
 
 
 def noise_rig(cameras: int, side: int = 1024) -> Rig:
-    """Cameras that look at nothing, side by side."""
+    """Creates placeholder cameras in a row."""
     k = np.array([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1.0]])
     placed_cameras = []
     for number in range(cameras):
@@ -74,7 +74,7 @@ def noise_rig(cameras: int, side: int = 1024) -> Rig:
 
 
 def measure(folder: Path, *, frames: int, cameras: int, size_bytes: int, rounds: int, senders: int) -> IngestTimes:
-    """Sends `frames` frames a round and writes the same bytes plainly, in turns."""
+    """Sends `frames` frames per round and writes the same bytes to plain files, in alternation."""
     rig = noise_rig(cameras)
     pictures = [jpeg(size_bytes, seed) for seed in range(cameras)]
     records = [{name: pictures[(k + turn) % cameras] for k, name in enumerate(rig.names)} for turn in range(2)]
@@ -110,9 +110,7 @@ def measure(folder: Path, *, frames: int, cameras: int, size_bytes: int, rounds:
 
 
 def _plain(folder: Path, bodies: Sequence[bytes], frames: int, first: int) -> float:
-    """Seconds to write each record to a new file and sync it. The files stay, as the frame log's do: a disk may be
-    several times faster where it writes again what was just deleted.
-    """
+    """Returns the seconds for writing and syncing each record to a new file; files are kept, since reuse is faster."""
     folder.mkdir(exist_ok=True)
     began = time.perf_counter()
     for number in range(first, first + frames):
@@ -128,7 +126,7 @@ def _plain(folder: Path, bodies: Sequence[bytes], frames: int, first: int) -> fl
 def _ingest(
     service: Service, scene: str, records: Sequence[dict[str, bytes]], first: int, frames: int, senders: int
 ) -> float:
-    """Seconds until all frames are acknowledged, sent in turn over so many connections."""
+    """Returns the seconds until all frames are acknowledged, sent over several connections in rotation."""
     connections = [http.client.HTTPConnection("127.0.0.1", service.port) for _ in range(senders)]
     faults: list[str] = []
 
@@ -162,7 +160,7 @@ def _ingest(
 
 
 def _socket(service: Service, scene: str, records: Sequence[dict[str, bytes]], first: int, frames: int) -> float:
-    """The same over one WebSocket, `UNANSWERED` messages on their way at most."""
+    """Returns the seconds over one WebSocket, with at most `UNANSWERED` messages in flight."""
     faults: list[str] = []
     room = threading.Semaphore(UNANSWERED)
 
@@ -189,7 +187,7 @@ def _socket(service: Service, scene: str, records: Sequence[dict[str, bytes]], f
 
 
 def page(measured: IngestTimes, *, frames: int, cameras: int, size_bytes: int, senders: int) -> str:
-    """As Markdown."""
+    """Formats the rates as Markdown."""
     shares = [f"{100 * measured.share(took):.0f} %" for took in (measured.ingest, measured.socket)]
     rows = "\n".join(
         f"| {number + 1} | {plain:.0f} | {ingest:.0f} | {100 * ingest / plain:.0f} % "

@@ -1,4 +1,4 @@
-"""Measures the peak memory of a reconstruction against the estimate of the service (server/health/estimate.py).
+"""Peak memory of a reconstruction compared with the service's estimate (server/health/estimate.py).
 
 Frame 0 and two updates of a ball in the middle of a ring of cameras, in few iterations: memory does not depend on them.
 And memory of a service whose scenes all sleep, with the time of their listing and of a first view.
@@ -29,7 +29,7 @@ from studies.running.process import Service
 
 
 def ring(count: int, size: int) -> Rig:
-    """Cameras around the origin, 2 m away."""
+    """Creates cameras around the origin, at a distance of 2 m."""
     lens = np.array([[1.2 * size, 0, size / 2], [0, 1.2 * size, size / 2], [0, 0, 1]])
     cameras = []
     for k in range(count):
@@ -42,7 +42,7 @@ def ring(count: int, size: int) -> Rig:
 
 
 def frame(rig: Rig, size: int, index: int, masked: bool) -> Frame:
-    """A ball that moves by a pixel a frame."""
+    """Creates a ball that moves by one pixel per frame."""
     rows, columns = np.mgrid[:size, :size]
     ball = np.hypot(rows - size / 2, columns - size / 2 - index) < 0.24 * size
     picture = np.zeros((size, size, 3), np.uint8)
@@ -52,7 +52,7 @@ def frame(rig: Rig, size: int, index: int, masked: bool) -> Frame:
 
 
 def measure(cameras: int, size: int, gaussians: int, scale: float, masks: bool) -> dict[str, float]:
-    """Reconstructs, and compares: MB at the peak and as estimated, their ratio, and the Gaussians kept."""
+    """Reconstructs and returns measured and estimated peak MB, their ratio, and the number of Gaussians."""
     from scas4d_core.reconstruction import Reconstruction
     from scas4d_core.warm_up import compile_in_processes
 
@@ -76,7 +76,7 @@ def measure(cameras: int, size: int, gaussians: int, scale: float, masks: bool) 
 
 
 def sleeping(scene: Path, count: int, views: int, work: Path) -> dict[str, float]:
-    """Copies a scene's folder, starts a service over the copies, which sleep, and asks for views of some.
+    """Copies a scene's folder, starts a service on the sleeping copies, and requests views of some.
 
     Args:
         scene: folder of a scene with committed frames, in the data folder of a service that has ended.

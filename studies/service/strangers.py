@@ -1,4 +1,4 @@
-"""Cost of strangers without a token: `/health/live`, memory and updates with an attack and without, in turns.
+"""Cost of clients without a token: `/health/live`, memory and updates with and without an attack, in alternation.
 
 The attack is `studies.service.attack`, in a process of its own; a service runs with a token and one without. The scene
 goes on updating all the time, in the turns with the attack until its last connection is closed.
@@ -35,7 +35,7 @@ WARM_UP = 3
 
 @dataclass(frozen=True)
 class Attack:
-    """Size of an attack: bytes of one endless header, half-sent headers, hanging uploads."""
+    """Size of an attack: bytes of an endless header, incomplete headers, hanging uploads."""
 
     header: int = 300_000_000
     halves: int = 300
@@ -44,7 +44,7 @@ class Attack:
 
 @dataclass
 class AttackTimes:
-    """Measurements of all turns without the attack, or with it.
+    """Measurements of all rounds, with or without the attack.
 
     Attributes:
         health: ms of each answer of `/health/live`. lost: questions without an answer of 200. memory: largest MB of the
@@ -57,12 +57,12 @@ class AttackTimes:
     updates: list[float] = field(default_factory=list)
 
     def p(self, percent: float) -> float:
-        """Percentile of the health check, ms."""
+        """Percentile of the health check, in ms."""
         return float(np.percentile(self.health, percent))
 
 
 class Watch:
-    """Asks `/health/live` and reads the service's memory, from a thread, while the block runs."""
+    """Polls `/health/live` and the service's memory in a thread while the block runs."""
 
     def __init__(self, service: Service, side: AttackTimes) -> None:
         self._service, self._side = service, side
@@ -95,7 +95,7 @@ class Watch:
 
 
 def strangers(study: Study, attack: Attack, *, turns: int, seconds: float, token: bool, echo: Echo) -> ScenarioResult:
-    """The attack on one service.
+    """Runs the attack on one service.
 
     Args:
         study: frames and settings of the scene. attack: how much. turns: without and with the attack.
@@ -142,7 +142,7 @@ def _start(port: int, path: str, attack: Attack) -> subprocess.Popen[bytes]:
 def compare(
     attack: Attack, without: AttackTimes, attacked: AttackTimes, closed: float, left: int, *, token: bool
 ) -> ScenarioResult:
-    """The row of the table.
+    """Returns the row of the table.
 
     Args:
         closed: seconds until the last connection was closed. left: connections that were not.

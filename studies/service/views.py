@@ -1,4 +1,4 @@
-"""Live views beside updates, each slowed by the other: a scene under an open-loop load of renders.
+"""Live views during updates: a scene under an open-loop load of renders, and how each slows the other.
 
 A service runs in a process of its own. For each rate: views while nothing is updated, updates while nobody looks, and
 both together, in turns, because a machine's speed drifts. Arrivals are at fixed times whatever came of the requests
@@ -53,17 +53,17 @@ class ViewTimes:
 
     @property
     def latency(self) -> float:
-        """Median during updates over the median without."""
+        """Ratio of the median during updates to the median without."""
         return statistics.median(self.loaded) / statistics.median(self.idle)
 
     @property
     def slower(self) -> float:
-        """Share by which the median update takes longer under load."""
+        """Fraction by which the median update is slower under load."""
         return statistics.median(self.together) / statistics.median(self.alone) - 1
 
 
 class Load:
-    """Views at a rate, from a thread, until it is stopped."""
+    """Requests views at a fixed rate in a thread until it is stopped."""
 
     def __init__(self, url: str, cameras: Sequence[str], rate: float, width: int) -> None:
         self.latencies: list[float] = []
@@ -164,7 +164,7 @@ def measure(
 
 
 def line(row: ViewTimes) -> str:
-    """One row of the table."""
+    """Formats one row of the table."""
     cells = [
         f"{row.rate:g}",
         *(f"{statistics.median(times):.0f} ({np.percentile(times, 95):.0f})" for times in (row.idle, row.loaded)),
@@ -178,7 +178,7 @@ def line(row: ViewTimes) -> str:
 
 
 def table(rows: Sequence[ViewTimes]) -> str:
-    """As Markdown, with the target."""
+    """Formats the results as Markdown, with the target."""
     head = [
         "| views a second | idle, ms (95 %) | during updates, ms (95 %) | ratio | update alone, s | under views, s | "
         "slower | no answer |",
@@ -197,7 +197,7 @@ def table(rows: Sequence[ViewTimes]) -> str:
 
 
 def page(rows: Sequence[ViewTimes], capture: str, width: int, updates: int, turns: int) -> str:
-    """The table with what it was measured on."""
+    """Returns the table with the machine and sources that it was measured on."""
     day = datetime.now(UTC).date().isoformat()
     return (
         f"Measured {day} on {in_words(machine())}: `{capture}`, views {width} pixels wide as JPEG, every camera of the "

@@ -1,4 +1,4 @@
-"""The virtual clock: an event loop whose time jumps to the next timer, and that runs blocking functions at once."""
+"""Virtual clock: an event loop whose time jumps to the next timer, and that runs blocking functions immediately."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ Arguments = TypeVarTuple("Arguments")
 
 
 class StandstillError(RuntimeError):
-    """Every task waits, and no timer is left that could wake one."""
+    """Raised if every task waits and there is no timer that could wake one."""
 
 
 class _Jump(selectors.SelectSelector):
-    """Waits no time for files: it moves the clock on by as long as the loop would have waited."""
+    """A selector that never waits for files, but advances the clock by the requested waiting time."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -30,7 +30,7 @@ class _Jump(selectors.SelectSelector):
 
 
 class VirtualLoop(asyncio.SelectorEventLoop):
-    """Runs what is ready, then jumps to the next timer. Without threads and sockets: the same calls, the same order.
+    """An event loop that runs ready tasks, then jumps to the next timer; deterministic, without threads.
 
     Example:
         >>> async def hour() -> float:
@@ -45,11 +45,11 @@ class VirtualLoop(asyncio.SelectorEventLoop):
         super().__init__(self._jump)
 
     def time(self) -> float:
-        """Virtual seconds since the loop was made."""
+        """Returns the virtual seconds since the loop was created."""
         return self._jump.now
 
     def run_in_executor(self, executor: Any, func: Callable[[*Arguments], T], *args: *Arguments) -> asyncio.Future[T]:
-        """Runs the function now, in this thread; it takes no virtual time."""
+        """Runs the function immediately in this thread; it takes no virtual time."""
         future: asyncio.Future[T] = self.create_future()
         try:
             future.set_result(func(*args))
@@ -59,6 +59,6 @@ class VirtualLoop(asyncio.SelectorEventLoop):
 
 
 def run_virtual(main: Coroutine[Any, Any, T]) -> T:
-    """Runs a coroutine by a clock of its own, from 0 s on."""
+    """Runs a coroutine on its own virtual clock, starting at 0 s."""
     with asyncio.Runner(loop_factory=VirtualLoop) as runner:
         return runner.run(main)

@@ -1,4 +1,4 @@
-"""Ray as the service meets it: a queue, a head that places and notices, nodes that fail and come back."""
+"""Ray from the service's point of view: a queue, a head that places and detects, and nodes that fail and return."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from studies.simulation.nodes import Capacity, Node, NodeState, Placed
 
 
 class SimulatedCluster:
-    """Places processes on nodes with room, the longest waiting first among those for which there is room.
+    """Places processes on nodes with room, in the order of waiting time among those that fit.
 
     Args:
         count: of nodes. cpus, memory: of each. kinds: of needs. random: draws delays and nodes.
@@ -39,23 +39,23 @@ class SimulatedCluster:
             self.join()
 
     def later(self, delay: Range | float, call: Callable[[], None]) -> asyncio.TimerHandle:
-        """Calls after so many seconds."""
+        """Calls a function after a delay in seconds."""
         return self.loop.call_later(self.random.uniform(*delay) if isinstance(delay, tuple) else delay, call)
 
     def running(self) -> list[Node]:
-        """Nodes that run and that Ray counts with."""
+        """Returns the nodes that run and that Ray knows."""
         return [node for node in self.nodes if node.listed and node.state is NodeState.RUNNING]
 
     # Places.
 
     def queue(self, process: Placed) -> None:
-        """Asks for a place."""
+        """Requests a place for a process."""
         self._queued += 1
         self._queues[self.capacity.kind(process.needs)].append((self._queued, process))
         self._wake()
 
     def give(self, node: Node, process: Placed) -> None:
-        """Takes a process off its node."""
+        """Removes a process from its node."""
         if node.give(process):
             self._changed(node)
 
@@ -69,7 +69,7 @@ class SimulatedCluster:
             self.later(1 / PLACED_PER_S, self._serve)
 
     def _first(self) -> int | None:
-        """The kind of the process that is next."""
+        """Returns the kind of the next process to place."""
         best: tuple[int, int] | None = None
         for kind, queue in enumerate(self._queues):
             while queue and not queue[0][1].queued:  # it was given up meanwhile
@@ -99,33 +99,33 @@ class SimulatedCluster:
     # Failures.
 
     def join(self) -> None:
-        """A new node parents."""
+        """Adds a new node."""
         node = Node(self._made, self._cpus, self._memory)
         self._made += 1
         self.nodes.append(node)
         self._changed(node)
 
     def kill(self, node: Node) -> None:
-        """Ends a node with all that runs on it; a new one parents after a while."""
+        """Ends a node with all its processes; a new one joins after a delay."""
         self._fails(node, NodeState.DEAD)
         for process in tuple(node.processes):
             process.kill()
         self.later(REPLACED_S, self.join)
 
     def stop(self, node: Node, seconds: float) -> None:
-        """Stops a node for so long; its workers stand still."""
+        """Stops a node for a while, and its workers with it."""
         self._fails(node, NodeState.STOPPED)
         for process in tuple(node.processes):
             process.pause()
         self.later(seconds, lambda: self._back(node))
 
     def cut(self, node: Node, seconds: float) -> None:
-        """Cuts a node off for so long; its workers go on."""
+        """Disconnects a node for a while; its workers continue."""
         self._fails(node, NodeState.CUT)
         self.later(seconds, lambda: self._back(node))
 
     def head_down(self, seconds: float) -> None:
-        """The head places nothing and notices nothing for so long."""
+        """Suspends placement and failure detection of the head for a while."""
         self.answers = False
         self.capacity.head(False)
         self.later(seconds, self._head_back)
@@ -136,7 +136,7 @@ class SimulatedCluster:
         self._check(node)
 
     def _check(self, node: Node) -> None:
-        """The health checks of a node that does not answer."""
+        """Runs the health checks of a node that does not respond."""
         failed_at = node.failed_at
         self.later(NOTICED_S, lambda: self._notice(node, failed_at))
 

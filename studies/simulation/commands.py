@@ -1,4 +1,4 @@
-"""`scripts/bench simulate`."""
+"""The command `scripts/bench simulate`."""
 
 from __future__ import annotations
 

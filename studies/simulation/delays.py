@@ -1,4 +1,4 @@
-"""Delays and sizes of the model, each with its source; a pair of seconds is drawn from evenly."""
+"""Delays and sizes of the model, with sources; a pair of seconds is the range of a uniform distribution."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Failures at random moments: of nodes, of workers, of the service and of the cluster's head."""
+"""Random failures of nodes, of workers, of the service and of the cluster's head."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ AGAIN_S = 5.0
 
 
 class Failure(StrEnum):
-    """A thing that fails, in words."""
+    """A component that can fail, in words."""
 
     KILLED = "a node killed"
     STOPPED = "a node stopped and continued"
@@ -39,7 +39,7 @@ LEAST = 2
 
 
 def drawn(total: int, begin: float, end: float, random: Random) -> list[tuple[float, Failure]]:
-    """Draws failures by their shares, at moments spread evenly; nodes are killed in what is left of the total.
+    """Draws failures by their shares at uniformly distributed times; node kills make up the rest of the total.
 
     >>> found = drawn(60, 0, 10, Random(0))
     >>> len(found), sum(failure is Failure.SERVICE for _, failure in found)
@@ -52,7 +52,7 @@ def drawn(total: int, begin: float, end: float, random: Random) -> list[tuple[fl
 
 
 class Failures:
-    """Lets them happen.
+    """Executes the failures.
 
     Args:
         silent: the head does not answer for so long.
@@ -67,7 +67,7 @@ class Failures:
         self._restart: asyncio.Task[None] | None = None
 
     def plan(self, moments: list[tuple[float, Failure]]) -> None:
-        """Sets them up."""
+        """Schedules the failures."""
         for when, failure in moments:
             self._cluster.loop.call_at(when, self._happen, failure)
 

@@ -11,7 +11,7 @@ from server.cluster.resource_needs import ResourceNeeds
 
 
 class NodeState(Enum):
-    """The truth about a node, which Ray learns later."""
+    """The actual state of a node, which Ray learns with a delay."""
 
     RUNNING = auto()
     STOPPED = auto()
@@ -22,33 +22,33 @@ class NodeState(Enum):
 
 
 class Placed(Protocol):
-    """A process as its node sees it."""
+    """A process from the point of view of its node."""
 
     needs: ResourceNeeds
 
     @property
     def queued(self) -> bool:
-        """True while it waits for its place."""
+        """Whether the process waits for a place."""
 
     def place(self, node: Node) -> None:
-        """Ray has chosen the node."""
+        """Called when Ray has chosen the node."""
 
     def pause(self) -> None:
-        """The node is stopped."""
+        """Called when the node is stopped."""
 
     def resume(self) -> None:
-        """The node is continued."""
+        """Called when the node is continued."""
 
     def kill(self) -> None:
-        """The node has ended."""
+        """Called when the node has ended."""
 
     def lost(self) -> None:
-        """Ray takes the node for lost."""
+        """Called when Ray considers the node lost."""
 
 
 @dataclass(eq=False)
 class Node:
-    """One machine.
+    """A machine of the cluster.
 
     Attributes:
         cpus, memory: of it, bytes. listed: Ray counts with it. failed_at: when it last fell silent, seconds.
@@ -68,21 +68,21 @@ class Node:
         self.free_cpus, self.free_memory = self.cpus, self.memory
 
     def fits(self, needs: ResourceNeeds) -> bool:
-        """True where there is room for a process."""
+        """Returns whether there is room for a process."""
         return self.free_cpus >= needs.cpus and self.free_memory >= needs.memory
 
     def load(self) -> float:
-        """Share of the node that is taken, of whichever is scarcer."""
+        """Share of the node's scarcest resource that is in use."""
         return max(1 - self.free_cpus / self.cpus, 1 - self.free_memory / self.memory)
 
     def take(self, process: Placed) -> None:
-        """Counts a process."""
+        """Reserves the resources of a process."""
         self.processes[process] = None
         self.free_cpus -= process.needs.cpus
         self.free_memory -= process.needs.memory
 
     def give(self, process: Placed) -> bool:
-        """Counts a process no more; False where it was not here."""
+        """Releases the resources of a process; returns False if it was not on this node."""
         if process not in self.processes:
             return False
         del self.processes[process]
@@ -92,7 +92,7 @@ class Node:
 
 
 class Capacity:
-    """Seconds during which a node that runs and can be reached had room, by kind of needs.
+    """Seconds during which a running, reachable node had room, per kind of resource needs.
 
     Args:
         kinds: of needs. now: the clock.
@@ -113,17 +113,17 @@ class Capacity:
         self._seconds = [[0.0, 0.0] for _ in kinds]
 
     def kind(self, needs: ResourceNeeds) -> int:
-        """The kind of a process's needs."""
+        """Returns the kind of a process's resource needs."""
         return self._numbers[needs.cpus, needs.memory]
 
     def seconds(self, kind: int) -> tuple[float, float]:
-        """Seconds with room so far, and those of them in which the head answered."""
+        """Returns the seconds with room so far, and the part in which the head responded."""
         self._count(kind)
         total, answered = self._seconds[kind]
         return total, answered
 
     def changed(self, node: Node) -> None:
-        """Looks at a node again."""
+        """Re-evaluates a node."""
         none = [False] * len(self.kinds)
         listed_before, usable_before = self._seen.get(node, (none, none))
         fits = [node.fits(needs) for needs in self.kinds]
@@ -139,7 +139,7 @@ class Capacity:
             del self._seen[node]
 
     def head(self, answers: bool) -> None:
-        """Notes that the head answers, or does not."""
+        """Records whether the head responds."""
         for kind in range(len(self.kinds)):
             self._count(kind)
         self._answers = answers

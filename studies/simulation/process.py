@@ -1,4 +1,4 @@
-"""The placement of the simulation: its processes wait in a queue, run on a node, and send messages that take time."""
+"""Placement of the simulation: its processes wait in a queue, run on a node, and send messages with a delay."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from studies.simulation.work import Work
 
 
 class SimulatedProcess:
-    """A worker process, as `RayProcess` describes one: nothing of it reaches the service once its end was reported.
+    """A worker process as described by `RayProcess`: after its end was reported, nothing of it reaches the service.
 
     Attributes:
         over: the service has given it up, or has ended. work: None before it has a place, and when it has ended.
@@ -56,7 +56,7 @@ class SimulatedProcess:
 
     @property
     def queued(self) -> bool:
-        """True while it waits for its place."""
+        """Whether the process waits for a place."""
         return self.node is None and not self.over
 
     # Of the service.
@@ -75,7 +75,7 @@ class SimulatedProcess:
             self._finish()
 
     def abandon(self) -> None:
-        """The service has ended: the actor ends, later, and where its node is stopped once it goes on."""
+        """Handles the end of the service: the actor ends later; on a stopped node, after it continues."""
         self._let_go()
         if self.work is not None:
             self.work.drift()
@@ -89,27 +89,27 @@ class SimulatedProcess:
     # Of the node.
 
     def place(self, node: Node) -> None:
-        """Ray has chosen the node; one that is silent, and not known to be, does not start it."""
+        """Starts on the node that Ray has chosen, as soon as the node can be reached."""
         self.node = node
         self._reach(self._begin)
 
     def pause(self) -> None:
-        """The node is stopped."""
+        """Pauses with its stopped node."""
         if self.work is not None:
             self.work.pause()
 
     def resume(self) -> None:
-        """The node is continued."""
+        """Resumes with its node."""
         if self.work is not None:
             self.work.resume()
 
     def kill(self) -> None:
-        """The node has ended; Ray counts with it until it notices."""
+        """Ends with its node, before Ray detects it."""
         if self.work is not None:
             self.work.end()
 
     def lost(self) -> None:
-        """Ray takes the node for lost."""
+        """Handles that Ray considers the node lost."""
         assert self.node is not None
         if self.work is not None:
             self.work.drift()
@@ -120,7 +120,7 @@ class SimulatedProcess:
             self._cluster.later(TOLD_S, lambda: self._tell_end(ProcessExit(None, why, lost=began)))
 
     def die(self) -> None:
-        """The worker is killed; its node goes on."""
+        """Kills the worker; its node continues."""
         assert self.work is not None
         self.work.end()
         self._times.hit(self.needs.scene, "worker", self._cluster.loop.time(), self._kind)
@@ -137,7 +137,7 @@ class SimulatedProcess:
         self.work = Work(self._cluster, frames, scene, folder, self._number, longest, self._say, self._gone)
 
     def _gone(self) -> None:
-        """The worker has ended by itself."""
+        """Handles that the worker has ended by itself."""
         assert self.node is not None
         if self.over:
             self._cluster.give(self.node, self)
@@ -145,7 +145,7 @@ class SimulatedProcess:
             self._last_message = self._pass(lambda: self._tell_end(ProcessExit(-signal.SIGKILL)), self._last_message)
 
     def _finish(self) -> None:
-        """Ends on its node, as soon as that can be reached."""
+        """Ends the worker on its node, as soon as the node can be reached."""
         assert self.node is not None
         if self.node.state in (NodeState.STOPPED, NodeState.CUT) and self.node.listed:
             self.node.held.append(self._finish)
@@ -164,7 +164,7 @@ class SimulatedProcess:
             self._on_message(message)
 
     def _pass(self, call: Callable[[], None], after: float) -> float:
-        """Calls over the network, after what was sent before; returns when."""
+        """Makes a call over the network, after all earlier messages; returns its time."""
         loop = self._cluster.loop
         due = max(after, loop.time() + self._cluster.random.uniform(*MESSAGE_S))
         loop.call_at(due, self._reach, call)
@@ -190,7 +190,7 @@ class SimulatedProcess:
 
 
 class SimulatedPlacement(Placement):
-    """Starts workers on the modelled cluster, for one service; the next one has another.
+    """Starts workers on the modelled cluster for one service instance.
 
     Args:
         needs: of a scene's worker. between_s: seconds between the frames of a scene.
@@ -231,11 +231,11 @@ class SimulatedPlacement(Placement):
         task.add_done_callback(self._endings.discard)
 
     def drop(self, process: SimulatedProcess) -> None:
-        """Forgets a process that is over."""
+        """Forgets a process that has ended."""
         self.processes.get(process.needs.scene, {}).pop(process, None)
 
     def working(self) -> list[SimulatedProcess]:
-        """Processes at work on nodes that run, which the service has not given up."""
+        """Returns the processes on running nodes that the service has not given up."""
         return [
             process
             for node in self.simulated.running()
@@ -244,7 +244,7 @@ class SimulatedPlacement(Placement):
         ]
 
     def abandon(self) -> None:
-        """The service ends."""
+        """Ends all processes with the service."""
         for processes in tuple(self.processes.values()):
             for process in tuple(processes):
                 process.abandon()

@@ -1,4 +1,4 @@
-"""The record of a simulation: frames acknowledged, committed and reported; times of places and of failures got over.
+"""Record of a simulation: frames acknowledged, committed and reported; times of placement and of recovery.
 
 A frame is **run twice** if the service knew of one worker's commit of it (`FrameCommitted` or `Ready` of the scene's
 worker, or found by a new service; from then on clients see it), and another worker's commit was reported after it,
@@ -22,10 +22,10 @@ from studies.simulation.nodes import Capacity
 
 
 class Hurried(Protocol):
-    """The work of a worker that runs."""
+    """The work of a running worker."""
 
     def hurry(self) -> None:
-        """Commits now."""
+        """Commits the next frame immediately."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class FoundFrame:
 
 @dataclass(frozen=True)
 class FrameCounts:
-    """Frames found at the end. All but `read` and `again` must be 0.
+    """Counts of frames at the end. All except `read` and `again` must be 0.
 
     Attributes:
         read: through the links. lost: acknowledged, and not read. foreign: read, and written by a worker that was given
@@ -57,7 +57,7 @@ class FrameCounts:
 
 
 class FrameRecord:
-    """By scene.
+    """Frames of each scene.
 
     Attributes:
         acknowledged: number of frames, on the service's disk. works: of workers that run, given up or not.
@@ -77,7 +77,7 @@ class FrameRecord:
         self._twice: dict[str, set[int]] = {}
 
     def start(self, scene: str, beside: bool) -> int:
-        """A worker is started; returns its number. `beside`: another one of the scene has not been given up."""
+        """Registers a started worker; returns its number. `beside`: whether the scene's previous one is active."""
         self.workers += 1
         self._newest[scene] = self.workers
         self._beside += beside
@@ -85,28 +85,28 @@ class FrameRecord:
 
     @property
     def adrift(self) -> int:
-        """Files that workers wrote after they were given up."""
+        """Returns the number of files that workers wrote after they were given up."""
         return len(self._adrift)
 
     def write(self, scene: str, worker: int) -> int:
-        """A worker writes a file; returns its number, which goes into the file."""
+        """Registers a write of a worker; returns its number, which is stored in the file."""
         self._writes += 1
         if worker != self._newest[scene]:
             self._adrift.add(self._writes)
         return self._writes
 
     def wrote(self, scene: str, index: int, worker: int) -> None:
-        """The file of a frame is written."""
+        """Records that the file of a frame is written."""
         if worker == self._newest[scene]:
             self._kept.setdefault(scene, {})[index, worker] = None
 
     def report(self, scene: str, index: int, worker: int) -> None:
-        """The service learns that a frame is committed."""
+        """Records that the service was informed of a committed frame."""
         if self._reported.setdefault(scene, {}).setdefault(index, worker) != worker:
             self._twice.setdefault(scene, set()).add(index)
 
     def untold(self, scene: str, count: int) -> list[int]:
-        """Returns those of the first `count` frames, which are committed, that the service did not know of."""
+        """Returns the committed ones of the first `count` frames that the service did not know."""
         reported = self._reported.setdefault(scene, {})
         if gone := {index for index in reported if index >= count}:
             self._twice.setdefault(scene, set()).update(gone)
@@ -135,14 +135,14 @@ class FrameRecord:
         )
 
     def total(self, counts: Sequence[FrameCounts]) -> FrameCounts:
-        """Adds scenes up."""
+        """Sums the counts of all scenes."""
         names = [name for name in FrameCounts.__dataclass_fields__ if name != "beside"]
         return FrameCounts(beside=self._beside, **{name: sum(getattr(one, name) for one in counts) for name in names})
 
 
 @dataclass
 class TimeRecord:
-    """By scene.
+    """Placement and recovery times of each scene.
 
     Attributes:
         placed: seconds with room until a worker had a place, by the reason for which it was wanted; and those of them
@@ -166,24 +166,24 @@ class TimeRecord:
 
     @property
     def waiting(self) -> int:
-        """Workers that have no place."""
+        """Returns the number of workers without a place."""
         return len(self._wanted)
 
     def want(self, scene: str, reason: str, kind: int) -> None:
-        """A worker is wanted, unless it was before."""
+        """Records that a worker is needed, unless that is already recorded."""
         self._wanted.setdefault(scene, (reason, *self.capacity.seconds(kind)))
 
     def ask(self, scene: str) -> None:
-        """The service has asked for a place."""
+        """Records that the service has requested a place."""
         self._asked[scene] = self.now()
         self._explained.discard(scene)
 
     def explain(self, scene: str) -> None:
-        """The scene was notified that no node has room."""
+        """Records that the scene was informed that no node has room."""
         self._explained.add(scene)
 
     def place(self, scene: str, kind: int) -> None:
-        """The scene's worker has a place on a node that runs."""
+        """Records that the scene's worker has a place on a running node."""
         if (wanted := self._wanted.pop(scene, None)) is None:
             return
         reason, *before = wanted
@@ -194,21 +194,21 @@ class TimeRecord:
             self.unexplained += scene not in self._explained
 
     def forget(self) -> None:
-        """Nobody wants workers: there is no service."""
+        """Drops all requests, because there is no service."""
         self._wanted.clear()
 
     def drop(self, scene: str) -> None:
-        """The scene has ended."""
+        """Removes a scene that has ended."""
         self._wanted.pop(scene, None)
         self._hit.pop(scene, None)
 
     def hit(self, scene: str, failure: str, at: float, kind: int) -> None:
-        """A failure has hit the scene, at a moment that may be past; one that it has not got over counts on."""
+        """Records a failure of the scene, at a time that may be past; an earlier unresolved failure has priority."""
         without = self.now() - self.capacity.seconds(kind)[0]
         self._hit.setdefault(scene, (failure, at, without))
 
     def resume(self, scene: str, kind: int) -> None:
-        """The scene goes on."""
+        """Records that the scene continues after a failure."""
         if (hit := self._hit.pop(scene, None)) is not None:
             failure, at, before = hit
             without = self.now() - self.capacity.seconds(kind)[0] - before
@@ -216,5 +216,5 @@ class TimeRecord:
 
 
 def left_over(folder: Path) -> int:
-    """Folders of epochs, whole or not, that a scene's folder has beside the one that is read."""
+    """Returns the number of epoch folders of a scene, complete or not, in addition to the current one."""
     return sum(name.startswith("states.") for name in os.listdir(folder)) - 1

@@ -1,4 +1,4 @@
-"""A scene of the simulated service: acknowledges frames, gives the worker one at a time, counts the reports."""
+"""A scene of the simulated service: acknowledges frames, gives the worker one at a time, and counts the reports."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from studies.simulation.work import frame_file, listed, read_frame
 
 @dataclass(frozen=True, eq=False)
 class ScenePlan:
-    """The wishes of a user for a scene.
+    """The requests of a user for a scene.
 
     Attributes:
         frames: when each is sent, seconds. ends: when the scene may end, once all its frames are committed.
@@ -31,12 +31,12 @@ class ScenePlan:
 
     @property
     def name(self) -> str:
-        """The scene's id."""
+        """Id of the scene."""
         return self.spec.folder.name
 
 
 class SimulatedScene:
-    """Stands in for `server.updates.updates.Updates`, of one service; the next one makes its scenes anew.
+    """Replacement for `server.updates.updates.Updates` of one service instance.
 
     Attributes:
         worker: the real one. trouble: as in the scene's status. ended: a user has ended the scene.
@@ -67,11 +67,11 @@ class SimulatedScene:
 
     @property
     def done(self) -> bool:
-        """All its frames are committed, as far as the service knows."""
+        """Whether all frames are committed, as far as the service knows."""
         return self._committed == len(self.plan.frames)
 
     def kill(self) -> None:
-        """The service has ended: nothing of it happens any more."""
+        """Detaches the scene from a service that has ended."""
         self._dead = True
         self.worker.close()
         self._background.cancel()
@@ -85,7 +85,7 @@ class SimulatedScene:
             self._learn(len(listed(states)))
 
     def _learn(self, count: int) -> None:
-        """So many frames are committed; who committed those that are new is read through the link, as clients do."""
+        """Registers committed frames; their writer is read through the link, as by clients."""
         for index in self._frames.untold(self.plan.name, count):
             try:
                 worker = read_frame(frame_file(self.plan.spec.folder.states, index)).worker

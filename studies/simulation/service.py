@@ -1,4 +1,4 @@
-"""The simulated service: owns all scenes, and makes them anew from their folders when it has been away."""
+"""The simulated service: owns all scenes, and recreates them from their folders after a restart."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ INTERRUPTED = 20
 
 
 class SimulatedService:
-    """One service at a time.
+    """Runs one instance of the service at a time.
 
     Args:
         needs: of a scene's worker. between_s: seconds between the frames of a scene.
@@ -48,18 +48,18 @@ class SimulatedService:
 
     @property
     def done(self) -> bool:
-        """The service runs, and all frames of all scenes are committed."""
+        """Whether the service runs and all frames of all scenes are committed."""
         return self.up and all(name in self.scenes and self.scenes[name].done for name in self.plans)
 
     def create(self, plan: ScenePlan) -> None:
-        """Creates a scene; a service that is away does so once it is back."""
+        """Creates a scene; while the service is down, creation waits until it is back."""
         self.plans[plan.name] = plan
         plan.spec.folder.path.mkdir(parents=True)
         if self.up:
             self._open(plan, "new")
 
     async def restart(self) -> None:
-        """Ends, and comes back after a while: scene by scene."""
+        """Ends the service and restarts it later, scene by scene."""
         self.up = False
         now = self._cluster.loop.time()
         living = [scene for scene in self.scenes.values() if not scene.ended]
@@ -80,7 +80,7 @@ class SimulatedService:
             self._cluster.later((0.0, RECOVER_S), lambda plan=plan: self._recover(plan))  # type: ignore[misc]
 
     def end(self) -> None:
-        """Ends for good."""
+        """Ends the service permanently."""
         for scene in self.scenes.values():
             scene.kill()
         self.placement.abandon()

@@ -1,4 +1,4 @@
-"""`scripts/bench simulate`: runs a cluster through its failures, and checks what is left in the folders."""
+"""`scripts/bench simulate`: runs a cluster through its failures, and checks what remains in the folders."""
 
 from __future__ import annotations
 
@@ -70,23 +70,23 @@ class Sizes:
 
     @property
     def cpus(self) -> int:
-        """Of a node."""
+        """Number of CPUs per node."""
         return math.ceil(self.scenes / self.nodes / FULL)
 
     @property
     def more(self) -> int:
-        """Scenes that are asked for beyond the room."""
+        """Number of scenes that exceed the capacity."""
         return min(self.scenes, math.ceil(MORE * self.nodes * self.cpus))
 
     @property
     def seconds(self) -> float:
-        """In which frames are sent and failures happen."""
+        """Duration in which frames are sent and failures happen."""
         return self.failures * APART_S / self.nodes
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The findings.
+    """The results of a simulation.
 
     Attributes:
         placed, resumed, waited, unexplained: see `TimeRecord`. unplaced: workers that are wanted and have no place at
@@ -110,7 +110,7 @@ class Outcome:
 
 
 def simulate(sizes: Sizes) -> Outcome:
-    """Runs the simulation; the same sizes and seed give the same outcome."""
+    """Runs the simulation, which is deterministic for given sizes and seed."""
     level, memory = logging.getLogger("scas4d.server").level, Path("/dev/shm")
     logging.getLogger("scas4d.server").setLevel(logging.ERROR)
     try:
@@ -172,7 +172,7 @@ def _needs(spec: SceneSpec) -> ResourceNeeds:
 
 
 def _plans(sizes: Sizes, data: DataFolder, specs: Sequence[SceneSpec], random: Random) -> list[tuple[ScenePlan, float]]:
-    """All scenes, and when they are created. The first end in time for those that are asked for beyond the room."""
+    """Returns all scenes with creation times; the first ones end in time for those that exceed the capacity."""
     end, plans = sizes.seconds, []
     shares = [share for share, _ in RIGS]
     for number in range(sizes.scenes + sizes.more):

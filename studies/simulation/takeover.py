@@ -1,4 +1,4 @@
-"""The worst moments while the service begins an epoch: workers commit between its steps, or the service ends there."""
+"""Worst cases at the start of an epoch: workers commit between its steps, or the service ends there."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ HURRIED = 0.5
 
 
 class _Interrupted(Exception):
-    """The service ended here."""
+    """Raised to end the service at this point."""
 
 
 class Takeovers:
-    """Gives others their turn whenever `begin_epoch` syncs a folder.
+    """Runs other actions whenever `begin_epoch` syncs a folder.
 
     It does so when the states are linked, and their folder has no name yet; when it has, and the link has not moved;
     and when that has moved.
@@ -34,12 +34,12 @@ class Takeovers:
 
     @contextmanager
     def watched(self) -> Iterator[None]:
-        """Takes these turns inside."""
+        """Runs these actions inside the context."""
         with mock.patch.object(fencing, "sync_folder", self._sync):
             yield
 
     def interrupt(self, folder: SceneFolder) -> None:
-        """The service ends while it begins an epoch of the scene, at one of these moments."""
+        """Ends the service during the start of an epoch of the scene, at one of these points."""
         self._left = self._random.randrange(3)
         with suppress(_Interrupted):
             fencing.begin_epoch(folder.states, folder.worker_lock)

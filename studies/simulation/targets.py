@@ -1,4 +1,4 @@
-"""The targets that a simulation has to reach, and the table of what was found."""
+"""Targets of a simulation, and the table of its results."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ AFTER = {"node": "a node's failure", "worker": "a worker's end", "service": "the
 
 @dataclass(frozen=True)
 class Row:
-    """A figure, and the target where it has one."""
+    """A figure and its target, if it has one."""
 
     what: str
     found: str
@@ -74,7 +74,7 @@ def rows(outcome: Outcome) -> list[Row]:
 
 
 def summarize(outcome: Outcome) -> str:
-    """The failures in a sentence, and the table, as Markdown."""
+    """Formats the failures as a sentence and the table as Markdown."""
     sizes = outcome.sizes
     kinds = ", ".join(f"{kind} {count}" for kind, count in sorted(outcome.happened.items()))
     lines = [

@@ -1,4 +1,4 @@
-"""The work of a modelled worker: commits frames in order to its epoch's folder, and goes on when it is given up."""
+"""The work of a modelled worker: commits frames in order to its epoch's folder, and continues after it is given up."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SUFFIX = ".frame"
 
 
 def content(before: str, index: int) -> str:
-    """The state of a frame, which depends on the one before and on nothing else; before frame 0: the scene's name.
+    """Returns the state of a frame, which depends only on the previous one; before frame 0, on the scene's name.
 
     >>> content("a", 0) == content("a", 0) != content("b", 0)
     True
@@ -28,7 +28,7 @@ def content(before: str, index: int) -> str:
 
 
 def frame_file(folder: Path, index: int) -> Path:
-    """The file of a frame."""
+    """Returns the path of a frame's file."""
     return folder / f"{index:06}{SUFFIX}"
 
 
@@ -39,7 +39,7 @@ def read_frame(path: Path) -> FoundFrame:
 
 
 def listed(folder: Path) -> list[int]:
-    """Frames that a folder has, in order."""
+    """Returns the frames in a folder, in order."""
     names = (
         name
         for name in (os.listdir(folder) if folder.is_dir() else ())
@@ -49,7 +49,7 @@ def listed(folder: Path) -> list[int]:
 
 
 class _Timer:
-    """One call that is due; it can be paused."""
+    """One scheduled call that can be paused."""
 
     def __init__(self, cluster: SimulatedCluster) -> None:
         self._cluster = cluster
@@ -59,7 +59,7 @@ class _Timer:
         self._paused = False
 
     def set(self, delay: Range | float, call: Callable[[], None]) -> None:
-        """Calls after so many seconds of running; takes the place of the call before."""
+        """Schedules a call after a running time in seconds; replaces the previous call."""
         self.cancel()
         self._call = call
         self._left = self._cluster.random.uniform(*delay) if isinstance(delay, tuple) else delay
@@ -90,7 +90,7 @@ class _Timer:
 
 
 class Work:
-    """The doings of a worker process.
+    """The activity of a worker process.
 
     A worker that was given up and still runs is a harder opponent than a real one: it has no orders, and yet commits
     all frames that are acknowledged, and its own newest again and again.
@@ -124,7 +124,7 @@ class Work:
         self._step.set(START_S, self._open)
 
     def order(self, message: FrameReady) -> None:
-        """Takes a frame."""
+        """Accepts a frame."""
         if self._ended or self._adrift or self._at is not None:
             return
         if message.index != self._frames:
@@ -133,19 +133,19 @@ class Work:
         self._begin(math.exp(self._cluster.random.uniform(low, high)))
 
     def pause(self) -> None:
-        """Its node is stopped."""
+        """Pauses with its stopped node."""
         self._stopped = True
         self._step.pause()
         self._end.pause()
 
     def resume(self) -> None:
-        """Its node is continued."""
+        """Resumes with its node."""
         self._stopped = False
         self._step.resume()
         self._end.resume()
 
     def drift(self) -> None:
-        """It gets no instructions any more: it continues by itself for a while."""
+        """Continues without instructions for a while, after it was given up."""
         if not self._adrift and not self._ended:
             self._adrift = True
             self._end.set(ADRIFT_S, self._leave)
@@ -153,7 +153,7 @@ class Work:
                 self._go_on()
 
     def hurry(self) -> None:
-        """Commits now what it would commit next: the worst moment, chosen from outside."""
+        """Commits the next frame immediately, at the worst moment as chosen by the caller."""
         if not self._opened or self._stopped or self._ended:
             return
         if self._at is not None or (self._adrift and self._frames < self._record.acknowledged[self._scene]):
@@ -161,7 +161,7 @@ class Work:
             self._commit()
 
     def end(self) -> None:
-        """Ends at once."""
+        """Ends immediately."""
         self._ended = True
         self._step.cancel()
         self._end.cancel()
@@ -205,12 +205,12 @@ class Work:
             self._step.set(ADRIFT_UPDATE_S, self._again)
 
     def _again(self) -> None:
-        """Writes its own newest frame again, the same bytes."""
+        """Rewrites its own newest frame with the same bytes."""
         if self._frames == self._first_own or self._write(self._frames - 1, self._state):
             self._go_on()
 
     def _write(self, index: int, state: str) -> bool:
-        """Writes a frame whole or not at all; a worker whose folder is gone ends."""
+        """Writes a frame atomically; a worker whose folder was deleted ends."""
         path, number = frame_file(self._folder, index), self._record.write(self._scene, self._worker)
         beside = path.with_name(f".{path.name}.{self._worker}.part")
         try:

@@ -1,4 +1,4 @@
-"""Synthetic scene for comparisons: a coloured ball over a floor, seen by six cameras around it."""
+"""Synthetic scene for comparisons: a coloured ball over a floor, seen by six surrounding cameras."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SHIFT, TURN = np.array([0.015, 0.01, -0.01]), 0.05
 
 
 def rig(size: int, count: int = 6, *, turned: float = 0.0, names: str = "c") -> Rig:
-    """Square cameras of ``size`` pixels that look at the origin, by turns above and below; y is down.
+    """Returns square cameras of ``size`` pixels that look at the origin, alternately from above and below; y is down.
 
     Args:
         count: even, so that their mean is the origin. turned: radians, of all of them about the vertical.
@@ -35,7 +35,7 @@ def rig(size: int, count: int = 6, *, turned: float = 0.0, names: str = "c") -> 
 
 
 def ball_on_a_floor(count: int, rng: np.random.Generator) -> Gaussians:
-    """A ball of 0.25 m of ``count`` moving Gaussians and a quarter as many that stand, wide enough to cover."""
+    """Creates a ball of 0.25 m with ``count`` moving Gaussians, and a quarter as many static ones as background."""
     standing, total = count // 4, count + count // 4
     normals = rng.normal(size=(count, 3))
     ball = 0.25 * normals / np.linalg.norm(normals, axis=1, keepdims=True)
@@ -56,7 +56,7 @@ def ball_on_a_floor(count: int, rng: np.random.Generator) -> Gaussians:
 
 
 def moved(before: Gaussians) -> Gaussians:
-    """The moving Gaussians, turned about the vertical and shifted."""
+    """Rotates the moving Gaussians about the vertical axis and shifts them."""
     c, s = np.cos(TURN), np.sin(TURN)
     turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
     means, factors, rows = before.means.copy(), before.factors.copy(), before.moving
@@ -66,7 +66,7 @@ def moved(before: Gaussians) -> Gaussians:
 
 
 def photograph(gaussians: Gaussians, cameras: Rig) -> Frame:
-    """Frame 1 at 1 s: the pictures and masks of a rig of the inside world, as the CPU renders them."""
+    """Returns frame 1 at 1 s: pictures and masks of a rig in the internal world, rendered on the CPU."""
     images, masks = {}, {}
     features = np.concatenate([gaussians.colours, gaussians.foreground[:, None]], axis=1)
     for camera in cameras.cameras:

@@ -1,4 +1,4 @@
-"""A textured wall of any number of Gaussians before any number of cameras; its middle slides."""
+"""A textured wall with any number of Gaussians and cameras, whose middle part slides."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Size:
 
 
 def wall(size: Size) -> Gaussians:
-    """[N] Gaussians of the wall, its middle labelled as moving; metres, the wall's middle at the origin."""
+    """Creates the N Gaussians of the wall, with its middle labelled as moving; in metres, centred at the origin."""
     side = round(size.gaussians**0.5)
     lines = np.linspace(-WIDTH_M / 2, WIDTH_M / 2, side)
     x, y = (axis.ravel() for axis in np.meshgrid(lines, lines))
@@ -49,7 +49,7 @@ def wall(size: Size) -> Gaussians:
 
 
 def rig(size: Size) -> Rig:
-    """A row of cameras before the wall, which fills their pictures in height."""
+    """Creates a row of cameras in front of the wall, which fills their pictures vertically."""
     focal = size.height * AWAY_M / WIDTH_M
     lens = np.array([[focal, 0, size.width / 2], [0, focal, size.height / 2], [0, 0, 1]])
     cameras = []
@@ -63,13 +63,13 @@ def rig(size: Size) -> Rig:
 
 
 def shown(state: Gaussians, index: int, cameras: Rig) -> Frame:
-    """The frame after so many slides."""
+    """Returns the frame after a number of slides."""
     way = np.array([SLIDE_M * index, 0.5 * SLIDE_M * index, 0], np.float32)
     means = state.means + np.where(state.moving[:, None], way, np.float32(0))
     return replace(photograph(state.replace(means=means.astype(np.float32)), cameras), index=index, time=index / RATE)
 
 
 def known(state: Gaussians, cameras: Rig) -> StaticResult:
-    """Frame 0 as it is, in the world of the cameras."""
+    """Returns the true frame 0, in the world of the cameras."""
     world = cameras.world_frame(1.0)
     return StaticResult(state.replace(means=world.to_inside(state.means).astype(np.float32)), {}, [])

@@ -1,4 +1,4 @@
-"""The page of the variants: gains of contenders, and what a choice made without a capture gains on it."""
+"""The page of the variants: gains of contenders, and cross-validation over captures."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Figures = dict[tuple[Place, str], list[Row]]
 
 
 def page(rows: Sequence[Row], contenders: Sequence[str]) -> str:
-    """Tables in Markdown.
+    """Formats the results as Markdown tables.
 
     Args:
         rows: with ``capture``, ``of``, ``contender``, ``seed``; failed ones have ``error``.
@@ -59,7 +59,7 @@ def page(rows: Sequence[Row], contenders: Sequence[str]) -> str:
 
 
 def left_out(figures: Figures, places: Sequence[Place], contenders: Sequence[str]) -> list[str]:
-    """For each capture, which contender wins on all others, and what it gains on this one."""
+    """Returns, for each capture, the contender that wins on all others, and its gain on this one."""
     lines = ["| left out | chosen without it | gains on it dB |", "|---|---|---|"]
     first = contenders[0]
     for capture in dict.fromkeys(place[0] for place in places):
@@ -75,17 +75,17 @@ def left_out(figures: Figures, places: Sequence[Place], contenders: Sequence[str
 
 
 def gain(figures: Figures, place: Place, name: str, first: str) -> float:
-    """DB by which a contender is ahead of the first, in the mean over seeds and updates."""
+    """Returns the lead in dB of a contender over the first one, averaged over seeds and updates."""
     return mean(figures[place, name], "psnr") - mean(figures[place, first], "psnr")
 
 
 def ratio(rows: Sequence[Row], base: Sequence[Row]) -> float:
-    """Seconds of an update over those of other rows."""
+    """Returns the time of an update relative to other rows."""
     return mean(rows, "seconds_update") / mean(base, "seconds_update")
 
 
 def mean(rows: Sequence[Row], name: str) -> float:
-    """The mean of a value over rows."""
+    """Returns the mean of a value over rows."""
     return float(np.mean([row[name] for row in rows]))
 
 

@@ -33,7 +33,7 @@ CONSTANTS = "scas4d_core."
 
 @dataclass(frozen=True)
 class Contender:
-    """Settings that compete.
+    """Settings that compete for the default.
 
     Attributes:
         name: for tables. preset: that it starts from. changes: settings as ``"update.iterations=80"``.
@@ -52,7 +52,7 @@ class Contender:
 
     @classmethod
     def read(cls, text: str) -> Contender:
-        """From ``NAME`` of a preset, or ``NAME: CHANGE CHANGE …``; ``preset=NAME`` is one of the changes.
+        """Parses ``NAME`` of a preset, or ``NAME: CHANGE CHANGE …``; ``preset=NAME`` is one of the changes.
 
         Raises:
             ValueError: it cannot be read.
@@ -81,16 +81,16 @@ class VariantJob(Job):
     of: str = "as it is"
 
     def open_given(self) -> Capture:
-        """The variant as the method gets it."""
+        """Returns the variant as input of the method."""
         return VARIANTS[self.of].made(super().open_given())
 
     def open_truth(self) -> Capture:
-        """The variant as it is measured."""
+        """Returns the variant as it is measured."""
         return VARIANTS[self.of].made(super().open_truth())
 
     @property
     def variant(self) -> str:
-        """Names the row without its capture; the variant is a part of it."""
+        """Names the row without its capture; the variant is part of the name."""
         return f"{super().variant}-{self.of.replace(' ', '-')}"
 
 
@@ -107,7 +107,7 @@ def run(
     options: CaptureOptions = DEFAULT_OPTIONS,
     report: Report = print,
 ) -> str:
-    """Measures every contender on every variant of every capture; returns the page, which is ``out/variants.md`` too.
+    """Measures every contender on every variant of every capture; returns the page and writes ``out/variants.md``.
 
     Args:
         captures: folders. contenders: the first is what the others are compared with.

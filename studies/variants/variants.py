@@ -1,4 +1,4 @@
-"""The variants of a capture: its test cameras, masks, truth and points are those of the frames that are left.
+"""The variants of a capture; test cameras, masks, truth and points are restricted to the selected frames.
 
 A cloud is of the capture's first frame: a variant that begins elsewhere has none.
 """
@@ -19,7 +19,7 @@ from scas4d_core.captures.reader import PictureReader
 
 @dataclass(frozen=True)
 class Variant:
-    """A way to make another capture of one.
+    """A transformation of one capture into another.
 
     Attributes:
         made: the other capture. changes: settings that it has, as ``"scene.image_scale=0.5"``.
@@ -30,7 +30,7 @@ class Variant:
 
 
 class ChosenFrames:
-    """Some frames of a reader, in another order; their times rise from 0.
+    """Selected frames of a reader in a given order, with times that increase from 0.
 
     Args:
         reader: of all frames. frames: which ones, in their new order.
@@ -41,11 +41,11 @@ class ChosenFrames:
 
     @property
     def frame_count(self) -> int:
-        """Number of frames that are left."""
+        """Number of selected frames."""
         return len(self._frames)
 
     def time(self, index: int) -> float | None:
-        """Seconds since the first of these frames, to either side; None where the pictures do not say."""
+        """Returns the seconds since the first selected frame, or None if the pictures have no times."""
         first, now = (self._reader.time(self._frames[i]) for i in (0, index))
         return None if first is None or now is None else abs(now - first)
 
@@ -54,7 +54,7 @@ class ChosenFrames:
         return self._reader.image(self._frames[index], camera)
 
     def has_mask(self, index: int, camera: str) -> bool:
-        """True where there is a mask."""
+        """Returns whether there is a mask."""
         return self._reader.has_mask(self._frames[index], camera)
 
     def mask(self, index: int, camera: str) -> NDArray[np.uint8]:
@@ -62,16 +62,16 @@ class ChosenFrames:
         return self._reader.mask(self._frames[index], camera)
 
     def encoded_image(self, index: int, camera: str) -> bytes:
-        """A picture as a file."""
+        """Returns the file of a picture."""
         return self._reader.encoded_image(self._frames[index], camera)
 
     def encoded_mask(self, index: int, camera: str) -> bytes | None:
-        """A mask as a file; None where there is none."""
+        """Returns the file of a mask, or None if there is none."""
         return self._reader.encoded_mask(self._frames[index], camera)
 
 
 def of_frames(capture: Capture, frames: Sequence[int]) -> Capture:
-    """The capture with these frames alone, in this order; each ``abs(step)`` of a steady order takes its longer time.
+    """Returns the capture with these frames only, in this order, and a frame rate that matches their spacing.
 
     >>> from scas4d_core.captures import open_capture
     >>> slow = of_frames(open_capture("samples/robot"), [0, 2, 4])
@@ -100,22 +100,22 @@ def _truth(truth: GroundTruth, frames: Sequence[int]) -> GroundTruth:
 
 
 def backwards(capture: Capture) -> Capture:
-    """The last frame first."""
+    """Reverses the order of the frames."""
     return of_frames(capture, range(capture.frame_count)[::-1])
 
 
 def every_second(capture: Capture) -> Capture:
-    """Every second frame: all moves twice as far."""
+    """Selects every second frame, which doubles all motion."""
     return of_frames(capture, range(0, capture.frame_count, 2))
 
 
 def later(capture: Capture) -> Capture:
-    """Without the first third: frame 0 is another one."""
+    """Removes the first third, so that frame 0 is a different one."""
     return of_frames(capture, range(capture.frame_count // 3, capture.frame_count))
 
 
 def half_cameras(capture: Capture) -> Capture:
-    """Every second training camera."""
+    """Selects every second training camera."""
     return replace(capture, full_rig=Rig(capture.full_rig.cameras[::2]))
 
 

@@ -162,11 +162,11 @@ class CpuRasterizer:
         """Renders features and transmittance of one view.
 
         Args:
-                means: [N, 3] metres; factors: [N, 3, 3]; opacities: [N]; features: [N, C], C a multiple of 4; float32 and
+            means: [N, 3] metres; factors: [N, 3, 3]; opacities: [N]; features: [N, C], C a multiple of 4; float32 and
                 C-contiguous.
             camera: camera in the internal world.
             background: [C] float32.
-                depth_channel: channel of ``features`` to overwrite with the depth of the centres (metres), or −1.
+            depth_channel: channel of ``features`` to overwrite with the depth of the centres (metres), or −1.
             drawing: blocks to render; None: the full picture.
         """
         count, channels = features.shape

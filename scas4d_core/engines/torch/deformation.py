@@ -1,9 +1,8 @@
-"""The deformation of one frame in plain torch: cluster map, its Jacobian, cascade, deltas of single Gaussians.
+"""Deformation of one frame in plain PyTorch: cluster map, its Jacobian, cascade, and per-Gaussian deltas.
 
-Equation numbers are those of the SCas4D paper: (5) transport of a Gaussian, (6) the cluster map, (7) the cascade.
-Everything is vectorized, differentiable, and of the dtype and on the device of its inputs; in float64 it is the
-reference that the kernels of other engines are tested against.
-Quaternions are (w, x, y, z). Lengths are metres in the inside world.
+Equation numbers refer to the SCas4D paper: (5) transport of a Gaussian, (6) cluster map, (7) cascade. All functions
+are vectorized and differentiable, and keep dtype and device of their inputs. In float64 they are the reference for
+the kernels of other engines. Quaternions are (w, x, y, z). Lengths are in metres in the internal world.
 """
 
 from __future__ import annotations
@@ -18,28 +17,28 @@ from torch import Tensor
 from scas4d_core.guards import EMPTY_CLUSTER, EXPONENT, HALF_TURN
 
 LARGEST = EXPONENT / log2(e)
-"""Of an exponential's argument."""
+"""Upper bound of an exponential's argument."""
 
 ClusterMap = Literal["centred", "published"]
-"""Form of equation (6): scaling about the cluster's pivot, or about the world's origin as published."""
+"""Variant of equation (6): scaling about the cluster's pivot, or about the world origin as published."""
 
 Covariance = Literal["entangled", "separate"]
-"""The map that moves a Gaussian's covariance beside its own ΔR and Δs.
+"""How a Gaussian's covariance is deformed, besides its own ΔR and Δs.
 
-"entangled", equation (5): the Jacobian of the map that moves its mean. "separate": nothing, as in the paper's ablation,
-which learns the covariance apart from the positions; a wheel's Gaussians then keep their orientation while they go
-round, where ΔR does not turn them. The same parameters give the same means and turns in both.
+"entangled", equation (5): by the Jacobian of the map that moves its mean. "separate": not at all, as in the paper's
+ablation, which learns the covariance independently of the positions. The Gaussians of a rotating wheel then keep
+their orientation, unless ΔR rotates them. Means and rotations are the same in both variants.
 """
 
 
 class ClusterParams(NamedTuple):
-    """Learnt parameters of the K clusters of one layer, in the paper's symbols; all zeros is the identity when centred.
+    """Learned parameters of the K clusters of one layer, in the paper's symbols; all zeros is the centred identity.
 
     Attributes:
-        r: [K, 3] rotation as the quaternion (1, r)/|(1, r)|.
+        r: [K, 3] rotation, as the quaternion (1, r)/|(1, r)|.
         t: [K, 3] metres, displacement relative to the pivot (the paper's t_j is pivot + t).
-        c: [K, 3] per metre, gradient of the scaling's argument.
-        s: [K] scaling's argument at the pivot.
+        c: [K, 3] per metre, gradient of the scaling argument.
+        s: [K] scaling argument at the pivot.
     """
 
     r: Tensor
@@ -51,24 +50,24 @@ class ClusterParams(NamedTuple):
     def identity(
         cls, count: int, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu"
     ) -> ClusterParams:
-        """Zeros for ``count`` clusters."""
+        """Returns zeros for ``count`` clusters."""
         zeros = torch.zeros(count, 10, dtype=dtype, device=device)
         return cls(zeros[:, :3].clone(), zeros[:, 3:6].clone(), zeros[:, 6:9].clone(), zeros[:, 9].clone())
 
 
 class Layer(NamedTuple):
-    """One layer of the hierarchy: the cluster of each of the M points ([M] int64), and the parameters."""
+    """One layer of the hierarchy: the cluster of each of the M points ([M] int64), and the cluster parameters."""
 
     labels: Tensor
     params: ClusterParams
 
 
 class Deltas(NamedTuple):
-    """Deltas of single Gaussians after the cascade (Δp, ΔR, Δs of the paper); zeros are the identity.
+    """Per-Gaussian deltas applied after the cascade (Δp, ΔR, Δs of the paper); zeros are the identity.
 
     Attributes:
         dp: [M, 3] metres, added to the mean.
-        dr: [M, 3] rotation as the quaternion (1, dr)/|(1, dr)|.
+        dr: [M, 3] rotation, as the quaternion (1, dr)/|(1, dr)|.
         ds: [M, 3] natural logarithm of the scaling of each transported axis.
     """
 
@@ -78,18 +77,18 @@ class Deltas(NamedTuple):
 
     @classmethod
     def identity(cls, count: int, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> Deltas:
-        """Zeros for ``count`` Gaussians."""
+        """Returns zeros for ``count`` Gaussians."""
         zeros = torch.zeros(3, count, 3, dtype=dtype, device=device)
         return cls(zeros[0].clone(), zeros[1].clone(), zeros[2].clone())
 
 
 class Transported(NamedTuple):
-    """Points after a map, with the Jacobian and rotation of the map at each.
+    """Points after a map, with the map's Jacobian and rotation at each point.
 
     Attributes:
         points: [M, 3] metres.
         jacobians: [M, 3, 3] of the map at each point.
-        rotations: [M, 4] unit quaternions: polar rotations of the Jacobians (through the layers, their product).
+        rotations: [M, 4] unit quaternions: polar rotations of the Jacobians; for several layers, their product.
     """
 
     points: Tensor
@@ -103,7 +102,7 @@ class Deformed(NamedTuple):
     Attributes:
         means: [M, 3] metres.
         factors: [M, 3, 3]; Σ = F Fᵀ.
-        turns: [M, 4] unit quaternions with w ≥ 0: rotation of this frame relative to the one before.
+        turns: [M, 4] unit quaternions with w ≥ 0: rotation of this frame relative to the previous one.
     """
 
     means: Tensor
@@ -117,7 +116,7 @@ def _normalized(q: Tensor) -> Tensor:
 
 
 def rotation_quaternions(r: Tensor) -> Tensor:
-    """[..., 3] rotation parameters to unit quaternions [..., 4]: (1, r)/|(1, r)|, the half-angle's tangent and axis.
+    """Converts rotation parameters [..., 3] to unit quaternions [..., 4]: (1, r)/|(1, r)|, where |r| = tan(angle/2).
 
     >>> rotation_quaternions(torch.tensor([[0.0, 0, 1]]))  # tan(angle/2) = 1: a quarter turn about z
     tensor([[0.7071, 0.0000, 0.0000, 0.7071]])
@@ -127,7 +126,7 @@ def rotation_quaternions(r: Tensor) -> Tensor:
 
 
 def quaternion_matrices(q: Tensor) -> Tensor:
-    """Unit quaternions [..., 4] to rotation matrices [..., 3, 3].
+    """Converts unit quaternions [..., 4] to rotation matrices [..., 3, 3].
 
     >>> quaternion_matrices(torch.tensor([0.0, 0, 0, 1]))  # a half turn about z
     tensor([[-1.,  0.,  0.],
@@ -144,7 +143,7 @@ def quaternion_matrices(q: Tensor) -> Tensor:
 
 
 def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
-    """Hamilton product [..., 4] of quaternions: the rotation b first, then a.
+    """Returns the Hamilton product [..., 4] of quaternions, i.e. rotation b followed by rotation a.
 
     >>> about_x, about_z = torch.tensor([0.0, 1, 0, 0]), torch.tensor([0.0, 0, 0, 1])  # half turns
     >>> quaternion_product(about_z, about_x)  # a half turn about y
@@ -158,9 +157,9 @@ def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
 
 
 def scaling_factor(z: Tensor) -> tuple[Tensor, Tensor]:
-    """The factor f of equation (6) and its derivative df/dz, any shape.
+    """Returns the factor f of equation (6) and its derivative df/dz, for z of any shape.
 
-    f = 2σ(2z) is the paper's tanh(z) + 1 without its cancellation: in float32 the latter is exactly 0 from about −9.
+    f = 2σ(2z) equals the paper's tanh(z) + 1 without cancellation, which makes the latter 0 below about −9 in float32.
 
     >>> scaling_factor(torch.zeros(1))
     (tensor([1.]), tensor([1.]))
@@ -170,11 +169,11 @@ def scaling_factor(z: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def polar_rotation(f: Tensor, y: Tensor, c: Tensor) -> Tensor:
-    """Polar rotation of f·I + f(2−f)·y·cᵀ as unit quaternions [M, 4], in closed form.
+    """Returns the polar rotation of f·I + f(2−f)·y·cᵀ as unit quaternions [M, 4], in closed form.
 
-    The matrix acts in the plane of y and c, so its rotation is that plane's two-dimensional polar rotation: with
-    C the trace and S the skew part within the plane, the quaternion is proportional to (|(C, S)| + C, S). The common
-    factor f is left out, which keeps it exact where f comes near 0.
+    The matrix acts in the plane of y and c, so its rotation is the two-dimensional polar rotation in that plane. With C
+    the trace and S the skew part in the plane, the quaternion is proportional to (|(C, S)| + C, S). The common factor f
+    is omitted, so the result stays accurate for f near 0.
 
     Args:
         f: [M] scaling factors in (0, 2).
@@ -189,12 +188,12 @@ def polar_rotation(f: Tensor, y: Tensor, c: Tensor) -> Tensor:
     cosine = 2 + g * (c * y).sum(-1, keepdim=True)
     sine = g * torch.linalg.cross(c, y)
     radius: Tensor = torch.linalg.vector_norm(torch.cat([cosine, sine], dim=-1), dim=-1, keepdim=True)
-    # A half turn (cosine < 0, sine = 0) needs a map that folds space; it then counts as no rotation instead of NaN.
+    # A half turn (cosine < 0, sine = 0) requires a map that folds space; it is treated as no rotation to avoid NaN.
     return _normalized(torch.cat([(radius + cosine).clamp_min(HALF_TURN), sine], dim=-1))
 
 
 def cluster_pivots(points: Tensor, labels: Tensor, count: int) -> Tensor:
-    """[count, 3] means of the clusters' points, detached: no gradient flows through a pivot. Empty clusters get 0.
+    """Returns the mean position [count, 3] of each cluster, without gradient; 0 for empty clusters.
 
     >>> cluster_pivots(torch.tensor([[0.0, 0, 0], [2, 0, 0], [5, 5, 5]]), torch.tensor([0, 0, 1]), 2)
     tensor([[1., 0., 0.],
@@ -209,22 +208,22 @@ def cluster_pivots(points: Tensor, labels: Tensor, count: int) -> Tensor:
 def cluster_map(
     points: Tensor, pivots: Tensor, labels: Tensor, params: ClusterParams, kind: ClusterMap = "centred"
 ) -> Transported:
-    """Equation (6) for every point, with its Jacobian and the Jacobian's polar rotation.
+    """Applies equation (6) to every point, with the map's Jacobian and its polar rotation.
 
     With d = x − p, z = c·d + s, f = 2σ(2z), f' = f(2−f):
-    centred x' = p + t + f·R d; published x' = (R d + p + t)·f. Both have J = R (f·I + f'·y·cᵀ), y = d for the first,
-    y = Rᵀ(R d + p + t) for the second. The published map scales about the world's origin and so is not
-    translation-equivariant; the two agree where c = s = 0. Where every parameter is 0, points keep their bits.
+    centred x' = p + t + f·R d; published x' = (R d + p + t)·f. Both have J = R (f·I + f'·y·cᵀ), with y = d when centred
+    and y = Rᵀ(R d + p + t) as published. The published map scales about the world origin and is therefore not
+    translation-equivariant. Both agree for c = s = 0. If all parameters are 0, points keep their exact bits.
 
     Args:
         points: [M, 3] metres.
         pivots: [K, 3] metres.
         labels: [M] int64 in 0…K−1.
-        params: of the K clusters.
-        kind: form of the map.
+        params: parameters of the K clusters.
+        kind: variant of the map.
 
     Raises:
-        ValueError: an unknown form.
+        ValueError: if the variant is unknown.
 
     >>> points = torch.tensor([[1.0, 0, 0], [-1, 0, 0]])
     >>> params = ClusterParams.identity(1, torch.float32)
@@ -238,7 +237,7 @@ def cluster_map(
     rotation = quaternion_matrices(q)[labels]
     offset = points - pivot
     f, df = scaling_factor((c * offset).sum(-1) + params.s[labels])
-    # Points go by their change: every term but the point itself is 0 where the parameters are.
+    # Points are updated by their displacement, which is exactly 0 if all parameters are 0.
     unit = torch.eye(3, dtype=points.dtype, device=points.device)
     step = ((rotation - unit) @ offset[..., None])[..., 0]
     placed = points + (t + step)
@@ -256,17 +255,17 @@ def cluster_map(
 
 
 def cascade(points: Tensor, layers: Sequence[Layer], kind: ClusterMap = "centred") -> Transported:
-    """Equation (7), nested: x → φ_K(… φ_2(φ_1(x))), coarsest layer first.
+    """Evaluates equation (7), the nested maps x → φ_K(… φ_2(φ_1(x))), coarsest layer first.
 
-    The pivots of a layer are the means of its clusters' points as moved by the layers above, without gradient.
+    A layer's pivots are the means of its clusters' points after the coarser layers, without gradient.
 
     Args:
         points: [M, 3] metres.
-        layers: coarse to fine; none is the identity.
-        kind: form of the cluster map.
+        layers: coarse to fine; an empty sequence is the identity.
+        kind: variant of the cluster map.
 
     Returns:
-        Points, J_K … J_2 J_1, and Q_K ∘ … ∘ Q_1.
+        The moved points, Jacobians J_K … J_2 J_1, and rotations Q_K ∘ … ∘ Q_1.
 
     >>> points = torch.tensor([[1.0, 0, 0], [-1, 0, 0]])
     >>> coarse, fine = ClusterParams.identity(1, torch.float32), ClusterParams.identity(2, torch.float32)
@@ -296,20 +295,20 @@ def deform(
     kind: ClusterMap = "centred",
     covariance: Covariance = "entangled",
 ) -> Deformed:
-    """Equation (5) on factors: the cascade, then Δp, ΔR, Δs of each Gaussian.
+    """Applies equation (5) to factors: the cascade, then Δp, ΔR, Δs of each Gaussian.
 
-    mean = x_K + Δp; F = R(Δr)·J·F_previous·diag(exp Δs); turn = q(Δr) ∘ Q, flipped to w ≥ 0. Then Σ = F Fᵀ is
-    J Σ_previous Jᵀ where the deltas are 0. Where the covariance is separate, J is left out.
+    mean = x_K + Δp; F = R(Δr)·J·F_previous·diag(exp Δs); turn = q(Δr) ∘ Q, flipped to w ≥ 0. If the deltas are 0,
+    Σ = F Fᵀ is J Σ_previous Jᵀ. With separate covariance, J is omitted.
 
     Args:
-        means: [M, 3] metres, of the previous frame.
-        factors: [M, 3, 3] of the previous frame.
+        means: [M, 3] metres, in the previous frame.
+        factors: [M, 3, 3] in the previous frame.
         layers: coarse to fine.
-        deltas: per Gaussian.
-        kind: form of the cluster map. covariance: "separate" leaves J out of the factors.
+        deltas: per-Gaussian deltas.
+        kind: variant of the cluster map. covariance: "separate" omits J from the factors.
 
     Raises:
-        ValueError: an unknown form.
+        ValueError: if the variant is unknown.
 
     >>> means, factors = torch.zeros(1, 3), 0.1 * torch.eye(3)[None]
     >>> deltas = Deltas.identity(1, torch.float32)
@@ -332,7 +331,7 @@ def deform(
 
 
 def material_rotations(turns: Tensor, previous: Tensor) -> Tensor:
-    """[M, 4] unit quaternions since frame 0: this frame's turns after the previous material rotations.
+    """Returns rotations since frame 0, [M, 4] unit quaternions: previous rotations followed by this frame's turns.
 
     >>> quarter = torch.tensor([[0.5, 0, 0, 0.5]]) * 2**0.5
     >>> material_rotations(quarter, previous=quarter)

@@ -1,4 +1,4 @@
-"""Colours of Gaussians as one camera sees them, in plain torch (kernel: ``kernels.appearance.direction``)."""
+"""View-dependent colours of Gaussians in plain PyTorch (kernel: ``kernels.appearance.direction``)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scas4d_core.kernels.appearance.direction import CELLS, DARK, DULL, FALL, MI
 
 
 def no_turns(count: int) -> Tensor:
-    """[count, 4] quaternions that turn nothing."""
+    """Returns [count, 4] identity quaternions."""
     turns = torch.zeros(count, 4, dtype=torch.float64)
     turns[:, 0] = 1
     return turns
@@ -19,10 +19,10 @@ def no_turns(count: int) -> Tensor:
 def colours_seen(
     means: Tensor, turns: Tensor, colours: Tensor, gloss: Tensor | None, environment: Tensor | None, centre: Tensor
 ) -> Tensor:
-    """[N, 3] colours as a camera at ``centre`` [3] sees them: those given where nothing is glossy.
+    """Returns colours [N, 3] as seen by a camera at ``centre`` [3]; the given colours if nothing is glossy.
 
     Args:
-        gloss: [M, 3] of the first M; the others are dull. The rest are as of ``shade``.
+        gloss: [M, 3] for the first M Gaussians; the others have none. See ``shade`` for the other arguments.
     """
     if gloss is None or environment is None:
         return colours
@@ -31,20 +31,20 @@ def colours_seen(
 
 
 def cell_shares() -> Tensor:
-    """[CELLS] share of the sphere of each cell of the octahedral map; they sum to 1."""
+    """Returns the share of the sphere that each cell of the octahedral map covers, [CELLS]; sums to 1."""
     line = torch.linspace(-1, 1, SIDE, dtype=torch.float64)
     v, u = torch.meshgrid(line, line, indexing="ij")
     z = 1 - u.abs() - v.abs()
     x = torch.where(z < 0, (1 - v.abs()) * u.sign(), u)
     y = torch.where(z < 0, (1 - u.abs()) * v.sign(), v)
-    area = (x * x + y * y + z * z) ** -1.5  # of the sphere behind a piece of the map
-    area[[0, -1]] /= 2  # rows at the rim are half cells
+    area = (x * x + y * y + z * z) ** -1.5  # solid angle per map area
+    area[[0, -1]] /= 2  # rim rows cover half cells
     area[:, [0, -1]] /= 2
     return (area / area.sum()).flatten()
 
 
 def shade(means: Tensor, gloss: Tensor, turns: Tensor, colours: Tensor, environment: Tensor, centre: Tensor) -> Tensor:
-    """[N, 3] colours; arguments as the kernel's, with a gloss for every Gaussian."""
+    """Returns the shaded colours [N, 3]; same arguments as the kernel, with gloss for every Gaussian."""
     strength = gloss.norm(dim=1, keepdim=True)
     glossy = strength[:, 0] > float(DULL)
     strength = torch.where(glossy[:, None], strength, torch.ones_like(strength))
@@ -61,7 +61,7 @@ def shade(means: Tensor, gloss: Tensor, turns: Tensor, colours: Tensor, environm
 
 
 def looked_up(cells: Tensor, directions: Tensor) -> Tensor:
-    """[N, 3] of a grid [CELLS, 3] over directions [N, 3] of any length, bilinear in the octahedral map."""
+    """Samples a grid [CELLS, 3] at directions [N, 3] of any length, bilinearly in the octahedral map."""
     across = directions / directions.abs().sum(dim=1, keepdim=True)
     x, y = across[:, 0], across[:, 1]
     signs_x, signs_y = torch.where(x >= 0, 1.0, -1.0), torch.where(y >= 0, 1.0, -1.0)

@@ -1,7 +1,7 @@
-"""Losses of an update in plain torch, the reference for the kernels of other engines.
+"""Losses of an update in plain PyTorch, the reference for the kernels of other engines.
 
-Weights and forms follow the SCas4D paper (equation (8): scale loss) and Dynamic3DGaussians, whose local rigidity,
-isometry and rotation terms it takes over. Every function returns a scalar of its inputs' dtype, unweighted.
+Weights and forms follow the SCas4D paper (equation (8): scale loss) and Dynamic3DGaussians, the source of the local
+rigidity, isometry and rotation terms. Every function returns an unweighted scalar in the dtype of its inputs.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from scas4d_core.engines.torch.deformation import quaternion_matrices
 from scas4d_core.guards import ROOT_FLOOR, SMALLEST_SQUARE, SSIM_C1, SSIM_C2
 
 SSIM_WINDOW = 11
-"""Pixels across the Gaussian window (Wang et al. 2004)."""
+"""Size of the Gaussian window in pixels (Wang et al. 2004)."""
 SSIM_SIGMA = 1.5
-"""Pixels, standard deviation of the window."""
+"""Standard deviation of the window in pixels."""
 SSIM_SHARE = 0.2
-"""Share of 1 − SSIM in the image loss; the rest is L1 (Kerbl et al. 2023)."""
+"""Weight of 1 − SSIM in the image loss; L1 has the remaining weight (Kerbl et al. 2023)."""
 
 
 @functools.cache
 def _window(dtype: torch.dtype, device: torch.device) -> Tensor:
-    """[11] normalized Gaussian."""
+    """Returns the normalized Gaussian window [11]."""
     x = torch.arange(SSIM_WINDOW, dtype=torch.float64) - SSIM_WINDOW // 2
     weights = torch.exp(-(x**2) / (2 * SSIM_SIGMA**2))
     return (weights / weights.sum()).to(dtype=dtype, device=device)
 
 
 def _blurred(pictures: Tensor) -> Tensor:
-    """[B, 1, H, W] pictures under the SSIM window, zero beyond the border."""
+    """Filters pictures [B, 1, H, W] with the SSIM window, with zero padding at the border."""
     window = _window(pictures.dtype, pictures.device)
     half = SSIM_WINDOW // 2
     across = functional.conv2d(pictures, window.view(1, 1, 1, -1), padding=(0, half))
@@ -41,7 +41,7 @@ def _blurred(pictures: Tensor) -> Tensor:
 
 
 def ssim_map(image: Tensor, target: Tensor) -> Tensor:
-    """SSIM of every pixel and channel, [H, W, C], of two pictures [H, W, C] in 0…1; zero padding at the border.
+    """Returns the SSIM of every pixel and channel of two pictures [H, W, C] in 0…1, with zero padding at the border.
 
     >>> picture = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     >>> similarity = ssim_map(picture, picture)
@@ -60,11 +60,11 @@ def ssim_map(image: Tensor, target: Tensor) -> Tensor:
 
 
 def image_loss(image: Tensor, target: Tensor) -> Tensor:
-    """0.8·mean|I − Î| + 0.2·(1 − mean SSIM) over pixels and channels.
+    """Returns 0.8·mean|I − Î| + 0.2·(1 − mean SSIM) over pixels and channels.
 
     Args:
-        image: [H, W, C] rendered; a mask is a picture of one channel.
-        target: [H, W, C] observed, 0…1.
+        image: [H, W, C] rendered picture; a mask is a picture with one channel.
+        target: [H, W, C] observed picture, 0…1.
 
     >>> picture = torch.rand(16, 16, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     >>> abs(float(image_loss(picture, picture))) < 1e-12
@@ -75,7 +75,7 @@ def image_loss(image: Tensor, target: Tensor) -> Tensor:
 
 
 def psnr(image: Tensor, target: Tensor) -> Tensor:
-    """Peak signal-to-noise ratio, dB, of two pictures [H, W, C] in 0…1.
+    """Returns the peak signal-to-noise ratio, in dB, of two pictures [H, W, C] in 0…1.
 
     >>> truth = torch.zeros(8, 8, 3, dtype=torch.float64)
     >>> round(float(psnr(truth + 0.1, truth)), 6)
@@ -86,7 +86,7 @@ def psnr(image: Tensor, target: Tensor) -> Tensor:
 
 
 def _pairs(neighbours: Tensor, weights: Tensor, rows: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows [m], their neighbours [m, k] and weights [m, k]; all rows where none are named."""
+    """Returns rows [m], their neighbours [m, k] and weights [m, k]; all rows if ``rows`` is None."""
     if rows is None:
         return torch.arange(len(neighbours), device=neighbours.device), neighbours, weights
     return rows, neighbours[rows], weights[rows]
@@ -95,15 +95,15 @@ def _pairs(neighbours: Tensor, weights: Tensor, rows: Tensor | None) -> tuple[Te
 def rigidity_loss(
     means: Tensor, turns: Tensor, previous: Tensor, neighbours: Tensor, weights: Tensor, rows: Tensor | None = None
 ) -> Tensor:
-    """Mean over pairs of sqrt(w·|R_iᵀ(μ_j − μ_i) − (μ_j − μ_i)_previous|² + 1e-20), metres.
+    """Returns the mean over pairs of sqrt(w·|R_iᵀ(μ_j − μ_i) − (μ_j − μ_i)_previous|² + 1e-20), metres.
 
     Args:
-        means: [M, 3] metres, of this frame.
+        means: [M, 3] metres, in this frame.
         turns: [M, 4] unit quaternions, rotation since the previous frame.
-        previous: [M, 3] metres, means of the previous frame.
+        previous: [M, 3] metres, means in the previous frame.
         neighbours: [M, k] int64 rows.
         weights: [M, k].
-        rows: [m] int64, the i to sum over; None for all.
+        rows: [m] int64, the indices i to sum over; None for all.
 
     >>> previous = torch.tensor([[0.0, 0, 0], [1, 0, 0]])
     >>> still = torch.tensor([[1.0, 0, 0, 0]] * 2)
@@ -123,14 +123,14 @@ def rigidity_loss(
 def isometry_loss(
     means: Tensor, distances: Tensor, neighbours: Tensor, weights: Tensor, rows: Tensor | None = None
 ) -> Tensor:
-    """Mean over pairs of sqrt(w·(|μ_j − μ_i| − d_0)² + 1e-20), metres.
+    """Returns the mean over pairs of sqrt(w·(|μ_j − μ_i| − d_0)² + 1e-20), metres.
 
     Args:
-        means: [M, 3] metres, of this frame.
-        distances: [M, k] metres, d_0: the pairs' distances when the graph was built.
+        means: [M, 3] metres, in this frame.
+        distances: [M, k] metres, d_0: distances of the pairs when the graph was built.
         neighbours: [M, k] int64 rows.
         weights: [M, k].
-        rows: [m] int64, the i to sum over; None for all.
+        rows: [m] int64, the indices i to sum over; None for all.
 
     >>> neighbours, weights = torch.tensor([[1], [0]]), torch.ones(2, 1)
     >>> means = torch.tensor([[0.0, 0, 0], [0, 1.5, 0]])
@@ -144,13 +144,13 @@ def isometry_loss(
 
 
 def rotation_loss(turns: Tensor, neighbours: Tensor, weights: Tensor, rows: Tensor | None = None) -> Tensor:
-    """Mean over pairs of sqrt(w·|q_j − q_i|² + 1e-20), of the rotations since the previous frame.
+    """Returns the mean over pairs of sqrt(w·|q_j − q_i|² + 1e-20) for the rotations since the previous frame.
 
     Args:
         turns: [M, 4] unit quaternions with w ≥ 0.
         neighbours: [M, k] int64 rows.
         weights: [M, k].
-        rows: [m] int64, the i to sum over; None for all.
+        rows: [m] int64, the indices i to sum over; None for all.
 
     >>> turns = torch.tensor([[1.0, 0, 0, 0], [0.6, 0.8, 0, 0]])
     >>> rotation_loss(turns, torch.tensor([[1], [0]]), torch.ones(2, 1))
@@ -161,15 +161,16 @@ def rotation_loss(turns: Tensor, neighbours: Tensor, weights: Tensor, rows: Tens
 
 
 def axis_lengths(factors: Tensor) -> Tensor:
-    """[M, 3] metres: lengths of the columns of the factors [M, 3, 3], the transported axes."""
+    """Returns the lengths [M, 3] in metres of the transported axes, the columns of the factors [M, 3, 3]."""
     lengths: Tensor = torch.linalg.vector_norm(factors, dim=-2)
     return lengths
 
 
 def scale_loss(factors: Tensor, first_lengths: Tensor, max_scale: float) -> Tensor:
-    """Equation (8), over axes too and against each Gaussian's own size where that is larger; metres.
+    """Returns the scale loss of equation (8) in metres, averaged over axes too.
 
-    Mean over Gaussians and axes of max(0, |column a of F| − max(max_scale, |column a of F at frame 0|)).
+    It is the mean over Gaussians and axes of max(0, |column a of F| − max(max_scale, |column a of F at frame 0|)). In
+    contrast to the paper, an axis may always keep its length at frame 0.
 
     Args:
         factors: [M, 3, 3] of this frame.
@@ -184,7 +185,7 @@ def scale_loss(factors: Tensor, first_lengths: Tensor, max_scale: float) -> Tens
 
 
 def floor_loss(means: Tensor, plane: Sequence[float]) -> Tensor:
-    """Mean metres of ``means`` [M, 3] below the plane (a, b, c, d): where a·x + b·y + c·z + d is positive.
+    """Returns the mean depth (metres) of ``means`` [M, 3] below the plane (a, b, c, d): a·x + b·y + c·z + d > 0.
 
     >>> floor_loss(torch.tensor([[0.0, 1.5, 0], [0, 0, 0]]), plane=(0, 1, 0, -1))  # y points down, the floor is at 1
     tensor(0.2500)
@@ -193,7 +194,7 @@ def floor_loss(means: Tensor, plane: Sequence[float]) -> Tensor:
 
 
 def soft_colour_loss(colours: Tensor, previous: Tensor) -> Tensor:
-    """Mean |colour − colour of the previous frame| over Gaussians and channels; both [N, 3].
+    """Returns the mean |colour − colour of the previous frame| over Gaussians and channels; both [N, 3].
 
     >>> soft_colour_loss(torch.full((4, 3), 0.5), torch.full((4, 3), 0.25))
     tensor(0.2500)

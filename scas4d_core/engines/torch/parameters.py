@@ -1,4 +1,4 @@
-"""The parameters of one attempt as leaf tensors, and Adam over those that are free (algorithm 1, last line)."""
+"""Parameters of one attempt as leaf tensors, and Adam over the free ones (algorithm 1, last line)."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from scas4d_core.engines.torch.deformation import ClusterParams, Deltas
 from scas4d_core.guards import ADAM_EPSILON
 
 GLOSS_BETAS = (0.9, 0.999)
-"""Adam's decays of gloss and environment, in every update."""
+"""Adam decay rates of gloss and environment, in every update."""
 
 
 def leaf(values: object) -> Tensor:
-    """A float64 tensor of its own, from an array or a tensor."""
+    """Returns a new float64 tensor with the values of an array or a tensor."""
     return torch.as_tensor(values, dtype=torch.float64).detach().clone()
 
 
 @dataclass(eq=False)
 class GlossParameters:
-    """Gloss and environment; see ``kernels.appearance.direction``.
+    """Gloss and environment parameters; see ``kernels.appearance.direction``.
 
     Attributes:
-        gloss: [M, 3] normals times strengths. light: rows of the environment that are light.
-        nearness: [1, 3] its row of nearness; the first number counts. middle: [1, 3] metres; it is not learnt.
-        rates: Adam's, of gloss, light and nearness.
+        gloss: [M, 3] normals times strengths. light: rows of the environment that contain light.
+        nearness: [1, 3] the environment's row of nearness; only the first number is used.
+        middle: [1, 3] metres; not learned. rates: Adam learning rates of gloss, light and nearness.
     """
 
     gloss: Tensor
@@ -46,11 +46,11 @@ class GlossParameters:
 
 @dataclass(eq=False)
 class Parameters:
-    """Everything that an attempt can learn; what is not free keeps no gradient and stays as it is.
+    """All learnable parameters of an attempt; parameters that are not free are not updated.
 
     Attributes:
-        clusters: for each layer, coarse to fine, r, t, c, s of equation (6). deltas: Δp, ΔR, Δs of equation (7).
-        moving_colours, static_colours: [M, 3] and [N − M, 3] RGB. gloss: None: not learnt.
+        clusters: r, t, c, s of equation (6) per layer, coarse to fine. deltas: Δp, ΔR, Δs of equation (7).
+        moving_colours, static_colours: [M, 3] and [N − M, 3] RGB. gloss: None: not learned.
     """
 
     clusters: list[ClusterParams]
@@ -61,11 +61,11 @@ class Parameters:
     optimizers: list[FreeParameter] = field(default_factory=list)
 
     def set_tables(self, tables: Tables) -> None:
-        """Take a deformation from the host."""
+        """Sets the deformation from host tables."""
         self.clusters, self.deltas = deformation_of(tables)
 
     def tables(self) -> Tables:
-        """The deformation, for the host."""
+        """Returns the deformation as host tables."""
         clusters = [torch.cat([p.r, p.t, p.c, p.s[:, None]], dim=1) for p in self.clusters]
         return Tables(
             [values.detach().float().numpy() for values in clusters],
@@ -73,10 +73,10 @@ class Parameters:
         )
 
     def free(self, start: AttemptStart, learnt: ColourPlan | None) -> None:
-        """Give each parameter whose rate is above 0 an optimizer, with moments of zero.
+        """Creates an optimizer with zero moments for each parameter whose learning rate is positive.
 
         Args:
-            learnt: colours that are free; None: none.
+            learnt: the free colours; None: none.
         """
         betas = start.beta1, start.beta2
         self.optimizers = []
@@ -100,7 +100,7 @@ class Parameters:
                 self.optimizers.append(FreeParameter(tensor.requires_grad_(), rate, betas, stage))
 
     def step(self, step: StepScalars) -> None:
-        """Adam over all that is free, by the factors of an iteration."""
+        """Steps Adam for all free parameters, with the rate factors of an iteration."""
         factors = {f"layer {layer}": factor for layer, factor in enumerate(step.layers)}
         factors |= {"own": step.own, "colour": step.colour, "gloss": step.gloss}
         for parameter in self.optimizers:
@@ -108,10 +108,10 @@ class Parameters:
 
 
 class FreeParameter:
-    """One tensor and its Adam.
+    """A tensor and its Adam optimizer.
 
     Attributes:
-        stage: which factor of ``StepScalars`` its rate follows: "layer k", "own", "colour" or "gloss".
+        stage: the factor of ``StepScalars`` that scales its rate: "layer k", "own", "colour" or "gloss".
     """
 
     def __init__(self, tensor: Tensor, rate: float, betas: tuple[float, float], stage: str) -> None:
@@ -119,14 +119,14 @@ class FreeParameter:
         self._adam = torch.optim.Adam([tensor], lr=rate, betas=betas, eps=ADAM_EPSILON)
 
     def step(self, factor: float) -> None:
-        """Take a step; a factor of 0 takes none and leaves the moments."""
+        """Performs one optimization step; a factor of 0 skips it and leaves the moments unchanged."""
         if factor:
             self._adam.param_groups[0]["lr"] = self._rate * factor
             self._adam.step()
 
 
 def deformation_of(tables: Tables) -> tuple[list[ClusterParams], Deltas]:
-    """The parameters of a deformation as tensors."""
+    """Converts the parameters of a deformation to tensors."""
     clusters = [ClusterParams(leaf(v[:, :3]), leaf(v[:, 3:6]), leaf(v[:, 6:9]), leaf(v[:, 9])) for v in tables.clusters]
     own = tables.deltas
     return clusters, Deltas(leaf(own[:, :3]), leaf(own[:, 3:6]), leaf(own[:, 6:]))

@@ -1,8 +1,8 @@
-"""The rasterizer in plain torch: dense, slow, exact; every other engine is tested against it in float64.
+"""Rasterizer in plain PyTorch: dense, slow and exact; in float64 it is the reference for every other engine.
 
-Projection is EWA splatting (Zwicker et al. 2001) in the form of 3D Gaussian Splatting (Kerbl et al. 2023), with the
-Jacobian's clamping of gsplat. Camera axes are OpenCV's; the centre of pixel (column i, row j) is (i + 0.5, j + 0.5).
-Gradients of means, factors, opacities and features come from autograd through everything.
+The projection is EWA splatting (Zwicker et al. 2001) in the form of 3D Gaussian Splatting (Kerbl et al. 2023), with
+the Jacobian clamping of gsplat. Camera axes follow OpenCV; the centre of pixel (column i, row j) is (i + 0.5, j + 0.5).
+Gradients of means, factors, opacities and features come from autograd.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from scas4d_core.engines.views import CameraArrays
 from scas4d_core.guards import FEATURE_CEILING, NOT_FINITE
 
 PAIRS_AT_ONCE = 4_000_000
-"""Pixel–Gaussian pairs held in memory at a time; larger pictures go in strips and are computed anew for backward."""
+"""Maximum pixel–Gaussian pairs in memory; larger pictures are split into strips that backward recomputes."""
 
 
 class CameraParams(NamedTuple):
@@ -43,7 +43,7 @@ class CameraParams(NamedTuple):
 
     @classmethod
     def of(cls, camera: Camera, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> CameraParams:
-        """The camera's numbers in the given dtype on the given device."""
+        """Converts a camera to the given dtype on the given device."""
         rotation = torch.tensor(camera.rotation, dtype=dtype, device=device)
         translation = torch.tensor(camera.translation, dtype=dtype, device=device)
         fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
@@ -51,22 +51,22 @@ class CameraParams(NamedTuple):
 
     @classmethod
     def of_arrays(cls, camera: CameraArrays) -> CameraParams:
-        """The numbers of a camera as kernels read it, in float64."""
+        """Converts a camera in kernel format to float64."""
         pose = torch.as_tensor(camera.pose, dtype=torch.float64)
         fx, fy, cx, cy = camera.lens[:4].astype(float).tolist()
         return cls(pose[:, :3], pose[:, 3], fx, fy, cx, cy, camera.width, camera.height)
 
     def depths(self, means: Tensor) -> Tensor:
-        """[N] metres along the camera's z axis of points [N, 3]; append it to the features to render depth."""
+        """Returns the depth [N] of points [N, 3] along the camera's z axis, for rendering depth as a feature."""
         return means @ self.rotation[2] + self.translation[2]
 
 
 class Projected(NamedTuple):
-    """Projected Gaussians; rows nearer than the near plane are meaningless.
+    """Projected Gaussians; rows closer than the near plane are meaningless.
 
     Attributes:
         means: [N, 2] pixels.
-        covariances: [N, 2, 2] pixels², low-pass included.
+        covariances: [N, 2, 2] pixels², including the low-pass filter.
         depths: [N] metres along z.
     """
 
@@ -79,9 +79,9 @@ class Rendered(NamedTuple):
     """A rendered picture.
 
     Attributes:
-        features: [H, W, C], background included.
-        alpha: [H, W] in 0…1, one minus the light that passes.
-        means: [N, 2] pixels, the projected means; their gradient is what adaptive density control reads.
+        features: [H, W, C], including the background.
+        alpha: [H, W] in 0…1, one minus the remaining transmittance.
+        means: [N, 2] pixels, the projected means; adaptive density control uses their gradient.
         depths: [N] metres along z.
     """
 
@@ -92,18 +92,18 @@ class Rendered(NamedTuple):
 
 
 def project(means: Tensor, factors: Tensor, camera: CameraParams, limits: Limits = DEFAULT) -> Projected:
-    """EWA projection: cov2d = (A F)(A F)ᵀ + low_pass·I, A = J_projection·W of shape 2×3.
+    """Computes the EWA projection: cov2d = (A F)(A F)ᵀ + low_pass·I, A = J_projection·W of shape 2×3.
 
-    The Jacobian is evaluated with x/z and y/z clamped to the picture widened by ``tangent_margin`` (the means are not).
+    The Jacobian is evaluated with x/z and y/z clamped to the picture widened by ``tangent_margin``; the means are not.
 
     Args:
         means: [N, 3] metres.
         factors: [N, 3, 3].
-        camera: of the inside world.
-        limits: of the backend to agree with.
+        camera: camera in the internal world.
+        limits: constants of the rasterizer.
     """
     x, y, z = (means @ camera.rotation.T + camera.translation).unbind(-1)
-    # Culled rows would divide by zero and poison the gradients of all; they are not drawn, so any z does.
+    # Culled rows would divide by zero and make all gradients NaN; they are not rendered, so any z is fine.
     z_safe = torch.where(z < limits.near, torch.full_like(z, limits.near), z)
     tan_x, tan_y = x / z_safe, y / z_safe
     margin_x = limits.tangent_margin * camera.width / (2 * camera.fx)
@@ -128,13 +128,13 @@ def _composite(
     background: Tensor,
     limits: Limits,
 ) -> tuple[Tensor, Tensor]:
-    """Pixel centres [P, 2] to features [P, C] and alpha [P]; the Gaussians come front to back."""
+    """Composites depth-sorted Gaussians at pixel centres [P, 2] to features [P, C] and alpha [P]."""
     d = pixels[:, None] - means
     a, b, c = conics.unbind(-1)
     power = -0.5 * (a * d[..., 0] ** 2 + c * d[..., 1] ** 2) - b * d[..., 0] * d[..., 1]
     alpha = (opacities * torch.exp(power)).clamp(max=limits.alpha_cap)
     alpha = torch.where(alpha >= limits.alpha_floor, alpha, 0)
-    # The running product falls, so where it is below the stop a pixel is finished for good.
+    # The product decreases monotonically, so a pixel below the stop is finished.
     passed = torch.cumprod(1 - alpha.detach(), dim=1)
     alpha = torch.where(passed >= limits.transmittance_stop, alpha, 0)
     passed = torch.cumprod(1 - alpha, dim=1)
@@ -144,7 +144,7 @@ def _composite(
 
 
 def sound(means: Tensor, factors: Tensor, opacities: Tensor, features: Tensor) -> Tensor:
-    """[N] bool: Gaussians that can be drawn, finite, within ``guards.NOT_FINITE`` metres, features not too large."""
+    """Returns [N] bool: finite Gaussians within ``guards.NOT_FINITE`` metres whose features are not too large."""
     size = means.detach().abs().sum(-1) + factors.detach().abs().sum((-2, -1)) + opacities.detach().abs()
     return (size <= NOT_FINITE) & (features.detach().abs() <= FEATURE_CEILING).all(-1)
 
@@ -160,18 +160,18 @@ def render(
 ) -> Rendered:
     """Renders Σ_i w_i·feature_i + T_final·background at every pixel, front to back by depth, ties by row.
 
-    alpha = min(cap, o·exp(−½ dᵀ cov2d⁻¹ d)) with d from the projected mean to the pixel's centre; a Gaussian
-    contributes exactly where alpha ≥ floor; a pixel is finished, that Gaussian not drawn, once T·(1 − alpha) < stop.
-    Through the cap no gradient flows. Gaussians that are not ``sound`` are left out; their gradients are 0.
+    alpha = min(cap, o·exp(−½ dᵀ cov2d⁻¹ d)) with d from the projected mean to the pixel centre. A Gaussian contributes
+    exactly if alpha ≥ floor. A pixel is finished, without that Gaussian, when T·(1 − alpha) < stop. No gradient flows
+    through the cap. Gaussians that are not ``sound`` are not rendered; their gradients are 0.
 
     Args:
         means: [N, 3] metres.
         factors: [N, 3, 3]; Σ = F Fᵀ.
         opacities: [N] in (0, 1).
-        features: [N, C], C ≥ 1: colour, label, depth, in one pass.
-        camera: of the inside world.
+        features: [N, C], C ≥ 1: colour, label and depth in one pass.
+        camera: camera in the internal world.
         background: [C].
-        limits: of the backend to agree with.
+        limits: constants of the rasterizer.
 
     >>> from scas4d_core.gaussians import Gaussians
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
@@ -186,7 +186,7 @@ def render(
     """
     finite = sound(means, factors, opacities, features)
     if not bool(finite.all()):
-        # Behind the near plane of any camera, and without anything that a product with 0 would turn into NaN.
+        # Moved behind every near plane, with values that do not become NaN in a product with 0.
         away = (-camera.translation - camera.rotation[2]) @ camera.rotation
         means = torch.where(finite[:, None], means, away)
         factors = torch.where(finite[:, None, None], factors, 0)

@@ -1,4 +1,4 @@
-"""Draws states in torch, float64: the ``Renderer`` that others are tested against."""
+"""Renderer in PyTorch, float64: the reference for the other renderers."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from scas4d_core.gaussians import Gaussians
 
 Array = NDArray[np.float32]
 TILE = 32
-"""Pixels to whose multiples ``reached`` pads a picture."""
+"""``reached`` pads a picture to multiples of this number of pixels."""
 
 
 class TorchRenderer:
-    """See ``Renderer``.
+    """The reference ``Renderer``.
 
     Args:
         background: RGB in 0…1. limits: constants of the rasterizer.
@@ -57,7 +57,7 @@ class TorchRenderer:
         return Comparison(float(losses.psnr(picture, target)), loss, (red, green, blue))
 
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
-        """See ``Renderer.gather``: the gradient of a weighted sum of the pixels, for features that it is linear in."""
+        """See ``Renderer.gather``; computed as the feature gradient of a weighted sum of pixels."""
         features = torch.zeros(len(state), len(planes), dtype=torch.float64, requires_grad=True)
         picture = self._drawn(state, camera, features, np.zeros(len(planes), np.float32))
         (picture.features * leaf(planes).permute(1, 2, 0)).sum().backward()  # type: ignore[no-untyped-call]
@@ -77,7 +77,7 @@ class TorchRenderer:
         return sums[:, :LABEL], sums[:, LABEL]
 
     def reached(self, state: Gaussians, rows: NDArray[np.int64], camera: CameraArrays) -> NDArray[np.bool_]:
-        """See ``Renderer.reached``; a block counts where a pixel's centre is in a support."""
+        """See ``Renderer.reached``; a block is set if the support contains one of its pixel centres."""
         chosen = state.rows(rows)
         params = CameraParams.of_arrays(camera)
         drawn = project(leaf(chosen.means), leaf(chosen.factors), params, self._limits)
@@ -98,7 +98,7 @@ class TorchRenderer:
         return blocks
 
     def _seen(self, state: Gaussians, camera: CameraArrays) -> Tensor:
-        """[N, 4] RGB with gloss, and the label."""
+        """Returns [N, 4] features: RGB with gloss, and the label."""
         gloss = None if state.gloss is None else leaf(state.gloss)
         environment = None if state.environment is None else leaf(state.environment)
         means, colours = leaf(state.means), leaf(state.colours)

@@ -1,6 +1,6 @@
-"""The engine of a GPU: kernels in NVIDIA Warp, float32; they run on Warp's CPU device too, slowly, for tests.
+"""GPU engine: NVIDIA Warp kernels in float32. They also run, slowly, on Warp's CPU device for tests.
 
-Pictures: ``layout`` has the structures that kernels share, ``lanes`` the lanes of a warp; ``projection``, ``supports``,
-``tiles`` and ``blend`` draw, ``picture_loss`` compares. ``rasterizer`` and ``pictures`` launch them; ``renderer`` draws
-states.
+Rendering: ``layout`` defines the structures shared by kernels and ``lanes`` the warp-level primitives. ``projection``,
+``supports``, ``tiles`` and ``blend`` render, ``picture_loss`` compares. ``rasterizer`` and ``pictures`` launch these
+kernels, and ``renderer`` renders states.
 """

@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba 2015) over tables on the device; reference: ``torch.optim.Adam``, guards: ``kernels.adam``."""
+"""Adam (Kingma and Ba 2015) over device tables; reference: ``torch.optim.Adam``, guards: ``kernels.adam``."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ def step_table(
     table: wp.array2d[wp.float32],
     guard_counts: wp.array[wp.int32],
 ) -> None:
-    """Steps a table [n, columns], a thread for each number; numbers whose rate is 0 stay, and so do their moments.
+    """Updates a table [n, columns] with one thread per element; elements with rate 0 and their moments are unchanged.
 
     Args:
-        gradients: [n, ≥ columns]. columns: rate of each column. by_row: [n] or [1] factor of each row's rates.
-        factor: on all rates. beta1, beta2: decays. correction1, correction2: 1 − β^steps.
-        first, second: moments. table: stepped. guard_counts: [2] see ``COUNTED_GUARDS``, added to.
+        gradients: [n, ≥ columns]. columns: learning rate of each column. by_row: [n] or [1] factor on each row's rates.
+        factor: factor on all rates. beta1, beta2: decay rates. correction1, correction2: 1 − β^steps.
+        first, second: moments. table: updated. guard_counts: [2] see ``COUNTED_GUARDS``; counts are added.
     """
     i, k = wp.tid()
     row = by_row[0]
@@ -49,7 +49,7 @@ def step_table(
     if rate > 0.0:
         g = gradients[i, k]
         size = wp.abs(g)
-        if not (size <= LARGEST):  # NaN, too
+        if not (size <= LARGEST):  # also true for NaN
             g = wp.where(g > 0.0, LARGEST, wp.where(g < 0.0, -LARGEST, 0.0))
             wp.atomic_add(guard_counts, 0, 1)
         elif size > 0.0 and size <= SMALLEST:
@@ -68,8 +68,8 @@ class Adam:
     """Adam over one table on the device.
 
     Args:
-        table: [n, columns] float32, stepped in place. columns: rate of each column.
-        betas: decays of the two moments, which start at zero. by_row: [n] factor on the rates of each row; None: 1.
+        table: [n, columns] float32, updated in place. columns: learning rate of each column.
+        betas: decay rates of the two moments, which start at zero. by_row: [n] factor on each row's rates; None: 1.
     """
 
     def __init__(
@@ -89,10 +89,10 @@ class Adam:
         self._guard_counts = wp.zeros(len(COUNTED_GUARDS), dtype=wp.int32, device=device)
 
     def step(self, gradients: wp.array, factor: float) -> None:
-        """Takes a step.
+        """Performs one optimization step.
 
         Args:
-            gradients: [n, ≥ columns]. factor: on all rates; 0 takes no step and leaves the moments.
+            gradients: [n, ≥ columns]. factor: factor on all rates; 0 skips the step and leaves the moments unchanged.
         """
         if factor == 0 or self._shape[0] == 0:
             return
@@ -104,7 +104,7 @@ class Adam:
         wp.launch(step_table, self._shape, inputs, device=self._table.device)
 
     def guards(self) -> GuardCounts:
-        """How often each guard acted; waits for the device."""
+        """Returns the number of times that each guard was triggered; waits for the device."""
         counts = GuardCounts(*COUNTED_GUARDS)
         counts.add(COUNTED_GUARDS, self._guard_counts.numpy().astype(np.int64))
         return counts

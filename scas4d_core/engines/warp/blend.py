@@ -1,11 +1,11 @@
 """Front-to-back blending of tiles, four features at a time, and its backward pass.
 
-A tile is 16×16 pixels, and a warp draws 8×4 of them: its lanes look at as many entries of the list at once, and draw
-those whose support meets these pixels. On the CPU device a warp is one lane, and draws one pixel.
+A tile is 16×16 pixels, and a warp renders 8×4 of them. Its lanes test one list entry each, and the warp blends the
+entries whose support intersects its pixels. On the CPU device, a warp is one lane and renders one pixel.
 
-Few tiles hold most of what is drawn, so a list is drawn in segments side by side: ``blend_segments`` draws each as if
-nothing were before it, and ``join_segments`` puts them together. A pixel that is finished within a segment is drawn
-anew there, so that it ends where the rule says. What each segment starts from is kept for the backward pass.
+Few tiles hold most of the work, so lists are split into segments that run in parallel. ``blend_segments`` renders each
+segment as if it were the first, and ``join_segments`` combines them. If a pixel ends within a segment, that segment is
+rendered again to end at the right entry. The start value of each segment is kept for the backward pass.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ ONE = wp.constant(wp.uint32(1))
 
 @wp.struct
 class Spot:
-    """A lane's pixel: its place and centre, whether it is in the picture, and its warp's upper left pixel's centre."""
+    """A lane's pixel: position and centre, whether it is in the picture, and the first pixel centre of its warp."""
 
     x: wp.int32
     y: wp.int32
@@ -48,7 +48,7 @@ class Spot:
 
 @wp.func
 def spot_of(raster: Raster, camera: Camera, tile: wp.int32, k: wp.int32) -> Spot:
-    """The k-th pixel of a tile; 32 in turn are 8×4."""
+    """Returns the k-th pixel of a tile; 32 consecutive pixels form an 8×4 block."""
     group = k // 32
     within = k - group * 32
     x0 = (tile % raster.tiles_x) * TILE + (group % 2) * 8
@@ -69,7 +69,7 @@ def spot_of(raster: Raster, camera: Camera, tile: wp.int32, k: wp.int32) -> Spot
 
 @wp.func
 def meets(spot: Spot, first: wp.vec4, second: wp.vec4) -> wp.int32:
-    """1 where a support meets the warp's pixels."""
+    """Returns 1 if a support intersects the warp's pixels."""
     met = wp.int32(0)
     if second[2] > 0.0:
         across = wp.where(lane_count() > 1, 7.0, 0.0)
@@ -84,13 +84,13 @@ def meets(spot: Spot, first: wp.vec4, second: wp.vec4) -> wp.int32:
 
 @wp.func
 def power_at(first: wp.vec4, second: wp.vec4, dx: wp.float32, dy: wp.float32) -> wp.float32:
-    """The logarithm of a splat's alpha at an offset from its mean."""
+    """Returns the logarithm of a splat's alpha at an offset from its mean."""
     return second[1] - 0.5 * (first[2] * dx * dx + second[0] * dy * dy) - first[3] * dx * dy
 
 
 @wp.struct
 class Light:
-    """A pixel while it is drawn: transmittance, the features so far, and whether it is unfinished."""
+    """State of a pixel during blending: transmittance, accumulated features, and whether it is unfinished."""
 
     passed: wp.float32
     features: wp.vec4
@@ -110,18 +110,18 @@ def draw_entries(
     passed: wp.float32,
     exact: wp.int32,
 ) -> Light:
-    """Draws entries of a list from a transmittance on; called by all lanes of a warp.
+    """Blends list entries front to back, starting from a transmittance; called by all lanes of a warp.
 
     Args:
-        begin, end: entries. open: 1 for pixels that are drawn. passed: transmittance before.
-        exact: 0: a pixel that is finished here is left with a transmittance below the stop; 1: with that before.
+        begin, end: range of entries. open: 1 for pixels to render. passed: transmittance before the first entry.
+        exact: 0: a pixel that is finished here keeps a transmittance below the stop; 1: the value before that entry.
     """
     light = Light()
     light.passed = passed
     light.open = open
     base = wp.int32(begin)
     alive = ballot(light.open)
-    # The numbers of the next candidates, and those of the next one that is drawn, are loaded before they are needed.
+    # The next candidates and the next rendered entry are loaded early to hide memory latency.
     item = wp.int32(0)
     first = wp.vec4(0.0, 0.0, 0.0, 0.0)
     second = wp.vec4(0.0, 0.0, 0.0, 0.0)
@@ -181,13 +181,13 @@ def blend_segments(
     segment_light: wp.array[wp.float32],
     segment_features: wp.array[wp.vec4],
 ) -> None:
-    """Draws each segment by itself; a warp for the next segment and some pixels of its tile, until all are done.
+    """Renders each segment independently; each warp repeatedly takes the next segment and part of its tile.
 
     Args:
-        splats: [2 N]. features: [N]. items, starts, segment_starts, segment_tiles: the lists, see ``tiles``.
-        warps: of the launch.
-        segment_light, segment_features: out [segments · 256] the light that a segment lets pass at each pixel of its
-            tile, below the stop where the pixel is finished even by this segment alone, and the features drawn.
+        splats: [2 N]. features: [N]. items, starts, segment_starts, segment_tiles: tile lists, see ``tiles``.
+        warps: number of warps in the launch.
+        segment_light, segment_features: out [segments · 256] transmittance of a segment at each pixel of its tile,
+            below the stop if this segment alone finishes the pixel, and blended features.
     """
     parts = PIXELS // lane_count()
     total = segment_starts[raster.tiles_x * raster.tiles_y] * parts
@@ -222,13 +222,13 @@ def join_segments(
     begun: wp.array2d[wp.int32],
     planes: wp.array3d[wp.float32],
 ) -> None:
-    """Puts the segments of each list together; a thread for each pixel of each tile.
+    """Combines the segments of each list, with one thread per pixel of each tile.
 
     Args:
-        background: [1] behind everything. segment_light, segment_features: from ``blend_segments``; left with what
-            each segment of an unfinished pixel starts from.
-        begun: out [rows, columns] how many segments a pixel was unfinished at the start of.
-        planes: out [5, rows, columns] the features, background included, and the transmittance left.
+        background: [1] behind all Gaussians. segment_light, segment_features: from ``blend_segments``; replaced by the
+            start values of each segment of an unfinished pixel.
+        begun: out [rows, columns] number of segments at whose start a pixel was unfinished.
+        planes: out [5, rows, columns] features, including the background, and remaining transmittance.
     """
     camera = cameras[view[0]]
     tile = wp.tid() // PIXELS
@@ -243,7 +243,7 @@ def join_segments(
     at = segment_starts[tile] * PIXELS + k
     count = wp.int32(0)
     segment = wp.int32(0)
-    # The next segment's numbers are loaded before they are needed.
+    # The next segment is loaded early to hide memory latency.
     next_passed = wp.float32(1.0)
     next_drawn = wp.vec4(0.0, 0.0, 0.0, 0.0)
     if segments > 0:
@@ -285,7 +285,7 @@ def join_segments(
 
 
 # A transposing butterfly: ten sums over 32 lanes fold into five over 16, three over 8, two over 4 and one over 2.
-# The compiler knows each index, so that the numbers stay in registers.
+# All indices are known at compile time, so the values stay in registers.
 @wp.func_native("""
 float* record = reinterpret_cast<float*>(records.data + row);
 #if defined(__CUDA_ARCH__)
@@ -318,7 +318,7 @@ def add_record(
     records: wp.array[wp.vec4], row: wp.int32, a0: wp.float32, a1: wp.float32, a2: wp.float32, a3: wp.float32,
     a4: wp.float32, a5: wp.float32, a6: wp.float32, a7: wp.float32, a8: wp.float32, a9: wp.float32,
 ) -> None:  # fmt: skip
-    """Adds ten numbers, summed over the lanes, to a record from a row on."""
+    """Sums ten numbers over the lanes and adds them to a record that starts at ``row``."""
     ...
 
 
@@ -341,12 +341,12 @@ def blend_backward(
     g_planes: wp.array3d[wp.float32],
     records: wp.array[wp.vec4],
 ) -> None:
-    """Carries the gradient of the planes to the splats; a warp for the next segment and some pixels, as forward.
+    """Backpropagates the gradient of the planes to the splats; work is distributed as in the forward pass.
 
     Args:
         segment_light, segment_features, begun, planes: from ``join_segments``.
         g_planes: [4, rows, columns] dL/dplanes of the features.
-        records: [4 N], added to; see ``projection``.
+        records: [4 N], accumulated; see ``projection``.
     """
     parts = PIXELS // lane_count()
     total = segment_starts[raster.tiles_x * raster.tiles_y] * parts
@@ -361,7 +361,7 @@ def blend_backward(
         spot = spot_of(raster, cameras[view[0]], tile, k)
         open = wp.int32(0)
         passed = wp.float32(1.0)
-        behind = wp.float32(0.0)  # what the entries behind the present one contribute, background included
+        behind = wp.float32(0.0)  # contribution of later entries and background
         g = wp.vec4(0.0, 0.0, 0.0, 0.0)
         if spot.inside == 1:  # noqa: SIM102  # Warp reads both sides of an `and`
             if number < begun[spot.y, spot.x]:

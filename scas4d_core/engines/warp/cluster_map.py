@@ -1,7 +1,7 @@
-"""The cluster map of equation (6) on a whole layer, and its backward pass; reference: ``engines.torch.deformation``.
+"""Cluster map of equation (6) for a whole layer, and its backward pass; reference: ``engines.torch.deformation``.
 
-A warp works on one cluster: its Gaussians are a contiguous range of the hierarchy's order, so that pivots and the
-gradients of the parameters are sums over the lanes, without atomics.
+A warp processes one cluster. Its Gaussians are a contiguous range of the hierarchy's order, so pivots and parameter
+gradients are sums over lanes that need no atomics.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from scas4d_core.guards import EXPONENT, HALF_TURN
 wp.set_module_options({"enable_backward": False})
 
 LARGEST = wp.constant(wp.float32(EXPONENT / log2(e)))
-"""Bound of an exponential's argument."""
+"""Upper bound of an exponential's argument."""
 SMALLEST_COSINE = wp.constant(wp.float32(HALF_TURN))
 COLUMNS = 10
-"""Parameters of a cluster: r, t, c (three each) and s."""
+"""Number of parameters of a cluster: r, t, c (three each) and s."""
 
 
 @wp.struct
 class ClusterParameters:
-    """The parameters of a cluster, with its rotation as a unit quaternion and as a matrix."""
+    """Parameters of a cluster, with its rotation as unit quaternion and as matrix."""
 
     r: wp.vec3
     t: wp.vec3
@@ -46,7 +46,7 @@ class ClusterParameters:
 
 @wp.func
 def parameters_of(table: wp.array2d[wp.float32], cluster: wp.int32) -> ClusterParameters:
-    """Reads a row of a layer's table."""
+    """Reads a row of a layer's parameter table."""
     found = ClusterParameters()
     found.r = wp.vec3(table[cluster, 0], table[cluster, 1], table[cluster, 2])
     found.t = wp.vec3(table[cluster, 3], table[cluster, 4], table[cluster, 5])
@@ -61,7 +61,7 @@ def parameters_of(table: wp.array2d[wp.float32], cluster: wp.int32) -> ClusterPa
 def pivot_of(
     start: wp.int32, end: wp.int32, sound: wp.array[wp.int32], points: wp.array[wp.vec3]
 ) -> wp.vec3:  # fmt: skip
-    """The mean of a cluster's points; all lanes get it."""
+    """Returns the mean of a cluster's points in all lanes."""
     total = wp.vec3(0.0, 0.0, 0.0)
     count = wp.float32(0.0)
     for entry in range(start + lane(), end, lane_count()):
@@ -74,13 +74,13 @@ def pivot_of(
 
 @wp.func
 def scaling(z: wp.float32) -> wp.float32:
-    """The factor f = 2σ(2z), which is tanh(z) + 1 without its cancellation."""
+    """Returns the factor f = 2σ(2z), which equals tanh(z) + 1 without cancellation."""
     return 2.0 / (1.0 + wp.exp(wp.clamp(-2.0 * z, -LARGEST, LARGEST)))
 
 
 @wp.func
 def polar(f: wp.float32, y: wp.vec3, c: wp.vec3) -> wp.vec4:
-    """The polar rotation of f I + f (2 − f) y cᵀ as a unit quaternion."""
+    """Returns the polar rotation of f I + f (2 − f) y cᵀ as a unit quaternion."""
     g = 2.0 - f
     cosine = 2.0 + g * wp.dot(c, y)
     sine = g * wp.cross(c, y)
@@ -90,7 +90,7 @@ def polar(f: wp.float32, y: wp.vec3, c: wp.vec3) -> wp.vec4:
 
 @wp.struct
 class PolarGradients:
-    """Gradients of the arguments of ``polar``."""
+    """Gradients with respect to the arguments of ``polar``."""
 
     f: wp.float32
     y: wp.vec3
@@ -99,7 +99,7 @@ class PolarGradients:
 
 @wp.func
 def polar_backward(f: wp.float32, y: wp.vec3, c: wp.vec3, g_out: wp.vec4) -> PolarGradients:
-    """Turns the gradient of ``polar`` into those of its arguments."""
+    """Backpropagates the gradient of ``polar`` to its arguments."""
     g = 2.0 - f
     along = wp.dot(c, y)
     across = wp.cross(c, y)
@@ -136,12 +136,12 @@ def map_clusters(
     moved_jacobians: wp.array[wp.mat33],
     moved_turns: wp.array[wp.vec4],
 ) -> None:
-    """Moves the Gaussians of a layer's clusters; a warp for each of K clusters.
+    """Moves the Gaussians of a layer's clusters, with one warp per cluster.
 
     Args:
-        published: 1 for the published form of the map, 0 for the centred one. starts: [K + 1] ranges of entries.
+        published: 1 for the published variant of the map, 0 for the centred one. starts: [K + 1] ranges of entries.
         table: [K, 10] parameters. sound: [M] 1 for entries that are finite.
-        points, jacobians, turns: [M] after the layers above. pivots: out [K].
+        points, jacobians, turns: [M] after the coarser layers. pivots: out [K].
         moved, moved_jacobians, moved_turns: out [M] after this layer.
     """
     cluster = wp.tid() // lane_count()
@@ -185,11 +185,11 @@ def map_clusters_backward(
     g_turns: wp.array[wp.vec4],
     g_table: wp.array2d[wp.float32],
 ) -> None:
-    """Turns gradients after a layer into those before it, in place, and into those of its parameters.
+    """Backpropagates gradients through a layer: to its inputs, in place, and to its parameters.
 
     Args:
-        published, starts, table, sound, points, jacobians, turns, pivots: as of ``map_clusters``.
-        g_points, g_jacobians, g_turns: [M] gradients of what the layer moved; overwritten. g_table: out [K, 10].
+        published, starts, table, sound, points, jacobians, turns, pivots: see ``map_clusters``.
+        g_points, g_jacobians, g_turns: [M] gradients of the layer's outputs; overwritten. g_table: out [K, 10].
     """
     cluster = wp.tid() // lane_count()
     own = parameters_of(table, cluster)
@@ -212,13 +212,13 @@ def map_clusters_backward(
             if published == 1:
                 y = back * placed
             inner = f * wp.identity(n=3, dtype=wp.float32) + slope * wp.outer(y, own.c)
-            # The turn: q ∘ polar ∘ turn of the layers above.
+            # The rotation: q ∘ polar ∘ rotation of the coarser layers.
             bent = polar(f, y, own.c)
             g_here = product(g_turns[entry], conjugate(turns[entry]))
             g_turns[entry] = product(conjugate(product(own.q, bent)), g_turns[entry])
             g_q += product(g_here, conjugate(bent))
             of_polar = polar_backward(f, y, own.c, product(conjugate(own.q), g_here))
-            # The Jacobian: R (f I + f' y cᵀ) J of the layers above.
+            # The Jacobian: R (f I + f' y cᵀ) J of the coarser layers.
             g_own = g_jacobians[entry] * wp.transpose(jacobians[entry])
             g_jacobians[entry] = wp.transpose(inner) * back * g_jacobians[entry]
             g_rotation = g_own * wp.transpose(inner)

@@ -26,12 +26,12 @@ def colour_gradients(
     gradients: wp.array2d[wp.float32],
     loss: wp.array[wp.float32],
 ) -> None:
-    """Adds the soft-colour term to the gradients of the pictures; a thread for each of N × 3 numbers.
+    """Adds the soft-colour term to the gradients of the rendering losses, with one thread per element of N × 3.
 
     Args:
-        weight: of one number's absolute change. counted: [N] 1 for Gaussians whose colours learn.
-        before, colours: [N, 3] and [N, 4], of Θ_{t−1} and now. g_features: [N, 4] of the pictures.
-        gradients: out [N, 3]. loss: [1] the weighted term is added.
+        weight: weight of one element's absolute change. counted: [N] 1 for Gaussians whose colours are learned.
+        before, colours: [N, 3] of Θ_{t−1} and [N, 4] current. g_features: [N, 4] gradients of the rendering losses.
+        gradients: out [N, 3]. loss: [1], to which the weighted term is added.
     """
     i, k = wp.tid()
     g = wp.float32(0.0)
@@ -45,11 +45,11 @@ def colour_gradients(
 
 
 class WarpColours:
-    """The colours that an attempt learns, as the first three columns of the features.
+    """The colours learned in an attempt, which are the first three columns of the features.
 
     Args:
-        plan: of the updates; it learns colours. features: [N, 4], stepped in place.
-        before: [N, 3] of Θ_{t−1}. rows: [M] moving Gaussians. start: rates and decays.
+        plan: plan of the updates; it must include colours. features: [N, 4], updated in place.
+        before: [N, 3] colours of Θ_{t−1}. rows: [M] moving Gaussians. start: learning rates and decay rates.
 
     Attributes:
         gradients: [N, 3], filled by ``backward``.
@@ -71,14 +71,14 @@ class WarpColours:
         self._adam = Adam(features, [1.0] * 3, (start.beta1, start.beta2), rates)
 
     def backward(self, g_features: wp.array, loss: wp.array) -> None:
-        """Fills ``gradients`` from those of the pictures [N, 4], and adds the weighted term to ``loss`` [1]."""
+        """Fills ``gradients`` from the gradients of the features [N, 4]; adds the weighted term to ``loss`` [1]."""
         inputs = [self._weight, self._counted, self._before, self._features, g_features, self.gradients, loss]
         wp.launch(colour_gradients, self.gradients.shape, inputs, device=self._features.device)
 
     def step(self, factor: float) -> None:
-        """Takes a step; ``factor`` is on all rates."""
+        """Performs one optimization step; ``factor`` scales all learning rates."""
         self._adam.step(self.gradients, factor)
 
     def guards(self) -> GuardCounts:
-        """How often each guard acted; waits for the device."""
+        """Returns the number of times that each guard was triggered; waits for the device."""
         return self._adam.guards()

@@ -1,4 +1,4 @@
-"""The deformation of an update on the device: cascade, deltas and terms, forward and backward."""
+"""Deformation of an update on the device: cascade, deltas and loss terms, with forward and backward pass."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ Array = NDArray[np.float32]
 
 
 class WarpDeformation:
-    """The parameters of a deformation, the Gaussians that they move, and the gradients of both.
+    """The parameters of a deformation, the deformed Gaussians, and the gradients of both.
 
     Args:
-        device: of Warp, as "cpu" or "cuda:0". plan, structure: of the updates.
+        device: Warp device, such as "cpu" or "cuda:0". plan, structure: those of the updates.
 
     Attributes:
-        clusters: per layer [K, 10], columns r, t, c, s of equation (6). deltas: [M, 9], columns Δp, Δr, Δs.
-        cluster_gradients, delta_gradients: the same shapes, filled by ``backward``.
+        clusters: [K, 10] per layer, columns r, t, c, s of equation (6). deltas: [M, 9], columns Δp, Δr, Δs.
+        cluster_gradients, delta_gradients: gradients of the same shapes, filled by ``backward``.
         means, factors: [N] of vec3 and mat33, all Gaussians, filled by ``forward``.
         turns: [M] of vec4 (w, x, y, z), rotation since Θ_{t−1}, filled by ``forward``.
-        loss: [1] weighted terms of the last iteration, without those of pictures.
-        held_back: number of moving Gaussians that are not finite; they stay as they are.
+        loss: [1] weighted terms of the last iteration, excluding rendering losses.
+        held_back: number of moving Gaussians that are not finite; they stay unchanged.
     """
 
     def __init__(self, device: str, plan: UpdatePlan, structure: Structure) -> None:
@@ -77,7 +77,7 @@ class WarpDeformation:
         return wp.array(np.ascontiguousarray(values), dtype=dtype, ndim=dimensions, device=self._device)
 
     def start(self, previous: Gaussians) -> None:
-        """Takes Θ_{t−1}, from which an attempt starts."""
+        """Loads the initial state Θ_{t−1} of an attempt."""
         moving = self._moving
         given = np.concatenate([previous.means[moving], previous.factors[moving].reshape(-1, 9)], axis=1)
         sound: NDArray[np.bool_] = np.isfinite(given).all(axis=1)
@@ -94,25 +94,25 @@ class WarpDeformation:
 
     @property
     def previous(self) -> tuple[wp.array, wp.array]:
-        """Means and factors of Θ_{t−1}, [N] of vec3 and mat33."""
+        """Returns means and factors of Θ_{t−1}, [N] of vec3 and mat33."""
         return self._previous_means, self._previous_factors
 
     def set_tables(self, tables: Tables) -> None:
-        """Sets the parameters."""
+        """Sets the parameters from host tables."""
         for table, values in zip(self.clusters, tables.clusters, strict=True):
             table.assign(values)
         self.deltas.assign(tables.deltas)
 
     def tables(self) -> Tables:
-        """The parameters, on the host; waits for the device."""
+        """Returns the parameters as host tables; waits for the device."""
         return Tables([table.numpy().copy() for table in self.clusters], self.deltas.numpy().copy())
 
     def set_samples(self, samples: list[NDArray[np.int64]]) -> None:
-        """Takes the samples of an attempt, whose neighbours are compared."""
+        """Sets the samples of an attempt whose neighbours are compared."""
         self._samples = [self._upload(sample, wp.int32) for sample in samples]
 
     def forward(self) -> None:
-        """Equations (5) to (7): fills ``means``, ``factors`` and ``turns``."""
+        """Evaluates equations (5) to (7); fills ``means``, ``factors`` and ``turns``."""
         for layer, table in enumerate(self.clusters):
             inputs = [self._published, self._starts[layer], table, self._sound, *self._stage(layer)]
             inputs += [self._pivots[layer], *self._stage(layer + 1)]
@@ -128,7 +128,7 @@ class WarpDeformation:
         """Fills ``delta_gradients``, ``cluster_gradients`` of the layers that are not frozen, and ``loss``.
 
         Args:
-            g_means, g_factors: [N] of vec3 and mat33, gradients of the pictures.
+            g_means, g_factors: [N] of vec3 and mat33, gradients of the rendering losses.
         """
         plan, device = self._plan, self._device
         for array in (self.loss, self._tied_means, self._tied_turns):

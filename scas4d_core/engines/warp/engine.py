@@ -1,4 +1,4 @@
-"""The engine of GPUs: one iteration of an update in Warp, in the order of algorithm 1."""
+"""GPU engine: one iteration of an update in Warp, in the order of algorithm 1."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ from scas4d_core.guards import SMALLEST_SQUARE, GuardCounts, summed
 Array = NDArray[np.float32]
 
 RECORDS = 4096
-"""Rows of the log on the device; the host reads them when they are full."""
+"""Capacity of the log on the device in rows; the host reads the rows when the log is full."""
 
 
 class WarpEngine:
-    """The ``UpdateEngine`` of NVIDIA Warp, on a GPU or on Warp's CPU device.
+    """The ``UpdateEngine`` based on NVIDIA Warp, on a GPU or on Warp's CPU device.
 
-    Kernels are launched one by one, and the host reads the overflow flag after each picture. Gloss and gains of the
-    cameras are computed on the host, from pictures and gradients that come down for them.
+    Kernels are launched individually, and the host reads the overflow flag after each rendering. Gloss and camera gains
+    are computed on the host from downloaded pictures and gradients.
 
     Args:
-        device: of Warp, as "cpu" or "cuda:0".
+        device: Warp device, such as "cpu" or "cuda:0".
 
     Attributes:
-        renderer: draws states with the background and limits of the plan.
+        renderer: renderer of states with the background and limits of the plan.
     """
 
     name = "warp"
@@ -50,7 +50,7 @@ class WarpEngine:
         self._device = device
 
     def bind(self, plan: UpdatePlan, structure: Structure) -> None:
-        """See ``UpdateEngine.bind``; this engine does all that a plan can ask for."""
+        """See ``UpdateEngine.bind``; this engine supports all options of a plan."""
         self._plan, self._structure, self._rows = plan, structure, structure.hierarchy.rows
         self.renderer = WarpRenderer(plan.background, plan.limits, self._device, plan.image)
         self._deformation = WarpDeformation(self._device, plan, structure)
@@ -62,7 +62,7 @@ class WarpEngine:
         self._view, self._record = (wp.zeros(1, dtype=wp.int32, device=self._device) for _ in range(2))
 
     def load_views(self, views: Sequence[TrainingView], probes: Sequence[TrainingView]) -> None:
-        """See ``UpdateEngine.load_views``; where gains are followed, the views get exposures of their own."""
+        """See ``UpdateEngine.load_views``; if gains are estimated, the views get their own copies of the exposures."""
         self._views, self._probes = list(views), list(probes)
         if self._plan.camera_gains:
             exposures = {view.name: view.exposure.copy() for view in views}
@@ -128,7 +128,7 @@ class WarpEngine:
         lap("adam")
 
     def _picture(self, index: int, weight: float, step: StepScalars) -> Array:
-        """Renders a view, compares it, and carries its losses back, times a weight; its row of the log."""
+        """Renders a view, backpropagates its loss times a weight, and returns its row of the log."""
         view, deformation, pictures = self._views[index], self._deformation, self._pictures
         if self._gloss is None:
             row = self._launched(index, _as_rows(self._features), weight)
@@ -154,23 +154,23 @@ class WarpEngine:
         return row
 
     def _launched(self, index: int, features: wp.array, weight: float) -> Array:
-        """A picture of the deformed Gaussians, its gradients added; with more room where lists had too little."""
+        """Renders a view and adds its gradients; repeats with larger lists after an overflow."""
         deformation, pictures = self._deformation, self._pictures
         self._view.fill_(index)
         given = (deformation.means, deformation.factors, self._opacities, features)
         pictures.launch(self._view, self._record, *given, weight)
-        # A picture that overflowed was drawn empty, and has added no gradient.
+        # After an overflow, the picture is empty and no gradient was added.
         while pictures.grow():
             pictures.launch(self._view, self._record, *given, weight)
         row: Array = pictures.log.numpy()[0]
         return row
 
     def _step(self, step: StepScalars) -> None:
-        """Adam over all that is free."""
+        """Steps Adam for all free parameters."""
         deformation = self._deformation
         for adam, gradient, factor in zip(self._layer_steps, deformation.cluster_gradients, step.layers, strict=True):
             adam.step(gradient, factor)
-        assert self._own_step is not None  # begin was called
+        assert self._own_step is not None  # set by `begin`
         self._own_step.step(deformation.delta_gradients, step.own)
         if self._colours is not None:
             self._colours.step(step.colour)
@@ -178,7 +178,7 @@ class WarpEngine:
             self._gloss.step(step.gloss, step.smooth_gloss)
 
     def _expose(self) -> None:
-        """Sends the exposures of the views and probes to the device."""
+        """Uploads the exposures of the views and probes to the device."""
         views = [*self._views, *self._probes]
         exposures = np.zeros((len(views), LABEL + 1, 2), np.float32)
         exposures[..., 0] = 1
@@ -268,7 +268,7 @@ class WarpEngine:
         return tables
 
     def _with_looks(self, state: Gaussians) -> Gaussians:
-        """A state with the colours, gloss and environment learnt so far."""
+        """Returns a state with the colours, gloss and environment learned so far."""
         state = state.replace(colours=np.ascontiguousarray(self._features.numpy()[:, :LABEL]))
         if self._gloss is None:
             return state
@@ -276,7 +276,7 @@ class WarpEngine:
 
 
 def record_of(index: int, row: Array, view: TrainingView) -> ViewRecord:
-    """The record of a rendering, from its row of the device's log."""
+    """Returns the record of a rendering from its row of the device's log."""
     height, width = view.target.shape[1:]
     psnr = 10 * log10(3 * height * width / max(float(row[SQUARES]), SMALLEST_SQUARE))
     red, green, blue = row[SHIFT : SHIFT + LABEL].tolist()
@@ -284,10 +284,10 @@ def record_of(index: int, row: Array, view: TrainingView) -> ViewRecord:
 
 
 def _as_rows(table: wp.array) -> wp.array:
-    """[N] of vec4, of the same memory as [N, 4]."""
+    """Views a table [N, 4] as [N] of vec4 without copying."""
     return wp.array(ptr=table.ptr, dtype=wp.vec4, shape=table.shape[0], device=table.device)
 
 
 def _as_table(rows: wp.array) -> wp.array:
-    """[N, 4], of the same memory as [N] of vec4."""
+    """Views [N] of vec4 as a table [N, 4] without copying."""
     return wp.array(ptr=rows.ptr, dtype=wp.float32, shape=(rows.shape[0], 4), device=rows.device)

@@ -1,4 +1,4 @@
-"""The deltas of single Gaussians, equation (5), with the scale and floor terms; reference: ``engines.torch``."""
+"""Per-Gaussian deltas, equation (5), with the scale and floor terms; reference: ``engines.torch``."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Terms:
-    """Weights and constants of the terms of single Gaussians.
+    """Weights and constants of the per-Gaussian terms.
 
     Attributes:
-        separate: 1: the Jacobian does not move the covariance.
-        axis_length, floor: weight of one axis, and of one Gaussian; 0: no such term. plane: of the floor.
+        separate: 1: the Jacobian does not transform the covariance.
+        axis_length, floor: weights per axis and per Gaussian; 0: no such term. plane: plane of the floor.
     """
 
     separate: wp.int32
@@ -34,13 +34,13 @@ class Terms:
 
 @wp.func
 def delta(deltas: wp.array2d[wp.float32], entry: wp.int32, first: wp.int32) -> wp.vec3:
-    """Three columns of a row of the deltas."""
+    """Reads three columns of a row of the deltas."""
     return wp.vec3(deltas[entry, first], deltas[entry, first + 1], deltas[entry, first + 2])
 
 
 @wp.func
 def stretch(ds: wp.vec3) -> wp.mat33:
-    """diag(exp Δs), with clamped arguments."""
+    """Returns diag(exp Δs), with clamped arguments."""
     return wp.diag(
         wp.vec3(
             wp.exp(wp.clamp(ds[0], -LARGEST, LARGEST)),
@@ -64,10 +64,10 @@ def apply_deltas(
     factors: wp.array[wp.mat33],
     turns: wp.array[wp.vec4],
 ) -> None:
-    """Applies Δp, ΔR, Δs after the cascade; a thread for each of M moving Gaussians.
+    """Applies Δp, ΔR, Δs after the cascade, with one thread per moving Gaussian.
 
     Args:
-        rows: [M] rows of the Gaussians in Θ. sound: [M] 1 for entries that are finite; others are left alone.
+        rows: [M] rows of the Gaussians in Θ. sound: [M] 1 for entries that are finite; others stay unchanged.
         points, jacobians, turned: [M] after the cascade. previous_factors: [N] of Θ_{t−1}. deltas: [M, 9].
         means, factors: out [N], the moving rows. turns: out [M] unit quaternions with w ≥ 0.
     """
@@ -106,14 +106,14 @@ def apply_deltas_backward(
     g_deltas: wp.array2d[wp.float32],
     loss: wp.array[wp.float32],
 ) -> None:
-    """Turns gradients of the moved Gaussians into those of the deltas and of the cascade; adds two terms.
+    """Backpropagates gradients of the moved Gaussians to deltas and cascade; adds the scale and floor terms.
 
     Args:
-        terms, rows, sound, jacobians, turned, previous_factors, deltas: as of ``apply_deltas``.
-        length_bounds: [M] metres; a longer axis is penalized (equation (8)). means, factors: [N] as moved.
-        g_means, g_factors: [N] gradients of the pictures. tied_means, tied_turns: [M] of the neighbour terms.
-        g_points, g_jacobians, g_turned: out [M] gradients of what the cascade gave. g_deltas: out [M, 9].
-        loss: [1] the weighted scale and floor terms are added.
+        terms, rows, sound, jacobians, turned, previous_factors, deltas: see ``apply_deltas``.
+        length_bounds: [M] metres; longer axes are penalized (equation (8)). means, factors: [N] after deformation.
+        g_means, g_factors: [N] gradients of the rendering losses. tied_means, tied_turns: [M] of the neighbour terms.
+        g_points, g_jacobians, g_turned: out [M] gradients of the cascade's outputs. g_deltas: out [M, 9].
+        loss: [1], to which the weighted scale and floor terms are added.
     """
     entry = wp.tid()
     if sound[entry] == 0:

@@ -1,20 +1,19 @@
-"""Functions of kernels in which the lanes of a warp work together.
+"""Warp-level primitives for kernels.
 
-A warp has 32 lanes on a GPU and one on Warp's CPU device; with these functions, a kernel is written once for both. All
-lanes of a warp must call those that exchange something. Code that Warp hands to the compiler as it is has a
-branch for each of the two devices.
+A warp has 32 lanes on a GPU and one on Warp's CPU device, so a kernel that uses these functions runs on both. All
+lanes of a warp must call the functions that exchange data. Native code snippets have one branch per device type.
 """
 
 from __future__ import annotations
 
 import warp as wp
 
-wp.config.log_level = wp.LOG_WARNING  # it would write what it compiles among the output of commands
+wp.config.log_level = wp.LOG_WARNING  # compilation messages would mix with the output of commands
 wp.set_module_options({"enable_backward": False})
 
 
 def lanes_of(device: str) -> int:
-    """The number of lanes of a warp on a device."""
+    """Returns the number of lanes of a warp on a device."""
     return 32 if wp.get_device(device).is_cuda else 1
 
 
@@ -26,7 +25,7 @@ return 0;
 #endif
 """)
 def lane() -> wp.int32:
-    """The number of this lane in its warp."""
+    """Returns the index of this lane in its warp."""
     ...
 
 
@@ -38,7 +37,7 @@ return 1;
 #endif
 """)
 def lane_count() -> wp.int32:
-    """The number of lanes of a warp."""
+    """Returns the number of lanes of a warp."""
     ...
 
 
@@ -50,7 +49,7 @@ return flag != 0 ? 1u : 0u;
 #endif
 """)
 def ballot(flag: wp.int32) -> wp.uint32:
-    """The lanes whose flag is not 0, as bits."""
+    """Returns a bitmask of the lanes whose flag is not 0."""
     ...
 
 
@@ -62,7 +61,7 @@ return 0;
 #endif
 """)
 def lowest(bits: wp.uint32) -> wp.int32:
-    """The first lane among some, by their bits; 0 where there is none."""
+    """Returns the index of the lowest set bit, or 0 if there is none."""
     ...
 
 
@@ -74,7 +73,7 @@ return value;
 #endif
 """)
 def broadcast(value: wp.int32, source: wp.int32) -> wp.int32:
-    """The value that one of the lanes has."""
+    """Returns the value of the lane ``source`` in all lanes."""
     ...
 
 
@@ -84,7 +83,7 @@ __syncwarp();
 #endif
 """)
 def sync_lanes() -> None:
-    """Waits for the lanes of the warp; what they have written can be read by each other."""
+    """Synchronizes the lanes of a warp and makes their writes visible to each other."""
     ...
 
 
@@ -95,7 +94,7 @@ for (int k = 16; k > 0; k >>= 1) value += __shfl_xor_sync(0xffffffffu, value, k)
 return value;
 """)
 def sum_over_lanes(value: wp.float32) -> wp.float32:
-    """The sum of the lanes' values."""
+    """Returns the sum of a value over the lanes."""
     ...
 
 
@@ -107,7 +106,7 @@ return ::expf(x);
 #endif
 """)
 def fast_exp(x: wp.float32) -> wp.float32:
-    """The exponential, to about 1e-6 relative."""
+    """Returns the exponential with a relative error of about 1e-6."""
     ...
 
 
@@ -119,7 +118,7 @@ return a / b;
 #endif
 """)
 def fast_divide(a: wp.float32, b: wp.float32) -> wp.float32:
-    """The quotient, to about 1e-7 relative; 0 where the divisor is beyond 2^126."""
+    """Returns the quotient with a relative error of about 1e-7; 0 for divisors above 2^126."""
     ...
 
 
@@ -129,7 +128,7 @@ either.number = x;
 return either.bits;
 """)
 def bits_of(x: wp.float32) -> wp.uint32:
-    """The bits of a number; those of positive numbers sort as the numbers do."""
+    """Returns the bits of a number; for positive numbers, they sort in the same order."""
     ...
 
 
@@ -142,7 +141,7 @@ return rows.data[row];
 #endif
 """)
 def load(rows: wp.array[wp.vec4], row: wp.int32) -> wp.vec4:
-    """A row, in one instruction of 16 bytes."""
+    """Loads a row with one 16-byte instruction."""
     ...
 
 
@@ -154,5 +153,5 @@ rows.data[row] = value;
 #endif
 """)
 def store(rows: wp.array[wp.vec4], row: wp.int32, value: wp.vec4) -> None:
-    """Sets a row, in one instruction of 16 bytes."""
+    """Stores a row with one 16-byte instruction."""
     ...

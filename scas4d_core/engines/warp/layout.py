@@ -1,7 +1,7 @@
-"""The structures that the kernels of a picture share: cameras, the sizes of pictures and lists, the log.
+"""Structures shared by rendering kernels: cameras, sizes of pictures and lists, log.
 
-Sizes of launches are constants of a CUDA graph, so buffers have the size of the largest picture; a kernel reads the
-size of the picture at hand from its camera. All pictures have as many columns of tiles as the largest.
+Launch dimensions are constants of a CUDA graph, so buffers have the size of the largest picture. Kernels read the
+actual picture size from the camera. All pictures use the tile stride of the largest one.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ from scas4d_core.engines.views import CameraArrays
 wp.set_module_options({"enable_backward": False})
 
 TILE = 16
-"""Pixels of a tile's side."""
+"""Side of a tile in pixels."""
 PIXELS = TILE * TILE
-"""Pixels of a tile, and threads of a block that draws one."""
+"""Pixels of a tile, and threads of a block that renders one."""
 SEGMENT = 128
-"""Entries of a segment: lists are drawn a segment at a time, side by side. 64 and 256 take 5 to 15 % longer."""
+"""Entries per segment of a list; segments are blended in parallel. 64 and 256 are 5 to 15 % slower."""
 
 COLUMNS = 8
-"""Numbers of a row of the log, which has a row for each rendering."""
+"""Columns of the log, which has one row per rendering."""
 IMAGE_LOSS, MASK_LOSS, SQUARES, SHIFT, PAIRS = 0, 1, 2, 3, 6
 """Columns of the log: weighted losses, sum of squared RGB differences, mean of the picture minus mean of the rendering
-(three columns, RGB in 0…1, exposure included), entries of the tile lists."""
+(three columns, RGB in 0…1, with exposure), and number of tile-list entries."""
 
 
 @wp.struct
 class Camera:
-    """A camera as kernels read it: world to camera, OpenCV axes; focal lengths and centre in pixels; picture size."""
+    """A camera in kernel format: world to camera, OpenCV axes; focal lengths and centre in pixels; picture size."""
 
     rotation: wp.mat33
     translation: wp.vec3
@@ -48,8 +48,8 @@ class Raster:
     """Constants of a rasterizer.
 
     Attributes:
-        count: Gaussians. columns, rows: pixels of the largest picture. tiles_x, tiles_y: its tiles.
-        capacity: entries of all lists of one picture.
+        count: number of Gaussians. columns, rows: size of the largest picture in pixels. tiles_x, tiles_y: in tiles.
+        capacity: maximum number of entries in all lists of one picture.
         alpha_floor, alpha_cap, stop, low_pass, near, margin: the fields of ``Limits``.
         log_floor: natural logarithm of ``alpha_floor``.
     """
@@ -70,7 +70,7 @@ class Raster:
 
 
 def camera_of(camera: CameraArrays) -> Camera:
-    """The structure of a camera."""
+    """Converts a camera to its kernel structure."""
     made = Camera()
     made.rotation = wp.mat33(*camera.pose[:, :3].ravel().tolist())
     made.translation = wp.vec3(*camera.pose[:, 3].tolist())
@@ -80,10 +80,10 @@ def camera_of(camera: CameraArrays) -> Camera:
 
 
 def raster_of(limits: Limits, count: int, columns: int, rows: int, capacity: int) -> Raster:
-    """The structure of a rasterizer.
+    """Returns the kernel structure of the rasterizer constants.
 
     Args:
-        count: Gaussians. columns, rows: pixels of the largest picture. capacity: entries of all lists of one picture.
+        count: number of Gaussians. columns, rows: size of the largest picture in pixels. capacity: see ``Raster``.
     """
     made = Raster()
     made.count, made.columns, made.rows, made.capacity = count, columns, rows, capacity

@@ -1,4 +1,4 @@
-"""Rigidity, isometry and rotation between neighbours, with their gradients; reference: ``engines.torch.losses``."""
+"""Rigidity, isometry and rotation terms between neighbours, with gradients; reference: ``engines.torch.losses``."""
 
 from __future__ import annotations
 
@@ -27,15 +27,16 @@ def neighbour_terms(
     tied_turns: wp.array[wp.vec4],
     loss: wp.array[wp.float32],
 ) -> None:
-    """Adds up the three terms and their gradients; a thread for each of S sampled Gaussians.
+    """Accumulates the three terms and their gradients, with one thread per sampled Gaussian.
 
-    Roots are exact: at rest differences are rounding, and a fast root would turn them into gradients of full size.
+    Square roots are exact: without motion, differences are rounding errors, and a fast square root would turn them into
+    full-size gradients.
 
     Args:
-        weights: of rigidity, isometry and rotation, for one pair; 0: no such term.
-        sample: [S] entries. neighbours, pair_weights, distances: [M, k], weights of 0 for pairs that do not count.
-        rows: [M] rows of the Gaussians in Θ. previous, means: [N] of Θ_{t−1}, and as moved. turns: [M].
-        tied_means, tied_turns: [M] gradients, added to. loss: [1] the weighted terms are added.
+        weights: weights of rigidity, isometry and rotation per pair; 0: no such term.
+        sample: [S] entries. neighbours, pair_weights, distances: [M, k]; weights are 0 for unused pairs.
+        rows: [M] rows of the Gaussians in Θ. previous, means: [N] of Θ_{t−1} and after deformation. turns: [M].
+        tied_means, tied_turns: [M] accumulated gradients. loss: [1], to which the weighted terms are added.
     """
     i = sample[wp.tid()]
     here = wp.float32(0.0)

@@ -1,8 +1,8 @@
-"""The picture loss 0.8 L1 + 0.2 (1 − SSIM) of views, and its gradient. Reference: ``engines.torch.losses``.
+"""Picture loss 0.8 L1 + 0.2 (1 − SSIM) of views, and its gradient. Reference: ``engines.torch.losses``.
 
-SSIM is that of 3D Gaussian Splatting: 11×11 Gaussian window, sigma 1.5, zero padding. A thread computes four pixels one
-above the other: it filters the 14 rows that their windows meet along the row, and adds each up for the four. Windows
-are filtered anew instead of being kept: arithmetic is cheap where all pixels of a picture fill a tenth of a GPU.
+SSIM follows 3D Gaussian Splatting: 11×11 Gaussian window, sigma 1.5, zero padding. A thread computes four pixels of a
+column: it filters the 14 rows of their windows horizontally and accumulates each row for the four pixels. Windows are
+recomputed instead of stored: arithmetic is cheap, as all pixels of a picture occupy only a tenth of a GPU.
 """
 
 from __future__ import annotations
@@ -19,20 +19,20 @@ from scas4d_core.engines.warp.layout import IMAGE_LOSS, MASK_LOSS, SHIFT, SQUARE
 from scas4d_core.engines.warp.rasterizer import Rasterizer
 from scas4d_core.guards import SSIM_C1, SSIM_C2
 
-# Loops over the window stay loops, of a length that the compiler does not know: written out, they take all registers.
+# Window loops must not be unrolled, which would exhaust the registers: their length is a runtime argument.
 wp.set_module_options({"enable_backward": False, "max_unroll": 4})
 
 Array = NDArray[np.float32]
 
 REACH = 5
-"""Pixels of the window on either side of its centre."""
+"""Radius of the window in pixels."""
 ROWS = 4
-"""Pixels of a thread."""
+"""Pixels per thread."""
 
 _taps = np.exp(-((np.arange(2 * REACH + 1) - REACH) ** 2) / (2 * 1.5**2))
 _taps /= _taps.sum()
 PADDED_TAPS = np.float32([0.0] * (ROWS - 1) + _taps.tolist() + [0.0] * (ROWS - 1))
-"""[17] weights of the window, with zeros on either side for those of four rows that a window does not reach."""
+"""[17] window weights, padded with zeros for rows outside the window of one of the four pixels."""
 PAD = ROWS - 1
 C1 = wp.constant(wp.float32(SSIM_C1))
 C2 = wp.constant(wp.float32(SSIM_C2))
@@ -48,7 +48,7 @@ return 1;
 #endif
 """)
 def leads() -> wp.int32:
-    """1 in the thread of a block that has ``sum_over_block``; on the CPU device each thread is a block."""
+    """Returns 1 in the thread that receives ``sum_over_block``; on the CPU device each thread is a block."""
     ...
 
 
@@ -81,13 +81,13 @@ return value;
 #endif
 """)
 def sum_over_block(value: wp.vec3) -> wp.vec3:
-    """The sum over the threads of a block, in its first thread; called by all of them."""
+    """Sums a value over a block, with the result in its first thread; called by all threads."""
     ...
 
 
 @wp.struct
 class Place:
-    """What a thread of the loss knows: its view and channel, the picture's size, and its first pixel."""
+    """Context of a loss thread: view, channel, picture size, and first pixel."""
 
     view: wp.int32
     channel: wp.int32
@@ -95,8 +95,8 @@ class Place:
     height: wp.int32
     x: wp.int32
     y: wp.int32
-    shown: wp.int32  # 1 where the pixel is in the picture
-    compared: wp.int32  # 1 where the target has this channel too
+    shown: wp.int32  # 1 if the pixel is in the picture
+    compared: wp.int32  # 1 if the target has this channel
     gain: wp.float32
     offset: wp.float32
     share: wp.float32  # weight of one pixel in the loss
@@ -107,7 +107,7 @@ def place_of(
     cameras: wp.array[Camera], channels: wp.array[wp.int32], view: wp.array[wp.int32],
     exposures: wp.array2d[wp.vec2], weights: wp.vec4, channel: wp.int32, band: wp.int32, x: wp.int32,
 ) -> Place:  # fmt: skip
-    """What a thread has to know."""
+    """Returns the context of a thread."""
     here = Place()
     here.view = view[0]
     here.channel = channel
@@ -136,10 +136,10 @@ def target_moments(
     means: wp.array4d[wp.float32],
     squares: wp.array4d[wp.float32],
 ) -> None:
-    """Fills the window's means of each target and of its square.
+    """Fills the windowed means of each target and of its square.
 
     Args:
-        targets: [views, 4, rows, columns]. means, squares: out, the same; beyond a picture, as it is.
+        targets: [views, 4, rows, columns]. means, squares: out, same shape; values outside a picture stay unchanged.
     """
     view, channel, y, x = wp.tid()
     camera = cameras[view]
@@ -166,7 +166,7 @@ def target_moments(
 
 @wp.kernel
 def find_blank(cameras: wp.array[Camera], targets: wp.array4d[wp.float32], blank: wp.array3d[wp.int32]) -> None:
-    """Marks the tiles in which each target is 0; a thread for each tile.
+    """Marks the tiles in which a target is zero everywhere, with one thread per tile.
 
     Args:
         targets: [views, 4, rows, columns]. blank: out [views, tile rows, tile columns] 1 or 0.
@@ -187,7 +187,7 @@ def nothing_near(
     here: Place, tiles_x: wp.int32, starts: wp.array[wp.int32], background: wp.array[wp.vec4],
     blank: wp.array3d[wp.int32],
 ) -> wp.bool:  # fmt: skip
-    """True where the windows of a thread's pixels are 0 in the picture and in the target."""
+    """Returns whether picture and target are zero in all windows of a thread's pixels."""
     nothing = here.offset == 0.0 and background[0][here.channel] == 0.0
     if nothing:
         x1 = wp.min(here.x + REACH, here.width - 1) // TILE
@@ -220,21 +220,21 @@ def picture_loss(
     by_window: wp.array3d[wp.vec3],
     log: wp.array2d[wp.float32],
 ) -> None:
-    """Adds up the loss of a view, and keeps its derivatives by the quantities of SSIM's window.
+    """Accumulates the loss of a view, and stores its derivatives with respect to the windowed quantities of SSIM.
 
-    Windows of which picture and target are 0 have no loss; their derivatives are left as they are, and not read.
+    Windows in which picture and target are zero have no loss; their derivatives are neither written nor read.
 
-    The launch is [4, bands of ``ROWS`` rows, columns]; each block is within one channel.
+    The launch dimensions are [4, bands of ``ROWS`` rows, columns]; a block covers one channel.
 
     Args:
-        channels: [views] of each target. view, record: [1] index of the view, and row of the log.
+        channels: [views] channels of each target. view, record: [1] index of the view, and row of the log.
         window: 11. taps: see ``PADDED_TAPS``. exposures: [views, 4] gain and offset.
-        weights: of the mean over a plane, by channel.
+        weights: weight of each channel's mean.
         planes: [4 or more, rows, columns] the rendering.
         targets, means, squares: [views, 4, rows, columns] see ``target_moments``.
-        tiles_x, starts, background: of the picture's tile lists, and behind everything. blank: see ``find_blank``.
-        by_window: out [4, rows, columns] derivatives of SSIM by the window's mean, mean square and mean product.
-        log: [records, ``COLUMNS``], added to.
+        tiles_x, starts, background: tile lists and background of the rendering. blank: see ``find_blank``.
+        by_window: out [4, rows, columns] derivatives by SSIM's windowed mean, mean square and mean product.
+        log: [records, ``COLUMNS``], accumulated.
     """
     channel, band, x = wp.tid()
     at = place_of(cameras, channels, view, exposures, weights, channel, band, x)
@@ -310,13 +310,13 @@ def picture_gradient(
     by_window: wp.array3d[wp.vec3],
     g_planes: wp.array3d[wp.float32],
 ) -> None:
-    """Fills the gradient of the loss of a view by its planes; the launch is that of ``picture_loss``.
+    """Fills the gradient of a view's loss with respect to the planes; the launch is that of ``picture_loss``.
 
-    Tiles whose lists are empty are left as they are: nothing there has a gradient.
+    Tiles with empty lists are not written, because nothing there has a gradient.
 
     Args:
-        weights: of the mean over a plane, by channel. by_window: from ``picture_loss``.
-        g_planes: out [4, rows, columns]; 0 in a channel that the target lacks. The others: see ``picture_loss``.
+        weights: weight of each channel's mean. by_window: from ``picture_loss``.
+        g_planes: out [4, rows, columns]; 0 in channels that the target lacks. See ``picture_loss`` for the others.
     """
     channel, band, x = wp.tid()
     at = place_of(cameras, channels, view, exposures, weights, channel, band, x)
@@ -355,13 +355,13 @@ def picture_gradient(
 
 
 class PictureLoss:
-    """The pictures of a frame on a device, and the loss of a rendering against one of them.
+    """The pictures of a frame on a device, and the loss of a rendering compared with one of them.
 
     Args:
-        device: of Warp, as "cpu" or "cuda:0". image_weight, mask_weight: of the two terms.
+        device: Warp device, such as "cpu" or "cuda:0". image_weight, mask_weight: weights of the two terms.
 
     Attributes:
-        columns, rows: pixels of the largest picture so far.
+        columns, rows: size of the largest picture so far, in pixels.
         cameras: [views] of type ``Camera``. exposures: [views, 4] of vec2, gain and offset of each channel.
     """
 
@@ -374,17 +374,17 @@ class PictureLoss:
         self.columns = self.rows = 0
 
     def load(self, views: Sequence[TrainingView]) -> bool:
-        """Takes the pictures, cameras and exposures of a frame; pictures that it has are not sent again.
+        """Uploads the pictures, cameras and exposures of a frame; pictures that are already loaded are reused.
 
         Returns:
-            Whether buffers were replaced: a graph that was captured before has to be captured anew.
+            Whether buffers were replaced, which invalidates captured graphs.
         """
         columns = max(self.columns, *(view.camera.width for view in views))
         rows = max(self.rows, *(view.camera.height for view in views))
         replaced = columns > self.columns or rows > self.rows or len(views) > len(self._taken)
         if replaced:
             self._allocate(max(len(views), len(self._taken)), columns, rows)
-        elif self._sent is not None:  # what is on its way must not be overwritten
+        elif self._sent is not None:  # a pending upload must not be overwritten
             wp.synchronize_event(self._sent)
         fresh = []
         for index, view in enumerate(views):
@@ -416,7 +416,7 @@ class PictureLoss:
         """Adds the loss of a view's rendering to a row of the log; see ``picture_loss``.
 
         Args:
-            drawn: rasterizer that drew it. background: [1] of vec4, behind everything.
+            drawn: rasterizer with the rendering. background: [1] of vec4, behind all Gaussians.
         """
         given = [self.cameras, self.channels, view, record, *self._window, self.exposures, wp.vec4(*self._weights)]
         targets = [drawn.planes, self.targets, self.target_means, self.target_squares]
@@ -424,18 +424,18 @@ class PictureLoss:
         wp.launch(picture_loss, self._threads, given + targets + kept, device=self._device)
 
     def carry_back(self, view: wp.array, drawn: Rasterizer, weight: float) -> None:
-        """Fills ``drawn.g_planes`` with the gradient of what was measured last, times a weight."""
+        """Fills ``drawn.g_planes`` with the gradient of the last measured loss, times a weight."""
         weights = wp.vec4(*(weight * each for each in self._weights))
         given = [self.cameras, self.channels, view, *self._window, self.exposures, weights]
         kept = [drawn.planes, self.targets, drawn.tiles_x, drawn.starts, self._by_window, drawn.g_planes]
         wp.launch(picture_gradient, self._threads, given + kept, device=self._device)
 
     def _allocate(self, views: int, columns: int, rows: int) -> None:
-        """Makes the buffers of so many views, whose pictures are to be sent."""
+        """Allocates buffers for a number of views, and marks all pictures for upload."""
         device, shape = self._device, (views, CHANNELS, rows, columns)
         pinned = wp.get_device(device).is_cuda
         self.columns, self.rows, self._taken = columns, rows, [None] * views
-        # Whole blocks within each channel.
+        # Blocks must not span two channels.
         bands = -(-rows // ROWS)
         self._threads = (CHANNELS, -(-bands // 8) * 8, -(-columns // 32) * 32)
         self.cameras = wp.zeros(views, dtype=Camera, device=device)
@@ -448,7 +448,7 @@ class PictureLoss:
         self._channels = wp.zeros(views, dtype=wp.int32, device="cpu", pinned=pinned)
         self._exposures = wp.zeros((views, CHANNELS), dtype=wp.vec2, device="cpu", pinned=pinned)
         self._targets = wp.zeros(shape, dtype=wp.float32, device="cpu", pinned=pinned)
-        # Views of the same memory.
+        # Array views of the same memory.
         self._host_channels, self._host_exposures = self._channels.numpy(), self._exposures.numpy()
         self._host_targets = self._targets.numpy()
         self._host_exposures[:] = [1, 0]

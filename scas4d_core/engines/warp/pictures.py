@@ -1,4 +1,4 @@
-"""The pictures of an iteration: render a view, compare it, and carry its loss back to the Gaussians."""
+"""Rendering pass of an iteration: renders a view, compares it, and backpropagates its loss to the Gaussians."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from scas4d_core.guards import GuardCounts
 
 
 class PicturePass:
-    """Renders, compares and carries back the views of an iteration, one after the other.
+    """Renders, compares and backpropagates the views of an iteration one after the other.
 
-    ``launch`` and ``measure`` can be captured in a CUDA graph, once each has run: a kernel is compiled when it is first
-    launched. A graph holds as long as ``generation`` stays the same.
+    ``launch`` and ``measure`` can be captured in a CUDA graph after each has run once, which compiles the kernels. A
+    graph is valid while ``generation`` does not change.
 
     Args:
-        device: of Warp, as "cpu" or "cuda:0". plan: of the updates. count: N Gaussians.
+        device: Warp device, such as "cpu" or "cuda:0". plan: plan of the updates. count: N Gaussians.
 
     Attributes:
-        grad_means, grad_factors, grad_features: [N] of vec3, mat33 and vec4; ``launch`` adds to them.
-        planes: [5, rows, columns] of the last rendering: RGB before exposure, label, transmittance left.
+        grad_means, grad_factors, grad_features: [N] of vec3, mat33 and vec4, accumulated by ``launch``.
+        planes: [5, rows, columns] of the last rendering: RGB before exposure, label, remaining transmittance.
         exposures: [views, 4] of vec2, gain and offset; may be changed between launches.
         log: [records, 8] float32, columns as in ``layout``.
-        overflow: [1] int32, set to 1 when a picture had no room and was drawn empty; see ``grow``.
+        overflow: [1] int32, set to 1 if a picture is empty because its lists exceeded the capacity; see ``grow``.
         generation: number of times that buffers were replaced.
     """
 
@@ -47,7 +47,7 @@ class PicturePass:
 
     @property
     def planes(self) -> wp.array:
-        """See the attributes of the class; so are the others."""
+        """See the class attributes."""
         return self._rasterizer.planes
 
     @property
@@ -64,29 +64,29 @@ class PicturePass:
         return self._rasterizer.overflow
 
     def guards(self) -> GuardCounts:
-        """How often the guards of pictures have acted since ``forget_guards``; waits for the device."""
+        """Returns how often the rendering guards were triggered since ``forget_guards``; waits for the device."""
         counts = GuardCounts(*COUNTED_GUARDS)
         counts.add(COUNTED_GUARDS, self._rasterizer.guard_counts.numpy().astype(np.int64))
         return counts
 
     def forget_guards(self) -> None:
-        """Sets the counts of the guards to 0."""
+        """Resets the counts of the guards to 0."""
         self._rasterizer.guard_counts.zero_()
 
     def load_views(self, views: Sequence[TrainingView]) -> None:
-        """Takes the pictures, cameras and exposures of a frame; pictures that it has are not sent again."""
+        """Uploads the pictures, cameras and exposures of a frame; pictures that are already loaded are reused."""
         if self._loss.load(views):
             self._rasterizer.resize(self._loss.columns, self._loss.rows)
             self.generation += 1
 
     def reserve(self, records: int) -> None:
-        """Makes room for so many rows of the log, which may lose what it holds."""
+        """Allocates log rows for a number of records; the previous contents may be lost."""
         if records > self.log.shape[0]:
             self.log = wp.zeros((records, COLUMNS), dtype=wp.float32, device=self._device)
             self.generation += 1
 
     def grow(self) -> bool:
-        """Makes more room where a picture had too little, and says whether one had; waits for the device."""
+        """Enlarges the lists after an overflow and returns whether there was one; waits for the device."""
         grew = self._rasterizer.grow()
         self.generation += grew
         return grew
@@ -95,11 +95,11 @@ class PicturePass:
         self, view: wp.array, record: wp.array, means: wp.array, factors: wp.array, opacities: wp.array,
         features: wp.array,
     ) -> None:  # fmt: skip
-        """Renders a view into ``planes`` and compares it; the losses go to a row of the log.
+        """Renders a view into ``planes`` and compares it; the losses are written to a row of the log.
 
         Args:
             view: [1] int32, index of the view. record: [1] int32, row of the log.
-            means, factors, opacities, features: [N] of vec3, mat33, float32, and vec4 as the camera sees them;
+            means, factors, opacities, features: [N] of vec3, mat33, float32, and vec4 as the camera sees them; all
                 contiguous.
         """
         cameras, log = self._loss.cameras, self.log
@@ -111,7 +111,7 @@ class PicturePass:
         self, view: wp.array, record: wp.array, means: wp.array, factors: wp.array, opacities: wp.array,
         features: wp.array, weight: float,
     ) -> None:  # fmt: skip
-        """As ``measure``; also adds the gradients, times a weight, to ``grad_means`` and the others."""
+        """Runs ``measure`` and adds the gradients, times a weight, to ``grad_means`` etc."""
         self.measure(view, record, means, factors, opacities, features)
         rasterizer, cameras = self._rasterizer, self._loss.cameras
         self._loss.carry_back(view, rasterizer, weight)

@@ -1,7 +1,7 @@
 """EWA projection of Gaussians into a camera, and its backward pass. Reference: ``engines.torch.rasterizer``.
 
-A Gaussian that cannot be drawn without spoiling the pixels of others is left out, and so is a gradient that overflows
-(``guards``).
+Gaussians with invalid values are not rendered, because they would corrupt the pixels of others. Gradients that overflow
+are dropped (``guards``).
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ BRIGHTEST = wp.constant(wp.float32(FEATURE_CEILING))
 WIDEST = wp.constant(wp.float32(FOOTPRINT_CEILING))
 STEEPEST = wp.constant(wp.float32(GRADIENT_NOT_FINITE))
 COUNTED_GUARDS = ("not_finite", "footprint_ceiling", "gradient_not_finite")
-"""Guards that are counted: the first two in ``project``, the last in ``project_backward``."""
+"""Counted guards: the first two in ``project``, the last in ``project_backward``."""
 RECORD = 4
-"""Rows of a splat in ``records`` [4 N]. Ten numbers are sums over pixels: dL/dpower times 1, x, y, xx, xy and yy of
-the offset (x, y) from the mean, and dL/dfeatures; the rest pads them to 64 bytes."""
+"""Rows per splat in ``records`` [4 N]. Ten values are sums over pixels: dL/dpower times 1, x, y, xx, xy and yy of the
+offset (x, y) from the mean, and dL/dfeatures. The rest is padding to 64 bytes."""
 FEATURES = 6
-"""The first of the ten numbers that is of features."""
+"""Index of the first of the ten values that belongs to the features."""
 
 
 @wp.func
 def held(raster: Raster, tangent: wp.float32, focal: wp.float32, centre: wp.float32, size: wp.int32) -> wp.vec2:
-    """x/z or y/z clamped for the Jacobian, and 1 where it was within the bounds, else 0."""
+    """Returns x/z or y/z clamped for the Jacobian, and 1 if it was within the bounds, else 0."""
     margin = raster.margin * 0.5 * wp.float32(size) / focal
     low = -(centre / focal + margin)
     high = (wp.float32(size) - centre) / focal + margin
@@ -39,7 +39,7 @@ def held(raster: Raster, tangent: wp.float32, focal: wp.float32, centre: wp.floa
 
 @wp.func
 def size_of(mean: wp.vec3, factor: wp.mat33, opacity: wp.float32) -> wp.float32:
-    """The sum of a Gaussian's magnitudes; NaN or infinite where one of them is."""
+    """Returns the sum of a Gaussian's absolute values, which is NaN or infinite if one of them is."""
     size = wp.abs(mean[0]) + wp.abs(mean[1]) + wp.abs(mean[2]) + wp.abs(opacity)
     for row in range(3):
         size += wp.abs(factor[row, 0]) + wp.abs(factor[row, 1]) + wp.abs(factor[row, 2])
@@ -48,7 +48,7 @@ def size_of(mean: wp.vec3, factor: wp.mat33, opacity: wp.float32) -> wp.float32:
 
 @wp.func
 def sound(mean: wp.vec3, factor: wp.mat33, opacity: wp.float32, feature: wp.vec4) -> wp.bool:
-    """True where a Gaussian is finite and neither too far, too large nor too bright."""
+    """Returns whether a Gaussian is finite and neither too distant, too large nor too bright."""
     return (
         size_of(mean, factor, opacity) <= FARTHEST
         and wp.abs(feature[0]) <= BRIGHTEST
@@ -88,7 +88,7 @@ def project_one(
         xx = wp.dot(m0, m0) + raster.low_pass
         yy = wp.dot(m1, m1) + raster.low_pass
         xy = wp.dot(m0, m1)
-        # Without the cancellation of xx yy − xy² for needles.
+        # Avoids the cancellation of xx yy − xy² for needle-shaped Gaussians.
         normal = wp.cross(m0, m1)
         determinant = wp.dot(normal, normal) + raster.low_pass * (xx + yy - raster.low_pass)
         if not (determinant > 0.0 and determinant < WIDEST):
@@ -132,15 +132,15 @@ def project(
     starts: wp.array[wp.int32],
     keys: wp.array[wp.uint64],
 ) -> None:
-    """Projects N Gaussians, a thread each, and counts the entries of each tile's list; whole warps.
+    """Projects N Gaussians with one thread each, and counts the entries of each tile list; launched in whole warps.
 
     Args:
-        raster: constants. cameras: of all views. view: [1] index of the camera.
+        raster: constants. cameras: all views. view: [1] index of the camera.
         means, factors, opacities, features: [N]; Σ = F Fᵀ.
-        splats: out [2 N], see ``supports``. boxes: out [N] tiles x0, y0, x1, y1 (exclusive) around the support; where
-            culled, anything. records: out [4 N], set to 0. guard_counts: [3] counts of the guards ``COUNTED_GUARDS``,
-            added to.
-        tile_counts: [tiles], added to. starts, keys: of the lists, left alone.
+        splats: out [2 N], see ``supports``. boxes: out [N] tiles x0, y0, x1, y1 (exclusive) around the support;
+            undefined if culled. records: out [4 N], set to 0.
+        guard_counts: [3] counts of the guards ``COUNTED_GUARDS``, accumulated.
+        tile_counts: [tiles], accumulated. starts, keys: buffers of the lists, not used.
     """
     i = wp.tid()
     camera = cameras[view[0]]
@@ -167,12 +167,12 @@ def project_backward(
     g_factors: wp.array[wp.mat33],
     g_features: wp.array[wp.vec4],
 ) -> None:
-    """Carries the gradients of splats to the world, a thread for each of N Gaussians.
+    """Backpropagates the gradients of splats to the Gaussians, with one thread per Gaussian.
 
     Args:
-        raster, cameras, view, means, factors: as of ``project``. splats: from it. records: from ``blend_backward``.
-        guard_counts: [3] counts of the guards ``COUNTED_GUARDS``, added to. g_means, g_factors, g_features: [N], added
-            to.
+        raster, cameras, view, means, factors: see ``project``. splats: from it. records: from ``blend_backward``.
+        guard_counts: [3] counts of the guards ``COUNTED_GUARDS``, accumulated. g_means, g_factors, g_features: [N],
+            accumulated.
     """
     i = wp.tid()
     second = load(splats, 2 * i + 1)
@@ -193,7 +193,7 @@ def project_backward(
         c = second[0]
         gx = a * r0[1] + b * r0[2]
         gy = b * r0[1] + c * r0[2]
-        # dL/dcov2d = −conic dL/dconic conic, all of them symmetric.
+        # dL/dcov2d = −conic dL/dconic conic, all symmetric.
         ga = -0.5 * r0[3]
         gb = -0.5 * r1[0]
         gc = -0.5 * r1[1]
@@ -212,7 +212,7 @@ def project_backward(
         g_axis0 = camera.fx * inverse * gm0
         g_axis1 = camera.fy * inverse * gm1
         g_axis2 = -(u * g_axis0 + v * g_axis1)
-        # The clamped tangents are constants; the projected mean always moves.
+        # Clamped tangents are treated as constants; the projected mean always gets a gradient.
         g_place0 = camera.fx * inverse * gx - at_u[1] * inverse * wp.dot(g_axis0, axes[2])
         g_place1 = camera.fy * inverse * gy - at_v[1] * inverse * wp.dot(g_axis1, axes[2])
         g_place2 = -inverse * (wp.dot(gm0, m0) + wp.dot(gm1, m1) + place[0] * g_place0 + place[1] * g_place1)

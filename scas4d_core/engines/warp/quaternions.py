@@ -1,4 +1,4 @@
-"""Functions of kernels on quaternions (w, x, y, z), as ``wp.vec4``; reference: ``engines.torch.deformation``."""
+"""Kernel functions on quaternions (w, x, y, z) as ``wp.vec4``; reference: ``engines.torch.deformation``."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def vector_of(q: wp.vec4) -> wp.vec3:
-    """The vector part (x, y, z)."""
+    """Returns the vector part (x, y, z)."""
     return wp.vec3(q[1], q[2], q[3])
 
 
 @wp.func
 def conjugate(q: wp.vec4) -> wp.vec4:
-    """The conjugate: the inverse rotation of a unit quaternion."""
+    """Returns the conjugate, which is the inverse rotation for a unit quaternion."""
     return wp.vec4(q[0], -q[1], -q[2], -q[3])
 
 
 @wp.func
 def product(a: wp.vec4, b: wp.vec4) -> wp.vec4:
-    """The Hamilton product: the rotation b first, then a.
+    """Returns the Hamilton product, i.e. rotation b followed by rotation a.
 
-    It is linear in both. With a gradient g of the product, that of a is g b̄, and that of b is ā g.
+    The product is linear in both factors. For a gradient g of the product, the gradients of a and b are g b̄ and ā g.
     """
     u = vector_of(a)
     v = vector_of(b)
@@ -34,14 +34,14 @@ def product(a: wp.vec4, b: wp.vec4) -> wp.vec4:
 
 @wp.func
 def of_tangent(r: wp.vec3) -> wp.vec4:
-    """The unit quaternion (1, r) / |(1, r)|."""
+    """Returns the unit quaternion (1, r) / |(1, r)|."""
     scale = 1.0 / wp.sqrt(1.0 + wp.dot(r, r))
     return wp.vec4(scale, scale * r[0], scale * r[1], scale * r[2])
 
 
 @wp.func
 def of_tangent_backward(r: wp.vec3, g: wp.vec4) -> wp.vec3:
-    """Turns the gradient of ``of_tangent`` into that of r."""
+    """Backpropagates the gradient of ``of_tangent`` to r."""
     q = of_tangent(r)
     along = wp.dot(q, g)
     return q[0] * (vector_of(g) - along * vector_of(q))
@@ -49,7 +49,7 @@ def of_tangent_backward(r: wp.vec3, g: wp.vec4) -> wp.vec3:
 
 @wp.func
 def change_of(q: wp.vec4, v: wp.vec3) -> wp.vec3:
-    """R v − v of a unit quaternion: exactly 0 without rotation."""
+    """Returns R v − v for a unit quaternion; exactly 0 without rotation."""
     u = vector_of(q)
     across = wp.cross(u, v)
     return 2.0 * (q[0] * across + wp.cross(u, across))
@@ -57,7 +57,7 @@ def change_of(q: wp.vec4, v: wp.vec3) -> wp.vec3:
 
 @wp.func
 def matrix_of(q: wp.vec4) -> wp.mat33:
-    """The rotation matrix of a unit quaternion."""
+    """Returns the rotation matrix of a unit quaternion."""
     w = q[0]
     x = q[1]
     y = q[2]
@@ -71,7 +71,7 @@ def matrix_of(q: wp.vec4) -> wp.mat33:
 
 @wp.func
 def matrix_backward(q: wp.vec4, g: wp.mat33) -> wp.vec4:
-    """Turns the gradient of ``matrix_of`` into that of q."""
+    """Backpropagates the gradient of ``matrix_of`` to q."""
     w = q[0]
     x = q[1]
     y = q[2]

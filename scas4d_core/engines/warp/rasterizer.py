@@ -1,6 +1,7 @@
-"""The rasterizer: the buffers of one picture, and the launches that draw it and carry its gradient to the splats.
+"""Rasterizer: the buffers of one picture, and the launches that render it and backpropagate its gradient.
 
-Nothing here waits for the device or allocates, so all can be captured in a CUDA graph, but ``resize`` and ``grow``.
+Except for ``resize`` and ``grow``, nothing here waits for the device or allocates memory, so that everything can be
+captured in a CUDA graph.
 """
 
 from __future__ import annotations
@@ -14,29 +15,29 @@ from scas4d_core.engines.warp.lanes import lanes_of
 from scas4d_core.engines.warp.layout import PIXELS, SEGMENT, TILE, raster_of
 
 LEAST_CAPACITY = 1 << 16
-"""Entries of all tile lists for which there is room at first, at least."""
+"""Minimum initial capacity of the tile lists, in entries."""
 TILES_EACH = 8
-"""The same for each Gaussian: on average they meet two to four tiles."""
+"""Initial capacity of the tile lists per Gaussian; on average, a Gaussian intersects two to four tiles."""
 WARPS_EACH = 24
-"""Warps of a GPU's multiprocessor that draw segments: as many as have registers."""
+"""Warps per multiprocessor that blend segments; more do not fit into the registers."""
 
 
 class Rasterizer:
-    """Draws pictures of a number of Gaussians.
+    """Renders pictures of a fixed number of Gaussians.
 
     Args:
-        device: of Warp, as "cpu" or "cuda:0". count: Gaussians. limits: constants of the rasterizer.
+        device: Warp device, such as "cpu" or "cuda:0". count: number of Gaussians. limits: constants of the rasterizer.
 
     Attributes:
-        count: see above.
-        planes: [5, rows, columns] of the last picture: four features, background included, and transmittance left.
+        count: number of Gaussians.
+        planes: [5, rows, columns] of the last picture: four features, with background, and remaining transmittance.
         g_planes: [4, rows, columns] gradient that ``carry_back`` reads.
         splats, records: [2 N] and [4 N] of vec4, see ``projection``.
-        starts, items: [tiles + 1] and [capacity] the tile lists of the last picture. tiles_x: tiles of a row.
-        overflow: [1] set to 1 on the device when the lists of a picture had more entries than there is room for; that
-            picture is drawn empty.
-        guard_counts: [3] number of times that the guards ``projection.COUNTED_GUARDS`` acted.
-        capacity: entries for which there is room.
+        starts, items: [tiles + 1] and [capacity] tile lists of the last picture. tiles_x: number of tiles in a row.
+        overflow: [1] set to 1 on the device if the lists of a picture exceeded the capacity; that picture is rendered
+            empty.
+        guard_counts: [3] number of times that the guards ``projection.COUNTED_GUARDS`` were triggered.
+        capacity: maximum number of list entries.
     """
 
     def __init__(self, device: str, count: int, limits: Limits = DEFAULT) -> None:
@@ -52,7 +53,7 @@ class Rasterizer:
         self.overflow = wp.zeros(1, dtype=wp.int32, device=device)
 
     def resize(self, columns: int, rows: int) -> None:
-        """Makes room for pictures of a size, and for ``capacity`` entries."""
+        """Allocates buffers for pictures of a given size and for ``capacity`` list entries."""
         device = self._device
         self._columns, self._rows = columns, rows
         self._raster = raster_of(self._limits, self.count, columns, rows, self.capacity)
@@ -72,14 +73,14 @@ class Rasterizer:
         self.items = wp.zeros(self.capacity, dtype=wp.int32, device=device)
 
     def holds(self, columns: int, rows: int) -> bool:
-        """Whether pictures of a size have room."""
+        """Returns whether pictures of a given size fit into the buffers."""
         return columns <= self._columns and rows <= self._rows
 
     def grow(self) -> bool:
-        """Makes room for twice as many entries where there was too little; waits for the device.
+        """Doubles the capacity after an overflow; waits for the device.
 
         Returns:
-            Whether buffers were replaced: a graph that was captured before has to be captured anew.
+            Whether buffers were replaced, which invalidates captured graphs.
         """
         if self.overflow.numpy()[0] == 0:
             return False
@@ -92,13 +93,13 @@ class Rasterizer:
         self, cameras: wp.array, view: wp.array, means: wp.array, factors: wp.array, opacities: wp.array,
         features: wp.array, record: wp.array, log: wp.array,
     ) -> None:  # fmt: skip
-        """Projects the Gaussians and makes the tile lists.
+        """Projects the Gaussians and builds the tile lists.
 
         Args:
-            cameras: of type ``Camera``. view: [1] index of the camera.
+            cameras: array of ``Camera``. view: [1] index of the camera.
             means, factors, opacities, features: [N] of vec3, mat33, float32 and vec4.
-            record, log: [1] and [records, 8]: this row of the log is set to 0, its last but one number to the entries
-                of the lists.
+            record, log: [1] and [records, 8]: this row of the log is reset to 0, except its second to last value,
+                which is set to the number of list entries.
         """
         device, view_of = self._device, [cameras, view]
         count = -(-self.count // self._lanes) * self._lanes
@@ -118,10 +119,10 @@ class Rasterizer:
         wp.launch(tiles.sort_lists, self._tiles * threads, [threads, *lists], device=device, block_dim=tiles.SORT_BLOCK)
 
     def draw(self, cameras: wp.array, view: wp.array, features: wp.array, background: wp.array) -> None:
-        """Draws what was projected.
+        """Renders the projected Gaussians.
 
         Args:
-            cameras, view: as projected. features: [N] of vec4. background: [1] of vec4, behind everything.
+            cameras, view: as in ``project``. features: [N] of vec4. background: [1] of vec4, behind all Gaussians.
         """
         given = [self._raster, cameras, view, self.splats, features, self.items, self.starts, self._segment_starts]
         state = [self._segment_light, self._segment_features]
@@ -131,7 +132,7 @@ class Rasterizer:
         wp.launch(blend.join_segments, self._tiles * PIXELS, inputs, device=self._device, block_dim=PIXELS)
 
     def carry_back(self, cameras: wp.array, view: wp.array, features: wp.array) -> None:
-        """Carries ``g_planes`` to ``records``; the inputs are those that were drawn."""
+        """Backpropagates ``g_planes`` to ``records``; the arguments are those of ``draw``."""
         given = [self._raster, cameras, view, self.splats, features, self.items, self.starts, self._segment_starts]
         state = [self._segment_light, self._segment_features, self._begun, self.planes, self.g_planes, self.records]
         inputs = [*given, self._segment_tiles, self._warps, *state]
@@ -141,11 +142,11 @@ class Rasterizer:
         self, cameras: wp.array, view: wp.array, means: wp.array, factors: wp.array, g_means: wp.array,
         g_factors: wp.array, g_features: wp.array,
     ) -> None:  # fmt: skip
-        """Adds the gradients of the Gaussians, from ``records``, to [N] of vec3, mat33 and vec4."""
+        """Adds the gradients of the Gaussians, computed from ``records``, to [N] of vec3, mat33 and vec4."""
         given = [self._raster, cameras, view, means, factors, self.splats, self.records, self.guard_counts]
         inputs = [*given, g_means, g_factors, g_features]
         wp.launch(projection.project_backward, self.count, inputs, device=self._device)
 
     def mark(self, cameras: wp.array, side: int, marks: wp.array) -> None:
-        """Marks the blocks, of so many pixels a side, that what was projected meets; see ``tiles.mark_blocks``."""
+        """Marks the blocks, ``side`` pixels wide, that the projected Gaussians intersect; see ``tiles.mark_blocks``."""
         wp.launch(tiles.mark_blocks, self.count, [side, cameras, self.splats, self._boxes, marks], device=self._device)

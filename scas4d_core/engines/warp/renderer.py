@@ -1,4 +1,4 @@
-"""Draws states with the kernels of a GPU: the ``Renderer`` of the Warp engine."""
+"""GPU renderer: the ``Renderer`` of the Warp engine."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from scas4d_core.guards import FEATURE_CEILING, SMALLEST_SQUARE
 
 Array = NDArray[np.float32]
 PADDING = 32
-"""Pixels to whose multiples ``reached`` pads a picture."""
+"""``reached`` pads a picture to multiples of this number of pixels."""
 
 
 class WarpRenderer:
-    """See ``Renderer``. Each call sends a state to the device and waits for the result.
+    """The ``Renderer`` of the Warp engine. Each call uploads a state and waits for the result.
 
     Args:
         background: RGB in 0…1. limits: constants of the rasterizer.
-        device: of Warp, as "cpu" or "cuda:0". image_weight: of the image loss in ``compare``.
+        device: Warp device, such as "cpu" or "cuda:0". image_weight: weight of the image loss in ``compare``.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class WarpRenderer:
         return Comparison(psnr, float(log[IMAGE_LOSS]), (red, green, blue))
 
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
-        """See ``Renderer.gather``: the gradient of a weighted sum of the pixels by the features."""
+        """See ``Renderer.gather``; computed as the feature gradient of a weighted sum of pixels."""
         features = np.zeros((len(state), CHANNELS), np.float32)
         cameras = self._projected(state, camera, features)
         on_device = self._rasterize(cameras, features, np.zeros(CHANNELS, np.float32))
@@ -121,13 +121,13 @@ class WarpRenderer:
         return blocks
 
     def _projected(self, state: Gaussians, camera: CameraArrays, features: Array) -> wp.array:
-        """Project a state and make its lists, with as much room as they need; the cameras, [1], on the device."""
+        """Projects a state and builds lists of sufficient capacity; returns the cameras, [1], on the device."""
         device, count = self._device, len(state)
         if count != self._rasterizer.count or not self._rasterizer.holds(camera.width, camera.height):
             self._rasterizer = Rasterizer(device, count, self._limits)
             self._rasterizer.resize(camera.width, camera.height)
         cameras = wp.array([camera_of(camera)], dtype=Camera, device=device)
-        # Of more than four features, projection sees none: what it would leave out has no opacity instead.
+        # Projection gets no features if there are more than four; Gaussians it would drop get zero opacity instead.
         sound = (np.abs(features) <= FEATURE_CEILING).all(axis=1)
         means = wp.array(state.means, dtype=wp.vec3, device=device)
         factors = wp.array(state.factors, dtype=wp.mat33, device=device)

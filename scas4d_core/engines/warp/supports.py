@@ -1,8 +1,8 @@
-"""Supports of splats, and the tiles that they meet.
+"""Supports of splats, and the tiles that they intersect.
 
-A splat is two rows of ``splats`` [2 N]: (mean x, mean y, conic a, conic b) and (conic c, ln opacity, reach, depth). Its
-support is where the squared Mahalanobis distance from the mean is at most the reach. That is a little widened: rounding
-must not cull what blending would draw. It is 0 where a Gaussian is not drawn.
+A splat is two rows of ``splats`` [2 N]: (mean x, mean y, conic a, conic b) and (conic c, ln opacity, reach, depth).
+Its support is the set of points whose squared Mahalanobis distance from the mean is at most the reach. The reach is
+slightly enlarged, so that rounding does not cull pixels that blending would cover. It is 0 for culled Gaussians.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ wp.set_module_options({"enable_backward": False})
 
 SLACK = wp.constant(wp.float32(COVER_SLACK))
 HUGE = wp.constant(wp.float32(3.0e38))
-FEW = wp.constant(4)  # tiles that a lane goes through by itself; those of a larger box are shared among the warp
+FEW = wp.constant(4)  # boxes with at most this many tiles are handled by one lane, larger ones by the warp
 NONE = wp.constant(wp.uint32(0))
 ONE = wp.constant(wp.uint32(1))
 
@@ -36,7 +36,7 @@ def least_form(
     a: wp.float32, b: wp.float32, c: wp.float32, left: wp.float32, right: wp.float32, top: wp.float32,
     bottom: wp.float32,
 ) -> wp.float32:  # fmt: skip
-    """The least a x² + 2 b x y + c y² over a rectangle of offsets from the mean."""
+    """Returns the minimum of a x² + 2 b x y + c y² over a rectangle of offsets from the mean."""
     least = wp.float32(0.0)
     beside = left > 0.0 or right < 0.0
     above = top > 0.0 or bottom < 0.0
@@ -55,7 +55,7 @@ def least_form(
 
 @wp.func
 def tile_form(camera: Camera, first: wp.vec4, second: wp.vec4, tile_x: wp.int32, tile_y: wp.int32) -> wp.float32:
-    """The least of a splat's form over the centres of a tile's pixels."""
+    """Returns the minimum of a splat's quadratic form over the pixel centres of a tile."""
     left = wp.float32(tile_x * TILE) + 0.5 - first[0]
     top = wp.float32(tile_y * TILE) + 0.5 - first[1]
     across = wp.float32(wp.min(TILE, camera.width - tile_x * TILE) - 1)
@@ -69,7 +69,7 @@ def enter_list(
     tile_y: wp.int32, starts: wp.array[wp.int32], tile_counts: wp.array[wp.int32], keys: wp.array[wp.uint64],
     filling: wp.int32,
 ) -> None:  # fmt: skip
-    """Enters a splat in the list of a tile if its support meets it; see ``enter_lists``."""
+    """Adds a splat to the list of a tile if its support intersects the tile; see ``enter_lists``."""
     if tile_form(camera, first, second, tile_x, tile_y) <= second[2]:
         tile = tile_y * raster.tiles_x + tile_x
         place = wp.atomic_add(tile_counts, tile, 1)
@@ -83,12 +83,12 @@ def enter_lists(
     boxes: wp.array[wp.vec4i], starts: wp.array[wp.int32], tile_counts: wp.array[wp.int32],
     keys: wp.array[wp.uint64], filling: wp.int32,
 ) -> None:  # fmt: skip
-    """Enters the splats of a warp in the lists of the tiles that they meet, or only counts them.
+    """Adds the splats of a warp to the lists of the tiles that they intersect, or only counts the entries.
 
     Args:
         i: the lane's splat. drawn: whether it has a box. splats, boxes: from projection.
-        starts: first entry of each list. tile_counts: [tiles], added to. keys: out depth and row of each entry.
-        filling: 0: ``starts`` and ``keys`` are left alone.
+        starts: first entry of each list. tile_counts: [tiles], accumulated. keys: out depth and row of each entry.
+        filling: 0: only count; ``starts`` and ``keys`` are not used.
     """
     area = wp.int32(0)
     if drawn == 1:

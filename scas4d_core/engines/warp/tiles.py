@@ -1,8 +1,8 @@
-"""Tile lists: which Gaussians each tile draws, nearest first, ties by row.
+"""Tile lists: the Gaussians of each tile sorted by depth, with ties in row order.
 
-Projection has counted the entries of each list; here their places are found (``place_lists``), they are written
-(``fill_lists``) and each list is sorted by itself (``sort_lists``). Lists are divided into segments of ``SEGMENT``
-entries, which blending draws side by side.
+Projection counts the entries of each list. Here, ``place_lists`` computes the offsets, ``fill_lists`` writes the
+entries and ``sort_lists`` sorts each list. Lists are divided into segments of ``SEGMENT`` entries, which blending
+processes in parallel.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from scas4d_core.engines.warp.supports import enter_lists, least_form
 wp.set_module_options({"enable_backward": False})
 
 SCAN_BLOCK = 1024
-"""Threads of the one block that places the lists."""
+"""Threads of the single block that computes the list offsets."""
 SORT_BLOCK = 512
 """Threads of a block that sorts a list."""
 
@@ -77,7 +77,7 @@ def scan_lists(
     thread: wp.int32, capacity: wp.int32, length: wp.int32, counts: wp.array[wp.int32], starts: wp.array[wp.int32],
     segment_starts: wp.array[wp.int32], overflow: wp.array[wp.int32],
 ) -> None:  # fmt: skip
-    """See ``place_lists``; called by all threads of one block."""
+    """Implements ``place_lists``; called by all threads of one block."""
     ...
 
 
@@ -92,13 +92,13 @@ def place_lists(
     record: wp.array[wp.int32],
     log: wp.array2d[wp.float32],
 ) -> None:
-    """Finds the first entry and the first segment of each list; one block.
+    """Computes the first entry and the first segment of each list; launched as one block.
 
     Args:
-        threads: of the block, 1 on the CPU device. tile_counts: [tiles] entries of each list; left 0.
-        starts, segment_starts: out [tiles + 1]; all 0 if the lists have more entries than there is room for.
+        threads: threads of the block, 1 on the CPU device. tile_counts: [tiles] entries of each list; reset to 0.
+        starts, segment_starts: out [tiles + 1]; all 0 if the lists exceed the capacity.
         overflow: [1], set to 1 in that case.
-        record: [1] row of the log that is begun. log: [records, ``COLUMNS``].
+        record: [1] row of the log to initialize. log: [records, ``COLUMNS``].
     """
     scan_lists(wp.tid(), raster.capacity, SEGMENT, tile_counts, starts, segment_starts, overflow)
     if wp.tid() == threads - 1:
@@ -118,12 +118,12 @@ def fill_lists(
     tile_counts: wp.array[wp.int32],
     keys: wp.array[wp.uint64],
 ) -> None:
-    """Writes the lists, each in any order; a thread for each Gaussian, whole warps.
+    """Writes the entries of the lists in arbitrary order, with one thread per Gaussian; launched in whole warps.
 
     Args:
         splats, boxes: from projection. starts: from ``place_lists``.
-        tile_counts: [tiles] 0; left with the entries of each list.
-        keys: out [capacity] depth and row of each entry: they sort nearest first, ties by row.
+        tile_counts: [tiles] initially 0; incremented to the number of entries of each list.
+        keys: out [capacity] depth and row of each entry, whose order is by depth, then by row.
     """
     i = wp.tid()
     drawn = wp.int32(0)
@@ -132,7 +132,7 @@ def fill_lists(
     enter_lists(raster, cameras[view[0]], i, drawn, splats, boxes, starts, tile_counts, keys, 1)
 
 
-# Bitonic, with every comparison in the same direction: what would lie beyond the end never moves.
+# Bitonic sort with all comparisons in the same direction, so that virtual elements past the end never move.
 @wp.func_native("""
 unsigned long long* list = reinterpret_cast<unsigned long long*>(keys.data) + first;
 #if defined(__CUDA_ARCH__)
@@ -176,7 +176,7 @@ for (int i = 0; i < count; ++i) items.data[first + i] = (int)(list[i] & 0xffffff
 def sort_list(
     thread: wp.int32, first: wp.int32, count: wp.int32, keys: wp.array[wp.uint64], items: wp.array[wp.int32]
 ) -> None:
-    """Sorts a list; called by all threads of a block, on the CPU device by one."""
+    """Sorts a list; called by all threads of a block, or by a single thread on the CPU device."""
     ...
 
 
@@ -190,13 +190,13 @@ def sort_lists(
     items: wp.array[wp.int32],
     segment_tiles: wp.array[wp.int32],
 ) -> None:
-    """Sorts each list, a block for each tile.
+    """Sorts each list, with one block per tile.
 
     Args:
-        threads: of a block, 1 on the CPU device. starts, segment_starts: from ``place_lists``.
-        tile_counts: [tiles], left 0. keys: from ``fill_lists``; left in any order.
+        threads: threads of a block, 1 on the CPU device. starts, segment_starts: from ``place_lists``.
+        tile_counts: [tiles], reset to 0. keys: from ``fill_lists``; undefined order afterwards.
         items: out [capacity] rows of the Gaussians of each list.
-        segment_tiles: out [segments] the tile that each segment belongs to.
+        segment_tiles: out [segments] tile of each segment.
     """
     tile = wp.tid() // threads
     thread = wp.tid() - tile * threads
@@ -218,11 +218,11 @@ def mark_blocks(
     boxes: wp.array[wp.vec4i],
     marks: wp.array2d[wp.int32],
 ) -> None:
-    """Marks the blocks of pixels that the supports of Gaussians meet; a thread for each Gaussian.
+    """Marks the blocks of pixels that the supports of Gaussians intersect, with one thread per Gaussian.
 
     Args:
-        side: pixels of a block's side, of which a tile's is a multiple. cameras: [1]. splats, boxes: from projection.
-        marks: [rows, columns] of blocks, set to 1 or left.
+        side: side of a block in pixels, a divisor of the tile's side. cameras: [1]. splats, boxes: from projection.
+        marks: [rows, columns] of blocks, set to 1 or unchanged.
     """
     i = wp.tid()
     first = load(splats, 2 * i)

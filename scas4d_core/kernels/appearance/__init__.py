@@ -1,1 +1,1 @@
-"""Kernels of the appearance effects; of the other files here they use only ``jit``."""
+"""Kernels of the appearance effects; the only other kernel module that they use is ``jit``."""

@@ -1,16 +1,17 @@
-"""Colours of Gaussians as one camera sees them, with the gloss that mirrors the surroundings; and gradients back.
+"""View-dependent colours of Gaussians whose gloss reflects an environment, and their backward pass.
 
-Values of pictures are about the square root of light (a gamma of 2), and light adds. With c the colour of a Gaussian, s
-its gloss, n its normal, v the direction to the camera, μ = n·v and r = 2μn − v the mirrored direction, for μ > 0:
+Pixel values are roughly the square root of light (a gamma of 2), and light is additive. With c the colour of a
+Gaussian, s its gloss, n its normal, v the direction to the camera, μ = n·v and r = 2μn − v the reflected direction, for
+μ > 0:
 
     T = c|c| (1 − FALL f min(s, 1)) + s (E(r + k (x − x₀)) + sheen f),    f = (1 − μ)⁴,    colour = T / √|T|
 
-E is the environment: RGB in a grid over directions (octahedral map, Cigolle et al. 2014), bilinear. It stays with the
-world while things turn. What is near lies in another direction from another place: k is 1 over its distance, x₀ the
-middle of the scene. The sheen is what smooth things mirror at grazing angles, where less light comes from inside.
+E is the environment: an RGB grid over directions (octahedral map, Cigolle et al. 2014), sampled bilinearly. It is fixed
+to the world while objects rotate. The direction to a nearby light depends on the position: k is its inverse distance,
+x₀ the middle of the scene. The sheen is the reflection at grazing angles, where less light comes from inside.
 
-Reference: ``engines.torch.gloss``. Gradients to places and turns are left out: the direction to a camera hardly changes
-within an update, and a turn is found by texture and outline.
+Reference: ``engines.torch.gloss``. Gradients to positions and rotations are omitted: the direction to a camera hardly
+changes within an update, and rotations are determined by texture and outline.
 """
 
 from __future__ import annotations
@@ -22,19 +23,19 @@ from numpy.typing import NDArray
 from scas4d_core.kernels.jit import ONE, TWO, ZERO, parallel_kernel
 
 SIDE = 16
-"""Cells along a side of the grid: 12 degrees each, about the width of the highlight of a lamp on glazed things."""
+"""Cells along a side of the grid: 12 degrees each, about the width of a lamp's highlight on a glazed surface."""
 CELLS = SIDE * SIDE
 SHEEN, MIDDLE, NEARNESS = CELLS, CELLS + 1, CELLS + 2
-"""Rows of an environment after the cells: RGB of the sheen; x₀; k, 0, 0."""
+"""Rows of an environment after the cells: RGB of the sheen; x₀; (k, 0, 0)."""
 ROWS = CELLS + 3
 FALL = np.float32(0.9)
-"""Share of the light from inside that does not come out at grazing angles."""
+"""Share of the diffuse light that is lost at grazing angles."""
 DARK = np.float32(1e-4)
-"""Light below which the square root is a line: its slope has no end at 0."""
+"""Light below which the square root is replaced by a line, because its slope is unbounded at 0."""
 OVER = np.float32(0.05)
-"""Slope of colours above 1: a picture shows no more than white, and only a hint is left which way is darker."""
+"""Slope of colours above 1; a picture saturates at white, and a small gradient keeps the direction to darker values."""
 DULL = np.float32(1e-4)
-"""Gloss below which a Gaussian has no normal, and its colour is the same from everywhere."""
+"""Gloss below which a Gaussian has no normal, and its colour is independent of the direction."""
 CHUNK = 4096
 _STEP = np.float32((SIDE - 1) / 2)
 _LAST = SIDE - 2
@@ -53,8 +54,8 @@ def shade(
     """Fills the first three columns of ``shown`` [N, 4] with the colours that a camera sees.
 
     Args:
-        means: [N, 3] metres. gloss: [M, 3], M at most N: normal times strength, before the turns; others have none.
-        turns: [N, 4] unit quaternions (w, x, y, z). colours: [N, 3]. environment: [ROWS, 3]. centre: [3] the camera's.
+        means: [N, 3] metres. gloss: [M, 3], M ≤ N: normal times strength, before rotation; other Gaussians have none.
+        turns: [N, 4] unit quaternions (w, x, y, z). colours: [N, 3]. environment: [ROWS, 3]. centre: [3] of the camera.
     """
     shade_rows(means, gloss, turns, colours, environment, centre, shown)
 
@@ -69,10 +70,10 @@ def shade_backward(
     g_shown: NDArray[np.float32],
     g_gloss: NDArray[np.float32],
 ) -> NDArray[np.float32]:
-    """Turns the gradient of ``shown`` [N, 4] into that of the colours, in place, and fills that of ``gloss`` [M, 3].
+    """Converts the gradient of ``shown`` [N, 4] to that of the colours, in place, and fills that of ``gloss`` [M, 3].
 
     Returns:
-        [ROWS, 3] the gradient of the environment; that of x₀ is 0.
+        [ROWS, 3] gradient of the environment; that of x₀ is 0.
     """
     sums = np.zeros((-(-len(means) // CHUNK), ROWS, 3), np.float32)
     shade_rows_backward(means, gloss, turns, colours, environment, centre, g_shown, g_gloss, sums)
@@ -82,7 +83,7 @@ def shade_backward(
 
 @parallel_kernel
 def shade_rows(means, gloss, turns, colours, environment, centre, shown):
-    """Runs ``shade`` in tasks."""
+    """Runs ``shade`` in parallel tasks."""
     count, glossy = means.shape[0], gloss.shape[0]
     k = environment[NEARNESS, 0]
     for task in prange((count + CHUNK - 1) // CHUNK):
@@ -132,7 +133,7 @@ def shade_rows(means, gloss, turns, colours, environment, centre, shown):
 
 @parallel_kernel
 def shade_rows_backward(means, gloss, turns, colours, environment, centre, g_shown, g_gloss, sums):
-    """Runs ``shade_backward`` in tasks; ``sums`` [tasks, ROWS, 3], zeros, gets each task's share."""
+    """Runs ``shade_backward`` in parallel tasks, which add to ``sums`` [tasks, ROWS, 3], initially zero."""
     count, glossy = means.shape[0], gloss.shape[0]
     k = environment[NEARNESS, 0]
     for task in prange((count + CHUNK - 1) // CHUNK):
@@ -216,7 +217,7 @@ def shade_rows_backward(means, gloss, turns, colours, environment, centre, g_sho
             hx = (hx - nx * radial) / s + nx * g_s
             hy = (hy - ny * radial) / s + ny * g_s
             hz = (hz - nz * radial) / s + nz * g_s
-            tx, ty, tz = TWO * (hy * z - hz * y), TWO * (hz * x - hx * z), TWO * (hx * y - hy * x)  # turned back
+            tx, ty, tz = TWO * (hy * z - hz * y), TWO * (hz * x - hx * z), TWO * (hx * y - hy * x)  # rotated back
             g_gloss[i, 0] = hx + w * tx + tz * -y + ty * z
             g_gloss[i, 1] = hy + w * ty + tx * -z + tz * x
             g_gloss[i, 2] = hz + w * tz + ty * -x + tx * y

@@ -188,7 +188,7 @@ def test_one_that_waits_to_begin_when_it_is_lost_is_not_made(killed: list[Any]) 
     async def test(placement: FakePlacement) -> None:
         calls = RayCalls()
         placement.call_ray = calls.call  # type: ignore[method-assign]
-        placement.host = lambda name, needs: made.append(name)  # type: ignore[method-assign,assignment,return-value]
+        placement.create_actor = lambda name, needs: made.append(name)  # type: ignore[method-assign,assignment,return-value]
         calls.suspend()
         running = Running(placement)
         await wait_for_soon(lambda: calls._enabled._waiters)

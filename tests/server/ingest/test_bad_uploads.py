@@ -33,7 +33,7 @@ BAD = {
     "truncated PNG": (lambda: picture()[:-5], "bytes", "again from its source"),
     "truncated WebP": (lambda: picture(format="WEBP")[:-5], "bytes", "again from its source"),
     "wrong size": (lambda: picture(size=(WIDTH + 1, HEIGHT)), f"{WIDTH + 1}x{HEIGHT}", "size the camera was"),
-    "16 bits": (sixteen_bits, "16 bits", "send 8 bits"),
+    "16 bits": (sixteen_bits, "16 bits", "convert the picture to 8 bits"),
     "CMYK": (lambda: picture(format="JPEG", mode="CMYK"), "CMYK", "send RGB or grey"),
     "animated PNG": (animated, "animated", "one picture per file"),
     "animated WebP": (animated_webp, "animated", "one picture per file"),

@@ -65,7 +65,7 @@ def test_an_entry_says_what_the_events_said():
     assert reports_[3].dropped_cameras == {"c0": "torn"}
     assert ledger.frames[1].receipt is None
     assert ledger.frames[2].receipt.model_dump() == {"scene": "abc", "index": 2, "time": 0.2, "identity": identity(2)}
-    assert (ledger.frames[3].note.own_deaths, ledger.frames[3].note.other_deaths) == (1, 1)
+    assert (ledger.frames[3].rare_properties.own_deaths, ledger.frames[3].rare_properties.other_deaths) == (1, 1)
     assert ledger.waiting() == [0, 4]
     assert ledger.frames.get(5) is None
     with pytest.raises(KeyError):
@@ -160,7 +160,7 @@ def test_a_day_of_frames_fits_in_memory():
     ledger = ledger_of(taken(0))
     for index in range(1, count):
         ledger.apply(taken(index))
-        ledger.move(index - 1, FrameState.COMMITTED)
+        ledger.set_state(index - 1, FrameState.COMMITTED)
         if index > 40:
             ledger.apply(PicturesDeleted(frames=(index - 40,)))
             ledger.apply(StatesDeleted(frames=(index - 40,)))

@@ -43,7 +43,7 @@ def state_of(ledger):
     frames = []
     for index in range(len(ledger.frames)):
         entry = ledger.frames[index]
-        note = entry.note
+        note = entry.rare_properties
         parts = None if note.parts is None else (note.parts.time, note.parts.hashes, note.parts.files)
         frames.append(
             (entry.state, entry.time, entry.identity, entry.files, entry.deleted, entry.error, note.dropped,

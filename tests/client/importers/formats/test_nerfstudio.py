@@ -135,7 +135,7 @@ def change(document, path, value):
         (
             ("frames", 1, "file_path"),
             "images/cam2/000001.jpg",
-            "camera 'cam2' has another world_to_camera.*stand still",
+            "camera 'cam2' has another world_to_camera.*must not move",
         ),
     ],
 )
