@@ -145,7 +145,7 @@ def test_a_long_history_is_read_a_frame_at_a_time(tmp_path, monkeypatch):
         ({"points": [[0, 0, 0]] * 800}, "format", "npz"),
         ({"points": [[0, 0, 0]] * 900, "format": "npz"}, "points", "at most 5000"),
         ({"points": [[0, 0, 0]], "project": ["many"]}, "project", "at most 60"),
-        ({"points": [[0, 0, 0]], "project": ["c0", "other c0"]}, "project", "differently"),
+        ({"points": [[0, 0, 0]], "project": ["c0", "other c0"]}, "project", "different names"),
     ],
 )
 def test_what_is_too_much_is_refused_by_name(http, finished, monkeypatch, changes, field, remedy):
