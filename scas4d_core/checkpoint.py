@@ -251,7 +251,7 @@ class ResumePoint:
     """The commit from which a scene was resumed.
 
     Attributes:
-        index: of the commit.
+        index: index of the commit.
         undone: indices of later committed frames that were rolled back; each must be sent again or is lost.
         faults: one sentence per file that could not be used; empty after a normal shutdown.
         cold: true if the state is intact but its checkpoint is not. The next update then starts without motion, and the

@@ -20,8 +20,8 @@ class FrameInput:
     """The measurements taken from a frame's images before its update.
 
     Attributes:
-        seconds: since the last committed frame. views: of all cameras that have an image.
-        bright: mean brightness of each camera's image, 0…1. fingerprints: of each camera's image.
+        seconds: since the last committed frame. views: views of all cameras that have an image.
+        bright: mean brightness of each camera's image, 0…1. fingerprints: fingerprints of each camera's image.
         exposure: brightness of the frame relative to the usual brightness. left_out: excluded cameras, with the reason.
             unusable: why the frame cannot be used, or None (``robust.checks.check_brightness``).
         light_changes: whether the lighting changes from frame to frame.

@@ -213,7 +213,7 @@ def timing_warnings(timing: Mapping[str, CameraTiming] | None) -> list[str]:
     the figures, which change from frame to frame, are in the report.
 
     Args:
-        timing: of the newest report; None if it has none.
+        timing: timing of the newest report; None if it has none.
 
     >>> in_step = {"frames": 0.02, "error": 0.03, "out_of_step": False}
     >>> late = {"frames": 0.41, "error": 0.03, "out_of_step": True}

@@ -57,7 +57,7 @@ class FrameReport:
     """Report of frame 0 or of the update of a frame.
 
     Attributes:
-        outcome: of the frame.
+        outcome: outcome of the frame.
         seconds: by stage; ``report`` is the time for this report and for writing the previous one.
         loss: weighted loss of each iteration; for frame 0, at most ``REPORTED_LOSSES`` means.
         psnr: dB, mean over the training views of the last iterations, as rendered at the time; NaN if not measured.
@@ -84,7 +84,7 @@ class FrameReport:
         shortened: frame 0 only: steps for which ``StaticSettings.seconds`` was too short, in words; small reductions of
             the iterations appear only in ``planned``. grey: frame 0 only: grayscale cameras in a rig with colour
             cameras.
-        curve: of the last attempt.
+        curve: curve of the last attempt.
         errors: mean image loss on the probe views by candidate, on images without the gain of ``exposure``.
         candidate: the candidate that became the state; "previous" if the frame was rejected.
     """
@@ -158,7 +158,7 @@ def report_of_first(
     """Returns the report of frame 0.
 
     Args:
-        names: of the rig's cameras. moving: number of Gaussians in the hierarchy. seconds: by stage.
+        names: names of the rig's cameras. moving: number of Gaussians in the hierarchy. seconds: by stage.
         dropped: cameras excluded by the caller, with the reason. calibration: check of the calibration, if measured.
     """
     return FrameReport(
@@ -197,7 +197,7 @@ def report_of_update(
     Args:
         result: that is committed. before: the previously committed state.
         left_out: cameras excluded by the first checks, with the reason.
-        names: of the rig's cameras. watch: has the stages "decode", "judge", "update" and optionally "presence".
+        names: names of the rig's cameras. watch: has the stages "decode", "judge", "update" and optionally "presence".
         dropped: cameras excluded by the caller, with the reason. postponed: see ``FrameReport``.
     """
     trace, gaussians = result.trace, result.gaussians

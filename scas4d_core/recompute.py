@@ -35,8 +35,8 @@ def recompute(
     """Recomputes the state of a frame and replaces the damaged one.
 
     Args:
-        rig: training cameras, user's world. settings: of the scene.
-        history: of the scene, in the process that appends to it.
+        rig: training cameras, user's world. settings: settings of the scene.
+        history: history of the scene, in the process that appends to it.
         base: index of the previous committed frame. frame: with the images of the damaged frame.
         budget: that applied to the frame (``Reconstruction.set_budget``).
         dropped, notes: see ``Reconstruction.step``.

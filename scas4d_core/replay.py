@@ -55,8 +55,8 @@ def replay(
     """Replays frames with a different number of iterations.
 
     Args:
-        rig: training cameras, user's world. settings: of the scene.
-        history: of the scene; only ``base`` and the first frame are read.
+        rig: training cameras, user's world. settings: settings of the scene.
+        history: history of the scene; only ``base`` and the first frame are read.
         base: index of the committed frame that the first of ``frames`` follows.
         frames: at least two, in order; the first is a warm-up. iterations: per frame.
         over: called at the end of each update.

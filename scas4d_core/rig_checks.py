@@ -68,7 +68,7 @@ def check_rig(rig: Rig, scene: SceneSettings, positions: Float | None) -> None:
     """Rejects a rig, settings and points of a first frame that cannot work, before its images are read.
 
     Args:
-        rig: in the user's world, at image size. scene: unit and image scale.
+        rig: rig in the user's world, at image size. scene: unit and image scale.
         positions: [P, 3] point cloud in the same world, or None.
 
     Raises:
@@ -84,7 +84,7 @@ def check_scene(rig: Rig, scene: SceneSettings) -> None:
     """Rejects rigs and settings that cannot work with any images.
 
     Args:
-        rig: in the user's world, at image size. scene: unit and image scale.
+        rig: rig in the user's world, at image size. scene: unit and image scale.
 
     Raises:
         RigError: the focal lengths, the image size or the extent of the rig are out of range.
@@ -187,7 +187,7 @@ def rig_warnings(rig: Rig, scene: SceneSettings, positions: Float | None = None)
     """Returns warnings about a usable rig: its unit, its poses and its point cloud.
 
     Args:
-        rig: in the user's world. scene: unit. positions: [P, 3] point cloud in the same world, or None.
+        rig: rig in the user's world. scene: unit. positions: [P, 3] point cloud in the same world, or None.
     """
     poses = pose_warnings(rig, positions)
     cloud = [] if poses or positions is None else cloud_warnings(rig, positions)
@@ -250,7 +250,7 @@ def pose_warnings(rig: Rig, positions: Float | None = None) -> list[str]:
     one of the cameras often meet both ways. In this case nothing is reported, because only the images could decide.
 
     Args:
-        rig: of at least three cameras if there are no points. positions: [P, 3] in its world, or None.
+        rig: rig of at least three cameras if there are no points. positions: [P, 3] in its world, or None.
 
     >>> lens, ring = [[100, 0, 32], [0, 100, 24], [0, 0, 1]], []
     >>> for i, angle in enumerate((0, 2, 4)):

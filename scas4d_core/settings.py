@@ -80,9 +80,9 @@ class StaticSettings(SettingsModel):
     iterations: int = Field(3000, ge=1, le=1_000_000, description="Iterations of frame 0, one training view each.")
     seconds: Annotated[float, Field(gt=0, le=1_000_000)] | None = Field(
         110.0,
-        description="Seconds that frame 0 may take, for points and fit. With too few, points are searched coarsely "
-        "and the fit has fewer iterations (at least 500), so the result depends on the machine. None: no "
-        "limit.",
+        description="Time limit for frame 0 in seconds, covering the initial points and the fit. With too few seconds, "
+        "points are searched coarsely and the fit has fewer iterations (at least 500), so the result depends on the "
+        "machine. None: no limit.",
     )
     stop_gain: Share = Field(
         0.0,

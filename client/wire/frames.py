@@ -89,7 +89,9 @@ class CameraTimingModel(Model):
     """Time offset of a camera, estimated from the motion in all frames so far."""
 
     frames: float = Field(
-        description=("Offset in frames: positive is later than the other cameras. The median over the cameras is 0.")
+        description=(
+            "Offset in frames; positive means this camera is later than the others. The median over the cameras is 0."
+        )
     )
     error: float = Field(description="Standard error of the offset, in frames.")
     out_of_step: bool = Field(description="The camera is clearly out of step; the scene's `warnings` name it.")

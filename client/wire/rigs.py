@@ -26,7 +26,8 @@ class CameraModel(Model):
     height: int = Field(ge=1, le=MAX_PIXELS_A_SIDE, description="Height of the pictures in pixels.")
 
     @model_validator(mode="after")
-    def _can_be(self) -> CameraModel:
+    def _check_camera(self) -> CameraModel:
+        """Rejects names that are reserved for frame fields, and impossible cameras."""
         if self.name == "time" or self.name.startswith("mask."):
             raise InputError(f"camera name {self.name!r} is the name of another field of a frame", "rename the camera")
         self.camera()  # raises CameraError, a ValueError, for an invalid camera

@@ -268,7 +268,7 @@ class SceneStatus(Model):
     warnings: list[str] = Field(
         description=(
             "Likely mistakes, one sentence each: poses that seem inverted, cameras that disagree with "
-            "their calibration, the outcome of refinement, first points that no camera confirms or "
+            "their calibration, the outcome of refinement, initial points that no camera confirms or "
             "that cover little of the pictures, stages of frame 0 that were cut short, grey cameras "
             "among colour ones, and cameras that are out of step."
         ),

@@ -206,7 +206,7 @@ class BinaryHead(Model):
     )
     media_type: str = Field(description="Media type of the body, as for the same request over HTTP.")
     headers: dict[str, str] = Field(
-        default_factory=dict, description="Headers of the HTTP answer, in lower case: x-depth-near …"
+        default_factory=dict, description="HTTP response headers with lowercase names, e.g. x-depth-near …"
     )
 
 

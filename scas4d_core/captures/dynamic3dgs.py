@@ -52,7 +52,7 @@ def read_dynamic3dgs(
         fps: frames per second; None uses ``fps`` of ``train_meta.json`` (written by ``scas4d import``), or else 30.
         use_masks: False ignores ``seg/``.
         use_points: False ignores ``init_pt_cld.npz``.
-        size_mismatch: how images with another aspect ratio than ``w``, ``h`` were made (`adapt_intrinsics`); None
+        size_mismatch: how images whose aspect ratio differs from ``w``:``h`` were produced (`adapt_intrinsics`); None
             rejects them.
 
     Raises:

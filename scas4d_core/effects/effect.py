@@ -39,7 +39,7 @@ class Effect:
         name: key in ``effect_names.EFFECTS``. group: group of related effects.
         description: a sentence for users. disambiguation: what separates it from other effects that could explain the
             same pixels.
-        cost: of an update with the effect, compared with one without.
+        cost: cost of an update with the effect, compared with one without.
         auto: whether the effect needs evidence; otherwise it is on unless it is refused.
         on_above, off_below: values of ``Evidence.share`` at or above which it is switched on, and below which it is
             switched off.

@@ -47,7 +47,7 @@ class FrameObservation:
     """A learnt frame, as input for the evidence of effects.
 
     Attributes:
-        index: of the frame. before: Θ_{t−1}. result: Θ_t, the trace of its update, arrays of the effects.
+        index: index of the frame. before: Θ_{t−1}. result: Θ_t, the trace of its update, arrays of the effects.
         rig: the cameras in the internal world, with their current poses. views: that were learnt from. renderer:
             renders states of the scene.
         room: number of Gaussians that may still be added to the scene. time: for fitting them.

@@ -108,7 +108,7 @@ def decide_switches(switches: Switches, settings: Settings, seen: FrameObservati
     """Returns the switches for the next frame.
 
     Args:
-        switches: used for the update of the frame. settings: of the scene. seen: the learnt frame.
+        switches: used for the update of the frame. settings: settings of the scene. seen: the learnt frame.
     """
     return {name: _decide_switch(name, switch, settings, seen) for name, switch in switches.items()}
 
@@ -143,7 +143,7 @@ def record_arrays(switches: Switches, settings: Settings, seen: FrameObservation
     """Returns the observation of a learnt frame with the arrays that the effects record.
 
     Args:
-        switches: used for the update of the frame. settings: of the scene. seen: the learnt frame.
+        switches: used for the update of the frame. settings: settings of the scene. seen: the learnt frame.
     """
     by_effect = {}
     for name, switch in switches.items():

@@ -158,7 +158,7 @@ def fit_first_frame(
     The cloud is computed in the internal world, so that the user's origin and unit do not change it.
 
     Args:
-        frame: with images of the size of the factory's rig. points: in the user's world. world: user to internal
+        frame: with images of the size of the factory's rig. points: points in the user's world. world: user to internal
             transform.
         on_progress: called with the progress of each stage.
     """

@@ -55,7 +55,7 @@ class FitSchedule:
     """Plans the iterations of a fit within a time limit.
 
     Args:
-        iterations: of the full schedule. limit: time limit of frame 0.
+        iterations: iterations of the full schedule. limit: time limit of frame 0.
         expected: returns the expected number of Gaussians at a point of the schedule.
 
     Attributes:

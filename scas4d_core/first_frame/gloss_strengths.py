@@ -54,7 +54,7 @@ def estimate_strengths(
     follows from reliable neighbours, or is near 0 if there are none.
 
     Args:
-        views: of the state.
+        views: views of the state.
     """
     from scas4d_core.kernels.appearance.direction import DARK, FALL, OVER, shade
 

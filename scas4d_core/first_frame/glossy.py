@@ -77,7 +77,10 @@ def fit_with_gloss_trial(
 
 
 def estimate_gloss(trainer: StaticTrainer, environment: Array | None) -> tuple[Array, Array]:
-    """Returns [N, 3] normals times strengths of a fit's surface, and its means; None: initial strengths."""
+    """Returns the surface normals scaled by gloss strength, [N, 3], and the means.
+
+    Without `environment` the initial strength is used.
+    """
     state, views, renderer = trainer.gaussians(), trainer.views, trainer.fit.renderer
     normals = surface_normals(state, views, renderer)
     if environment is None:
@@ -89,7 +92,7 @@ class GlossTrial:
     """Decides whether colours depend on direction, using the surface of an unfinished fit.
 
     Args:
-        trainer: of the fit. mode: "on" needs no evidence.
+        trainer: trainer of the fit. mode: "on" needs no evidence.
 
     Attributes:
         on: the decision, after the trial. out_of_time: whether there was no time for the trial.

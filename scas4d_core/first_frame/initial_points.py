@@ -95,7 +95,7 @@ def initial_points(
         max_points: maximum number of points.
         stereo: whether to use dense stereo in textured regions.
         stereo_iterations: rounds of propagation and refinement.
-        seed: of every random choice; the same seed gives the same points.
+        seed: seed of every random choice; the same seed gives the same points.
         limit: time limit of frame 0; if time is short, the search is coarser (``limit.shortened``).
 
     Returns:
@@ -196,7 +196,7 @@ def image_coverage(views: Sequence[PosedPicture], cloud: InitialPoints) -> float
     """Returns the share of image (or mask) cells that contain a point, median over the views.
 
     Args:
-        views: of the cameras. cloud: points in the same world.
+        views: views of the cameras. cloud: points in the same world.
     """
     shares = []
     for view in views:

@@ -40,7 +40,7 @@ def surface_normals(state: Gaussians, views: Sequence[TrainingView], renderer: R
     The normals are then averaged over neighbours.
 
     Args:
-        views: of the state, whose cameras render the depth.
+        views: training views; depth is rendered from their cameras.
     """
     means, count = state.means, len(state)
     haze = state.replace(opacities=np.minimum(state.opacities**SKIN, OPAQUE).astype(np.float32))

@@ -21,7 +21,7 @@ class Exposures:
     """Learns the exposures of the views of frame 0, in place.
 
     Args:
-        views: of the frame. rate: Adam learning rate of gain and offset. beta1, beta2: Adam decays.
+        views: views of the frame. rate: Adam learning rate of gain and offset. beta1, beta2: Adam decays.
 
     Attributes:
         on: whether exposures are still learnt.

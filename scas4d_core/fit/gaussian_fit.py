@@ -65,7 +65,7 @@ class GaussianFit:
         parameters: [N, 15], with the columns of ``engines.fit``; changed in place.
         fixed: for each view, fixed Gaussians that are rendered with the fitted ones; empty for none.
         gloss: for view-dependent colours, learnt as well; None for constant colours.
-        exposures: of the views, learnt as well; None for fixed exposures.
+        exposures: exposures of the views, learnt as well; None for fixed exposures.
         betas: Adam decays. statistics: whether to collect ``table.statistics`` for density control.
 
     Attributes:

@@ -52,9 +52,9 @@ def measure_pictures(
     """Returns the scores of one committed frame on the test cameras: their mean, and by camera.
 
     Args:
-        reconstruction: has committed the frame.
+        reconstruction: reconstruction in which the frame is already committed.
         capture: opened at the measured image scale, with masks.
-        index: of the frame.
+        index: frame index.
         with_lpips: also computes LPIPS, which loads torch.
     """
     rig, truth, first = capture.test_rig, capture.test_frame(index), capture.test_frame(0)

@@ -54,7 +54,7 @@ def median_trajectory_error(
         truth: [T, Q, 2] pixels.
         counted: [T, Q] bool: frames in which the point is visible in the camera and counts. Tracks that never count are
             ignored.
-        diagonal: of the image, in pixels.
+        diagonal: diagonal of the image, in pixels.
         query: frame in which the points were given; it does not count.
 
     Returns:
@@ -169,7 +169,7 @@ def lost_parts(
     Args:
         tracks: [T, P, 3] predicted, not finite if lost. truth: [T, P, 3]. Both in user units.
         part_id: [P], part of each point. moving: [P] bool, points that count.
-        extent: in user units.
+        extent: extent in user units.
 
     Raises:
         ValueError: as in ``track_error_3d``.
@@ -204,7 +204,7 @@ def error_by_confidence(
         tracks: [T, P, 3] predicted. truth: [T, P, 3]. Both in user units.
         confidence: [T, P].
         moving: [P] bool, points that count.
-        extent: in user units.
+        extent: extent in user units.
         query: frame in which the points were given; it does not count.
         groups: number of groups; the least confident positions that do not fill the groups evenly are ignored.
 

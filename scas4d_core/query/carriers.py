@@ -29,7 +29,7 @@ def carriers(
         gaussians: the state, N Gaussians.
         points: [Q, 3] metres, in the internal world.
         count: K, number of Gaussians that carry a point (at most N).
-        softening: in metres; m is computed with Σ + softening²·I.
+        softening: softening in metres; m is computed with Σ + softening²·I.
 
     Returns:
         Rows [Q, K], largest weight first. Weights [Q, K] proportional to o·exp(−½ m²), which sum to 1; far from all

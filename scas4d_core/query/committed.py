@@ -51,7 +51,7 @@ class CommittedScene:
         """Renders a novel view.
 
         Args:
-            camera: in the user's world. index: of a committed frame.
+            camera: camera in the user's world. index: index of a committed frame.
             background: RGB in 0…1; None for the scene's background.
             labels: [N] part of each Gaussian, −1 for none; required for ``View.parts``. Labels of the newest frame are
                 valid for any frame: those of Gaussians added later are ignored.

@@ -205,7 +205,7 @@ def part_features(positions: NDArray[Any], rotations: NDArray[Any], extent: floa
     Args:
         positions: [T, M, 3] in metres.
         rotations: [T, M, 4] unit quaternions.
-        extent: in metres.
+        extent: extent in metres.
     """
     frames, count = positions.shape[:2]
     p = positions.transpose(1, 0, 2) / extent

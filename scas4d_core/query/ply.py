@@ -77,7 +77,7 @@ def write_ply(path: Path | str, gaussians: Gaussians, world: WorldFrame) -> None
     """Writes one frame atomically, without its retired Gaussians.
 
     Args:
-        path: of the file. gaussians: in the internal world. world: user to internal transform.
+        path: path of the file. gaussians: gaussians in the internal world. world: user to internal transform.
 
     Raises:
         PlyError: some Gaussians are not finite or have no volume; the message gives their rows and ids.

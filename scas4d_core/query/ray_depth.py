@@ -1,8 +1,9 @@
 """Surface depth along single rays, for pixel queries that need more accuracy than rendered depth.
 
 Rendered depth is the weighted mean of the *centres* of a pixel's Gaussians. Here, each Gaussian absorbs light along the
-ray itself, around the point of the ray that is nearest to it in its own metric. The surface is at the depth at which
-half of the absorbed light is lost. At an edge, the mean lies between two surfaces, but this median lies on one of them.
+ray itself, around the point on the ray closest to its centre, measured in its own metric. The surface is at the depth
+at which half of the absorbed light is lost. At an edge, the mean lies between two surfaces, but this median lies on one
+of them.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ def ray_depths(
 
     Args:
         gaussians: a state, N Gaussians in the internal world.
-        camera: in the internal world.
+        camera: camera in the internal world.
         uv: [Q, 2] pixels; (0.5, 0.5) is the centre of the first pixel.
         limits: constants of the rasterizer, so that a ray meets what a pixel shows.
         softening: precision of the surface, added to every axis in quadrature, in metres.

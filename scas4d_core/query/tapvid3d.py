@@ -29,7 +29,7 @@ def tapvid3d(
     Args:
         positions: [T, Q, 3] in the user's world and units, NaN if unknown.
         visibility: [T, Q] in the camera.
-        camera: in the user's world.
+        camera: camera in the user's world.
         queried: row of T in which the points were queried; −1 if that frame is not included.
         metres_per_unit: metres per user unit.
         pixels: [Q, 2] queried pixels; None for the projections of the points in that row.

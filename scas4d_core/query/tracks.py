@@ -155,7 +155,7 @@ def tracks_of_pixels(
     Args:
         history: the committed states.
         world: user to internal transform.
-        camera: in the user's world.
+        camera: camera in the user's world.
         uv: [Q, 2] continuous pixel positions: (0.5, 0.5) is the centre of the first pixel. The depth is from
             ``ray_depth``. A ray that loses less than half of its light uses the rendered depth of the nearest covered
             pixel within ``PIXEL_REACH``.
@@ -248,9 +248,9 @@ def find_visibility(
     Args:
         positions: [T, Q, 3] in the user's world; NaN is never visible.
         indices: [T] committed frames.
-        camera: in the user's world.
+        camera: camera in the user's world.
         render_depth: returns rendered depth and alpha.
-        tolerance: in user units.
+        tolerance: tolerance in user units.
     """
     uv, z = camera.project(positions)
     inside = (z > 0) & ((uv >= 0) & (uv < (camera.width, camera.height))).all(axis=-1)

@@ -48,7 +48,7 @@ class ViewRenderer:
     """Renders views of states; buffers are reused between views.
 
     Args:
-        world: transform from the user's world to the internal world of the states. limits: of the rasterizer.
+        world: transform from the user's world to the internal world of the states. limits: limits of the rasterizer.
 
     >>> state = Gaussians.of_points([[0, 0, 2]], radius=0.1, colours=[1, 0, 0])
     >>> camera = Camera("front", [[100, 0, 8], [0, 100, 8], [0, 0, 1]], np.eye(4), 16, 16)
@@ -76,7 +76,7 @@ class ViewRenderer:
         """Renders a view of a state.
 
         Args:
-            gaussians: N Gaussians in the internal world. camera: in the user's world. background: RGB in 0…1.
+            gaussians: N Gaussians in the internal world. camera: camera in the user's world. background: RGB in 0…1.
             colours: [N, 3] float32 RGB instead of the state's colours; None for its colours as this camera sees them.
             labels: [N] part of each Gaussian, −1 for none; required for ``View.parts``.
 

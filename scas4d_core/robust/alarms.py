@@ -210,7 +210,7 @@ def left_out_alarms(names: Sequence[str], shown: Collection[str], dropped: Mappi
     """Returns the alarms of cameras that were not used for a frame.
 
     Args:
-        names: of the rig's cameras. shown: those with an image. dropped: excluded, with the reason.
+        names: names of the rig's cameras. shown: those with an image. dropped: excluded, with the reason.
     """
     reasons = {name: "no picture came" for name in names if name not in shown} | dict(dropped)
     return [
@@ -223,7 +223,7 @@ def colours_of(shift: Sequence[float], mean: Sequence[float] | Numbers) -> Numbe
     """Returns the [3] relative brightness difference between a camera's channels and their rendering.
 
     Args:
-        shift: ``CameraFit.colour_shift``. mean: of the camera's image, 0…1.
+        shift: ``CameraFit.colour_shift``. mean: mean of the camera's image, 0…1.
 
     >>> colours_of((0.05, 0.0, -0.02), (0.3, 0.2, 0.18)).round(3).tolist()
     [0.2, 0.0, -0.1]

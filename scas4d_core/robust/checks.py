@@ -79,7 +79,7 @@ def check_brightness(past: Past, bright: Mapping[str, float]) -> tuple[float, di
     """Compares the brightness of a frame's images with the usual one, before anything is rendered.
 
     Args:
-        past: of the scene; excluded cameras stay excluded (``outliers.past_after_update``). bright: by camera.
+        past: past of the scene; excluded cameras stay excluded (``outliers.past_after_update``). bright: by camera.
 
     Returns:
         The brightness ratio of the frame, 1 if it is within the usual range. The cameras to exclude, with the reason.

@@ -44,7 +44,7 @@ def best_order(run: Callable[[int, float], OrderResult], seed: int) -> tuple[Ord
     An update that needs no iteration is not repeated.
 
     Args:
-        run: runs the update with a seed and a factor on the layers' rates. seed: of the first order.
+        run: runs the update with a seed and a factor on the layers' rates. seed: seed of the first order.
     """
     ends: list[OrderResult] = []
     while len(ends) < len(FASTER) and not _agree(errors_of(ends)):

@@ -72,7 +72,7 @@ class Past:
         updates: number of updates included. rejected: number of consecutive rejected frames with usable images. fitted:
             time in seconds of the last learnt frame. lagging_frames: number of frames since a rejected or skipped one,
             0 when the PSNR is back to normal.
-        iterations: of the last update. error: usual error at the end of an update, by probe view.
+        iterations: iterations of the last update. error: usual error at the end of an update, by probe view.
         light: brightness ratio of the last frame, see ``checks.check_brightness``. light_frames: number of consecutive
             brighter, or darker, frames.
         last_brightness: by camera, mean of its image in the last frame, in any lighting. brightness_ratio: brightness
@@ -192,7 +192,7 @@ def misfits(past: Past, psnr: Mapping[str, float], limit: float) -> dict[str, st
     """Returns the cameras that fit much worse than usual, with the reason.
 
     Args:
-        psnr: in dB by camera. limit: ``FIRST_DB`` or ``LAST_DB``.
+        psnr: PSNR in dB by camera. limit: ``FIRST_DB`` or ``LAST_DB``.
     """
     limit += allowed(past)
     outlying = {
@@ -268,7 +268,7 @@ def past_after_update(
     """Returns the past after a committed update.
 
     Args:
-        psnr: in dB by camera: of learnt cameras when last rendered, of excluded ones at the end of the update.
+        psnr: PSNR in dB by camera: of learnt cameras when last rendered, of excluded ones at the end of the update.
         bright: of every image of the frame. exposure: of the frame. iterations: of the update; 0: as in the previous
             one.
         moved: whether this or an earlier update changed the state; otherwise no update's usual values are known.

@@ -136,7 +136,7 @@ def record_timing(
 
     Args:
         past: after the frame. before: Θ_{t−1}. result: Θ_t, before Gaussians are added. renderer: renders views.
-        way: seconds between the two states. frame: seconds since the previous frame. index: of the frame.
+        way: seconds between the two states. frame: seconds since the previous frame. index: index of the frame.
     """
     trace, after = result.trace, result.gaussians
     plain = result.outcome is FrameOutcome.UPDATED and len(result.attempts) == 1 and result.exposure == 1.0

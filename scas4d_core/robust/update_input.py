@@ -25,7 +25,7 @@ class UpdateInput:
     Attributes:
         state: Θ_{t−1}. motion: latest motion, or None. seconds: since the last learnt frame. step: since the previous
             frame.
-        views: of the frame, to learn from. suspects: views of excluded cameras. seed: of the update.
+        views: views of the frame, to learn from. suspects: views of excluded cameras. seed: seed of the update.
         brightness: mean of each camera's image. past: the usual values. carried: arrays of the effects.
         lengths: [N, 3] axis lengths in frame 0, in metres.
         exposure, left_out, unusable: from the image brightness, see ``checks.check_brightness``.

@@ -133,7 +133,7 @@ def committed_errors(rig: Rig, renderer: Renderer, views: Sequence[TrainingView]
     """Returns the image loss of a committed state in a few full-size probe views, under separate names.
 
     Args:
-        rig: as given, without pose drift. renderer: compares full-size images. views: of the frame.
+        rig: as given, without pose drift. renderer: compares full-size images. views: views of the frame.
     """
     chosen = probe_views(rig, views, CONFIRMING)
     return {view.name + COMMITTED: renderer.compare(state, view).image_loss for view in chosen}
@@ -143,7 +143,7 @@ class BestState:
     """Selects the best start of an update and the best state at its end.
 
     Args:
-        probes: of the frame. engine: has loaded Θ_{t−1}. hierarchy: of the moving Gaussians.
+        probes: probes of the frame. engine: has loaded Θ_{t−1}. hierarchy: hierarchy of the moving Gaussians.
         motion: of the previous update, or None. seconds: since it was measured. momentum: see ``UpdateSettings``.
 
     Attributes:
@@ -240,7 +240,7 @@ class BestState:
         """Selects the best candidate and sets the engine's tables to it.
 
         Args:
-            iterations: of the update. left_out: cameras to ignore.
+            iterations: number of iterations in the update. left_out: cameras to ignore.
         """
         if not self.errors:
             return Candidate.END

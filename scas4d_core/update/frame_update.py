@@ -39,10 +39,10 @@ class FrameUpdate:
 
     Args:
         engine: computes the update; it is bound to the plan here. built: plan and parts of the active effects.
-        neighbours: of the moving Gaussians; None if no term needs them.
+        neighbours: neighbours of the moving Gaussians; None if no term needs them.
 
     Attributes:
-        plan: of the updates. hierarchy: of the moving Gaussians.
+        plan: plan of the updates. hierarchy: hierarchy of the moving Gaussians.
         curve: whether loss terms are computed that only the report needs; they do not affect state and evidence.
 
     Raises:
@@ -71,7 +71,7 @@ class FrameUpdate:
         """Finds D_t and applies it to Θ_{t−1}.
 
         Args:
-            previous: Θ_{t−1}. views: of frame t. motion: of the previous update, or None.
+            previous: Θ_{t−1}. views: of frame t. motion: motion of the previous update, or None.
             seconds: between the frames. seed: for the order of views and the sampled neighbours.
             options: of this attempt. carried: arrays that the effects carry over, by effect.
         """

@@ -80,7 +80,7 @@ class PlanBuilder:
     Attributes:
         scene, update: the settings, with the floor in the internal world. factory: creates the scene's views.
             hierarchy: of the moving Gaussians. first: the roots, Θ_0 plus all Gaussians added since (``preparation``).
-        plan: filled in by the effects. parts: of the effects, in order.
+        plan: filled in by the effects. parts: parts of the effects, in order.
     """
 
     scene: SceneSettings

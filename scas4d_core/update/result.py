@@ -29,7 +29,7 @@ class Stopwatch:
         began: ``perf_counter`` value at the start; None for now.
 
     Attributes:
-        seconds: by stage. began, last: ``perf_counter`` values at the start and at the last lap.
+        seconds: seconds spent in each stage. began, last: ``perf_counter`` values at the start and at the last lap.
     """
 
     def __init__(self, began: float | None = None) -> None:
@@ -123,7 +123,7 @@ class UpdateTrace:
         losses: weighted loss of each iteration. psnr: dB of each rendered view, in order; one or more per iteration,
             depending on the settings. iteration_ends: seconds from the start of the update to the end of each
             iteration.
-        seconds: by stage.
+        seconds: seconds spent in each stage.
         first: dB of each camera when first rendered. cameras: fit of each camera when last rendered, by name.
         left_out: cameras that the gate excluded, with the reason.
         planned: (iteration, total iterations) for each change of plan by the stopping rule.
@@ -185,7 +185,7 @@ class UpdateResult:
             frame, of the last attempt before any search.
         frozen: number of Gaussians that keep their previous state. bounded: number of axes clamped to their minimum or
             maximum length.
-        outcome: of the frame. reason: in words, if the outcome is degraded.
+        outcome: outcome of the frame. reason: in words, if the outcome is degraded.
         attempts: each attempt at the frame, with its result.
         exposure: brightness ratio of the frame to the usual brightness.
         offsets: dB by camera above (+) or below its usual level among the cameras; empty if nothing was rendered.

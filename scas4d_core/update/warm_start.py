@@ -162,7 +162,7 @@ def warm_start(hierarchy: Hierarchy, motion: Motion | None, seconds: float, mome
     """Returns the initial deformation from the previous motion; scaling (c, s) and Δs start at the identity.
 
     Args:
-        motion: of the previous update; None for no motion. seconds: since it was measured.
+        motion: motion of the previous update; None for no motion. seconds: since it was measured.
         momentum: share of the residual motion, beyond the layers', from which Δp and ΔR start.
     """
     tables = Tables.identity(hierarchy)

@@ -153,7 +153,7 @@ def _times(given: KeyPoses, seconds_of_frame: Mapping[int, float], file: Path) -
             field = "time" if key.time is not None else "frame"
             raise InputError(
                 f"{file.name}: keys[{place}].{field} {getattr(key, field)} is not after that of keys[{place - 1}]",
-                "give keys in order of time",
+                "list the keys in chronological order",
             )
     return np.array(times)
 

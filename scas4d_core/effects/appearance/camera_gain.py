@@ -37,7 +37,7 @@ def current_exposures(
     """Returns the exposures of the cameras, [3, 2] gain and offset by name: as given, or from the latest gains.
 
     Args:
-        exposures: found in frame 0. carried: arrays of the effects. names: of the rig's cameras.
+        exposures: found in frame 0. carried: arrays of the effects. names: names of the rig's cameras.
     """
     if NAME not in carried:
         return exposures

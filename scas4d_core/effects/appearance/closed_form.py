@@ -38,7 +38,7 @@ def follow_pictures(
     """Returns the state with the colours of some Gaussians updated to match the images.
 
     Args:
-        state: geometry that matches the images. views: of the frame. renderer: renders them.
+        state: geometry that matches the images. views: views of the frame. renderer: renders them.
         learnt: [N] 1 for the Gaussians whose colours are updated; the others keep theirs.
     """
     views = from_all_sides(views)

@@ -39,7 +39,7 @@ def orientation_and_place(state: Gaussians, rows: NDArray[np.int64], centre: Dou
     The normal is the shortest axis, oriented towards the cameras. The position is in metres relative to the mean.
 
     Args:
-        rows: [R] rows of the Gaussians. centre: of the cameras, in metres.
+        rows: [R] rows of the Gaussians. centre: centre of the cameras, in metres.
     """
     factors, means = state.factors[rows].astype(np.float64), state.means[rows].astype(np.float64)
     axes = np.linalg.eigh(factors @ factors.transpose(0, 2, 1)).eigenvectors

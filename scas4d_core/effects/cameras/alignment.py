@@ -64,7 +64,7 @@ class Equations(NamedTuple):
         matrix: [K, K], vector: [K]; a twist ξ leaves the weighted squared error ``energy − 2 vector·ξ + ξ·matrix·ξ``,
             in units of ``RESIDUAL_SCALE``. Translations are in units of ``depth``. energy: weighted squared error
             without a twist.
-        depth: of the image centre, in metres.
+        depth: depth of the image centre, in metres.
     """
 
     matrix: Double
@@ -154,7 +154,7 @@ def twist_equations(lens: Array, seen: AlignedPixels, depth: Array) -> Equations
     """Returns the normal equations of a twist, in six unknowns.
 
     Args:
-        lens: of the camera. depth: [H, W] metres along z; NaN (nothing rendered) is replaced by the median depth.
+        lens: lens of the camera. depth: [H, W] metres along z; NaN (nothing rendered) is replaced by the median depth.
     """
     here = depth.reshape(-1)[seen.pixels].astype(np.float64)
     known = np.isfinite(here)
@@ -180,7 +180,7 @@ def pixel_offset(lens: Array, twist: Double, depth: float) -> Double:
     """Returns the [3] displacement (horizontal, vertical, roll) of the image centre by a twist, in pixels.
 
     Args:
-        depth: of the image centre, in metres.
+        depth: depth of the image centre, in metres.
     """
     middle = np.array([lens[4] / 2, lens[5] / 2], np.float64)
     return np.append(flow(lens, middle, depth) @ twist, twist[5] * float(lens[4]) / 4)

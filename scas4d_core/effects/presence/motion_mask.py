@@ -58,7 +58,7 @@ def first_labels(gaussians: Gaussians, rig: Rig, masks: Mapping[str, NDArray[np.
     """Returns the Gaussians of frame 0 with the initial labels of the scene.
 
     Args:
-        gaussians: as fitted. rig: in the internal world, at the size of the masks.
+        gaussians: as fitted. rig: rig in the internal world, at the size of the masks.
         masks: of frame 0, [H, W] by camera, non-zero on the foreground; empty if there are none.
     """
     return with_reliable_labels(with_mask_hull_labels(gaussians, rig, masks))

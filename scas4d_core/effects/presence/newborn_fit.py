@@ -156,7 +156,7 @@ class _Schedule:
         self.whole = True
 
     def begin(self, done: int) -> FitStep | None:
-        """See ``GaussianFit.run``."""
+        """Returns the step of an iteration, or None to end the fit; see ``GaussianFit.run``."""
         if done == 0 and self._end is not None and perf_counter() >= self._end:
             self.whole = False
             return None

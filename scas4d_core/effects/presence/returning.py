@@ -46,7 +46,7 @@ def find_returned(seen: Sequence[Novelty], hull: Hull, state: Gaussians, rendere
     """Returns the retired Gaussians that explain new objects, if shown unchanged at the hull's centre.
 
     Args:
-        seen: novelty maps. hull: of the new objects. state: Θ_t. renderer: renders views.
+        seen: novelty maps. hull: hull of the new objects. state: Θ_t. renderer: renders views.
     """
     retired = np.flatnonzero(state.retired & (state.foreground > 0.5))
     revivals: list[ReturnedThing] = []

@@ -60,7 +60,7 @@ def bundle_adjust(
     unchanged.
 
     Args:
-        cameras: of the tracks.
+        cameras: cameras of the tracks.
         tracks: features of one point each, some of them wrong.
         focal: whether to adjust each camera's focal length too; the ratio of fx and fy is fixed.
         seed: for RANSAC.

@@ -90,7 +90,7 @@ def match_by_appearance(views: Sequence[PosedPicture]) -> Matches:
     """Matches the SIFT features of each camera with those of its neighbours in direction and position.
 
     Args:
-        views: of one frame, from at least two cameras.
+        views: views of one frame, from at least two cameras.
     """
     small = [_downscale(view) for view in views]
     feature_sets = extract_features(small, most=FEATURES, contrast=CONTRAST)

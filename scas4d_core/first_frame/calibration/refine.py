@@ -48,7 +48,7 @@ def check_calibration(rig: Rig, images: Mapping[str, NDArray[np.uint8]], *, refi
     """Measures the calibration error in the images; returns None if fewer than two cameras have an image.
 
     Args:
-        rig: in the user's world, at image size. images: [H, W, 3] uint8 of one frame, by camera name.
+        rig: rig in the user's world, at image size. images: [H, W, 3] uint8 of one frame, by camera name.
         refine: whether to refine poses; the result is kept only if held-out matches improve.
 
     >>> from scas4d_core.captures import open_capture

@@ -144,14 +144,14 @@ def depth_maps(
     """Runs PatchMatch on every view with its neighbours, then compares all depths.
 
     Args:
-        views: of equal or different sizes; see ``halved``.
+        views: views of equal or different sizes; see ``halved``.
         ranges: (near, far) of each view, in world units.
         priors: [H, W] depth of each view to try first, 0 if unknown.
         active: [H, W] pixels to compute in each view.
         middle: [3] scene centre, about which angles between cameras are measured.
         iterations: rounds of PatchMatch.
         seed: for the random planes.
-        hull: of the masks; depths of masked pixels outside of it are rejected.
+        hull: hull of the masks; depths of masked pixels outside of it are rejected.
         fewest: minimum number of neighbours of an image.
         progress: called with (views done, views).
     """

@@ -239,9 +239,9 @@ def sample_surfaces(views: Sequence[PosedPicture], supports: Sequence[Support], 
     """Returns [P, 3] surface points that the cameras see, one per ``stride``-th pixel outside the masks.
 
     Args:
-        views: of the cameras; masked pixels show other objects.
+        views: views of the cameras; masked pixels show other objects.
         supports: fitted surfaces.
-        stride: in pixels.
+        stride: stride in pixels.
         scale: radius of the rig. Samples far from every triangulated point of the surface (``GAP_…``) are left out,
             unless they lie within a fitted dome.
     """

@@ -24,7 +24,7 @@ class Stage:
     """The ball that contains the cameras and the shared volume.
 
     Attributes:
-        middle: [3] centre in the world. radius: in world units.
+        middle: [3] centre in the world. radius: radius in world units.
     """
 
     middle: Float
@@ -54,7 +54,7 @@ def surroundings(views: Sequence[PosedPicture], distances: Sequence[float]) -> I
 
     Args:
         views: with images; masked pixels show the scene and get no point.
-        distances: of each camera to the scene centre, in world units.
+        distances: distances of each camera to the scene centre, in world units.
 
     Returns:
         Points with the colours of their pixels; labelled as background if there are masks.

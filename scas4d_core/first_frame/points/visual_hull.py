@@ -154,8 +154,8 @@ def count_contradictions(
 
     Args:
         views: those without a mask are ignored.
-        hull: of the masks.
-        points: in the world.
+        hull: hull of the masks.
+        points: points in the world.
         misses: share of the masks that may miss a foreground point.
     """
     surface = hull.centres[hull.surface()]

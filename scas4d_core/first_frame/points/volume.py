@@ -34,7 +34,7 @@ def shared_volume(views: Sequence[PosedPicture], distances: Sequence[float], see
 
     Args:
         views: with images; points lie in all masks.
-        distances: of each camera to the scene centre, in world units.
+        distances: distances of each camera to the scene centre, in world units.
         seed: for the samples.
 
     Raises:

@@ -236,7 +236,7 @@ def test_test_cameras_must_have_the_same_frames(folder):
     [
         (np.zeros((4, 5)), r"data must be \[P, 7\]"),
         (np.zeros((0, 7)), r"data must be \[P, 7\]"),
-        (np.full((4, 7), 200.0), "divide by 255"),
+        (np.full((4, 7), 200.0), "by 255"),
         (np.array([[0.0] * 7, [np.nan] + [0.0] * 6]), "NaN or infinity in row 1"),
         (np.array([[{}] * 7]), "without pickle"),
     ],

@@ -44,7 +44,7 @@ def test_the_document_has_every_resource():
     )
     assert document["security"] == [{"bearer": []}]
     assert "security" not in create_app(fake_settings("unused")).openapi()
-    assert paths["/v1/scenes"]["get"]["summary"] == "Lists all scenes, and wakes none"
+    assert paths["/v1/scenes"]["get"]["summary"] == "Lists all scenes without waking them"
     for path, operations in paths.items():
         for method, operation in operations.items():
             assert operation["summary"], (method, path)
