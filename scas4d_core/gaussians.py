@@ -208,6 +208,14 @@ def quaternion_products(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
     return np.stack(product_components(a.T, b.T), axis=1)
 
 
+def turned_rotations(rotations: NDArray[Any], rows: NDArray[np.int64], turns: NDArray[Any]) -> NDArray[Any]:
+    """Returns a copy of unit quaternions [N, 4] in which the given rows [M] are turned by [M, 4] (w, x, y, z)."""
+    made = rotations.copy()
+    turned = quaternion_products(turns, rotations[rows])
+    made[rows] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    return made
+
+
 def product_components(a: NDArray[Any], b: NDArray[Any]) -> list[NDArray[Any]]:
     """Returns the components (w, x, y, z), [M] each, of a∘b for quaternions [4, M]: b is applied first."""
     aw, ax, ay, az = a

@@ -227,7 +227,7 @@ SSIM_C2 = _convention(
 )  # fmt: skip
 SMALLEST_SQUARE = _convention(
     "smallest_square", 1e-9, 0.0,
-    unit="1", where="engines/torch/losses.py, engines/cpu/renderer.py",
+    unit="1", where="engines/torch/losses.py, engines/renderer.py",
     reason="Sum of squared differences below which two pictures count as equal: PSNR stays finite.",
     counted="acts on a reported figure, not on the state",
 )  # fmt: skip

@@ -112,6 +112,16 @@ class AttemptStart:
     curve: bool = True
     lap: Callable[[str], None] = lambda stage: None
 
+    @property
+    def cluster_columns(self) -> list[list[float]]:
+        """Learning rates of the ten columns r, t, c, s of each layer's table."""
+        return [[r] * 3 + [t] * 3 + [scaling] * 4 for r, t, scaling in self.layers]
+
+    @property
+    def delta_columns(self) -> list[float]:
+        """Learning rates of the nine columns Δp, Δr, Δs of the deltas."""
+        return [self.position] * 3 + [self.rotation] * 3 + [self.scale] * 3
+
 
 @dataclass(frozen=True)
 class StepScalars:

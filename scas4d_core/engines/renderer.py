@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import log10
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from scas4d_core.engines.views import CameraArrays, TrainingView
 from scas4d_core.gaussians import Gaussians
+from scas4d_core.guards import SMALLEST_SQUARE
 
 Array = NDArray[np.float32]
 
@@ -29,6 +31,15 @@ class Picture(NamedTuple):
 
     features: Array
     transmittance: Array
+
+
+def psnr_of(squares: float, pixels: int) -> float:
+    """Returns the PSNR in dB of a picture from its summed squared error over pixels and RGB; finite for equal pictures.
+
+    >>> round(psnr_of(0.03 * 64, pixels=64), 6)  # an error of 0.1 in every value
+    20.0
+    """
+    return 10 * log10(3 * pixels / max(squares, SMALLEST_SQUARE))
 
 
 class Comparison(NamedTuple):

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from math import log10
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +23,9 @@ from scas4d_core.engines.cpu.gloss import features_seen
 from scas4d_core.engines.cpu.rasterizer import Drawing
 from scas4d_core.engines.cpu.renderer import CpuRenderer, blocks_of, forget_moments, no_lap
 from scas4d_core.engines.limits import DEFAULT, Limits
-from scas4d_core.engines.renderer import Gradients, Picture
+from scas4d_core.engines.renderer import Gradients, Picture, psnr_of
 from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView, means
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.guards import SMALLEST_SQUARE
 from scas4d_core.kernels import image_loss, lanes, tiles
 
 Array = NDArray[np.float32]
@@ -240,7 +238,7 @@ class ChangedPixels(CpuRenderer):
         tiles.write_blocks(g_part, drawn, tiles_x, box, g_image)
         self.image_part, self.mask_part = float(sums[0]), float(sums[1])
         pixels = view.camera.height * view.camera.width
-        self.psnr = 10 * log10(3 * pixels / max(float(sums[2]), SMALLEST_SQUARE))
+        self.psnr = psnr_of(float(sums[2]), pixels)
         self._shown_mean = self._static_means[_key(view)] + shifts[:3] / pixels
 
     def _part(self, channels: int, box: tuple[int, int, int, int]) -> tuple[Array, Array]:

@@ -20,7 +20,7 @@ from scas4d_core.engines.gains import GainEstimator
 from scas4d_core.engines.plan import Structure, UpdatePlan
 from scas4d_core.engines.renderer import Gradients
 from scas4d_core.engines.views import TrainingView
-from scas4d_core.gaussians import Gaussians, quaternion_products
+from scas4d_core.gaussians import Gaussians, turned_rotations
 from scas4d_core.guards import GuardCounts, summed
 
 Array = NDArray[np.float32]
@@ -99,12 +99,11 @@ class CpuEngine:
             self._gloss = LearntGloss(previous.gloss, previous.environment, len(previous), self._rows, roots)
         if start.gains is not None:
             self._gains = GainEstimator(start.gains, self._camera_rows, self._views)
-        columns = [[r] * 3 + [t] * 3 + [scaling] * 4 for r, t, scaling in start.layers]
-        own = [start.position] * 3 + [start.rotation] * 3 + [start.scale] * 3
+        own = start.delta_columns
         deformation = self._deformation
         self._layer_columns = [
             AdamColumns(table, rates, betas) if any(rates) else None
-            for table, rates in zip(deformation.clusters, columns, strict=True)
+            for table, rates in zip(deformation.clusters, start.cluster_columns, strict=True)
         ]
         self._own_columns = AdamColumns(deformation.deltas, own, betas) if any(own) else None
 
@@ -238,9 +237,7 @@ class CpuEngine:
         """See ``UpdateEngine.state``."""
         self._forward()
         previous, deformation = self._previous, self._deformation
-        rotations = previous.rotations.copy()
-        turned = quaternion_products(deformation.turns, previous.rotations[self._rows])
-        rotations[self._rows] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+        rotations = turned_rotations(previous.rotations, self._rows, deformation.turns)
         moved = previous.replace(
             means=deformation.means.copy(), factors=deformation.factors.copy(), rotations=rotations
         )

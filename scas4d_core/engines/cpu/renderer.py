@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import log10
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -13,10 +12,9 @@ from scas4d_core.engines.cpu.blocks import as_grid, tile_grid
 from scas4d_core.engines.cpu.gloss import features_seen
 from scas4d_core.engines.cpu.rasterizer import CpuRasterizer, Drawing
 from scas4d_core.engines.limits import DEFAULT, Limits
-from scas4d_core.engines.renderer import CHANNELS, Comparison, Gradients, Picture
+from scas4d_core.engines.renderer import CHANNELS, Comparison, Gradients, Picture, psnr_of
 from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView, means
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.guards import SMALLEST_SQUARE
 from scas4d_core.kernels import image_loss, tiles
 
 Array = NDArray[np.float32]
@@ -188,7 +186,7 @@ class CpuRenderer:
         g_image[channels:] = 0
         sums = rows.sum(axis=1, dtype=np.float64)
         self.image_part, self.mask_part = float(sums[:3, 0].sum()), float(sums[3:, 0].sum())
-        self.psnr = 10 * log10(3 * height * width / max(float(sums[:3, 1].sum()), SMALLEST_SQUARE))
+        self.psnr = psnr_of(float(sums[:3, 1].sum()), height * width)
         self.exposure_gradient[:channels] = g_exposure.sum(axis=1)
 
     def _lacking(self, view: TrainingView, most: float) -> tuple[Array, Array]:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from math import log10
+from functools import partial
 
 import numpy as np
 import warp as wp
@@ -14,6 +14,7 @@ from scas4d_core.engines.cpu.gloss import LearntGloss, features_seen, without_tu
 from scas4d_core.engines.engine import AttemptStart, IterationLog, StepScalars, Tables, Thinned, ViewRecord
 from scas4d_core.engines.gains import GainEstimator
 from scas4d_core.engines.plan import Structure, UpdatePlan
+from scas4d_core.engines.renderer import psnr_of
 from scas4d_core.engines.views import LABEL, TrainingView
 from scas4d_core.engines.warp.adam import Adam
 from scas4d_core.engines.warp.colours import WarpColours
@@ -21,13 +22,10 @@ from scas4d_core.engines.warp.deformation import WarpDeformation
 from scas4d_core.engines.warp.layout import IMAGE_LOSS, MASK_LOSS, SHIFT, SQUARES
 from scas4d_core.engines.warp.pictures import PicturePass
 from scas4d_core.engines.warp.renderer import WarpRenderer
-from scas4d_core.gaussians import Gaussians, quaternion_products
-from scas4d_core.guards import SMALLEST_SQUARE, GuardCounts, summed
+from scas4d_core.gaussians import Gaussians, turned_rotations
+from scas4d_core.guards import GuardCounts, summed
 
 Array = NDArray[np.float32]
-
-RECORDS = 4096
-"""Capacity of the log on the device in rows; the host reads the rows when the log is full."""
 
 
 class WarpEngine:
@@ -55,7 +53,6 @@ class WarpEngine:
         self.renderer = WarpRenderer(plan.background, plan.limits, self._device, plan.image)
         self._deformation = WarpDeformation(self._device, plan, structure)
         self._pictures = PicturePass(self._device, plan, len(structure.roots))
-        self._pictures.reserve(RECORDS)
         self._camera_rows = {name: row for row, name in enumerate(plan.cameras)}
         self._views: list[TrainingView] = []
         self._probes: list[TrainingView] = []
@@ -82,7 +79,7 @@ class WarpEngine:
         self._colours: WarpColours | None = None
         self._layer_steps: list[Adam] = []
         self._own_step: Adam | None = None
-        self._log, self._records = IterationLog(), 0
+        self._log = IterationLog()
 
     def set_tables(self, tables: Tables) -> None:
         """See ``UpdateEngine.set_tables``."""
@@ -101,12 +98,10 @@ class WarpEngine:
         if start.gains is not None:
             self._gains = GainEstimator(start.gains, self._camera_rows, self._views)
             self._expose()
-        columns = [[r] * 3 + [t] * 3 + [scaling] * 4 for r, t, scaling in start.layers]
         self._layer_steps = [
-            Adam(table, rates, betas) for table, rates in zip(deformation.clusters, columns, strict=True)
+            Adam(table, rates, betas) for table, rates in zip(deformation.clusters, start.cluster_columns, strict=True)
         ]
-        own = [start.position] * 3 + [start.rotation] * 3 + [start.scale] * 3
-        self._own_step = Adam(deformation.deltas, own, betas)
+        self._own_step = Adam(deformation.deltas, start.delta_columns, betas)
         deformation.set_samples(list(start.samples))
 
     def iterate(self, views: Sequence[int], step: StepScalars) -> None:
@@ -154,15 +149,18 @@ class WarpEngine:
         return row
 
     def _launched(self, index: int, features: wp.array, weight: float) -> Array:
-        """Renders a view and adds its gradients; repeats with larger lists after an overflow."""
+        """Renders a view, adds its gradients times a weight, and returns its row of the log."""
         deformation, pictures = self._deformation, self._pictures
+        given = (self._view, self._record, deformation.means, deformation.factors, self._opacities, features)
+        return self._until_it_fits(index, lambda: pictures.launch(*given, weight))
+
+    def _until_it_fits(self, index: int, render: Callable[[], None]) -> Array:
+        """Renders a loaded view, again with larger lists after an overflow; returns its row of the log."""
         self._view.fill_(index)
-        given = (deformation.means, deformation.factors, self._opacities, features)
-        pictures.launch(self._view, self._record, *given, weight)
-        # After an overflow, the picture is empty and no gradient was added.
-        while pictures.grow():
-            pictures.launch(self._view, self._record, *given, weight)
-        row: Array = pictures.log.numpy()[0]
+        render()
+        while self._pictures.grow():  # the picture was empty and no gradient was added
+            render()
+        row: Array = self._pictures.log.numpy()[0]
         return row
 
     def _step(self, step: StepScalars) -> None:
@@ -212,11 +210,9 @@ class WarpEngine:
         for index in which:
             seen = features_seen(state, self._probes[index].camera, turns)
             features = wp.array(seen, dtype=wp.vec4, device=self._device)
-            self._view.fill_(len(self._views) + index)
-            pictures.measure(self._view, self._record, means, factors, self._opacities, features)
-            while pictures.grow():
-                pictures.measure(self._view, self._record, means, factors, self._opacities, features)
-            errors.append(float(pictures.log.numpy()[0, IMAGE_LOSS]))
+            given = (self._view, self._record, means, factors, self._opacities, features)
+            row = self._until_it_fits(len(self._views) + index, partial(pictures.measure, *given))
+            errors.append(float(row[IMAGE_LOSS]))
         return errors
 
     def tables(self) -> Tables:
@@ -237,9 +233,7 @@ class WarpEngine:
         """See ``UpdateEngine.state``."""
         previous, deformation = self._previous, self._deformation
         deformation.forward()
-        rotations = previous.rotations.copy()
-        turned = quaternion_products(deformation.turns.numpy(), previous.rotations[self._rows])
-        rotations[self._rows] = turned / np.linalg.norm(turned, axis=1, keepdims=True)
+        rotations = turned_rotations(previous.rotations, self._rows, deformation.turns.numpy())
         means, factors = deformation.means.numpy().copy(), deformation.factors.numpy().copy()
         moved = previous.replace(means=means, factors=factors, rotations=rotations)
         return self._with_looks(moved) if learnt else moved
@@ -278,9 +272,8 @@ class WarpEngine:
 def record_of(index: int, row: Array, view: TrainingView) -> ViewRecord:
     """Returns the record of a rendering from its row of the device's log."""
     height, width = view.target.shape[1:]
-    psnr = 10 * log10(3 * height * width / max(float(row[SQUARES]), SMALLEST_SQUARE))
     red, green, blue = row[SHIFT : SHIFT + LABEL].tolist()
-    return ViewRecord(index, psnr, (red, green, blue))
+    return ViewRecord(index, psnr_of(float(row[SQUARES]), height * width), (red, green, blue))
 
 
 def _as_rows(table: wp.array) -> wp.array:

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from math import log10
-
 import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
 from scas4d_core.engines.cpu.gloss import features_seen
 from scas4d_core.engines.limits import DEFAULT, Limits
-from scas4d_core.engines.renderer import BLOCK, CHANNELS, Comparison, Picture
+from scas4d_core.engines.renderer import BLOCK, CHANNELS, Comparison, Picture, psnr_of
 from scas4d_core.engines.views import LABEL, CameraArrays, TrainingView
 from scas4d_core.engines.warp.layout import COLUMNS, IMAGE_LOSS, SHIFT, SQUARES, Camera, camera_of
 from scas4d_core.engines.warp.picture_loss import PictureLoss
 from scas4d_core.engines.warp.projection import FEATURES, RECORD
 from scas4d_core.engines.warp.rasterizer import Rasterizer
 from scas4d_core.gaussians import Gaussians
-from scas4d_core.guards import FEATURE_CEILING, SMALLEST_SQUARE
+from scas4d_core.guards import FEATURE_CEILING
 
 Array = NDArray[np.float32]
 PADDING = 32
@@ -81,8 +79,7 @@ class WarpRenderer:
         self._loss.measure(self._first, self._first, self._rasterizer, self._behind, self._log)
         log = self._log.numpy()[0].astype(float)
         red, green, blue = log[SHIFT : SHIFT + 3].tolist()
-        pixels = 3 * view.camera.width * view.camera.height
-        psnr = 10 * log10(pixels / max(float(log[SQUARES]), SMALLEST_SQUARE))
+        psnr = psnr_of(float(log[SQUARES]), view.camera.width * view.camera.height)
         return Comparison(psnr, float(log[IMAGE_LOSS]), (red, green, blue))
 
     def gather(self, state: Gaussians, camera: CameraArrays, planes: Array) -> Array:
