@@ -312,9 +312,9 @@ def test_a_count_that_lies_fills_no_memory(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        (b"[]", "no head"),
-        (b"{}", "no head"),
-        (b"\xff", "no head"),
+        (b"[]", "invalid header"),
+        (b"{}", "invalid header"),
+        (b"\xff", "invalid header"),
         (
             json.dumps(json.loads(HEAD.text()) | {"version": 99}).encode(),
             "version 99; this scas4d reads version 1: use",
