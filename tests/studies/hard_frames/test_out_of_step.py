@@ -55,7 +55,7 @@ def test_the_synthetic_footage_is_rendered_at_any_moment() -> None:
 
 
 def report(**timing: float) -> Any:
-    rows = {name: {"frames": way, "error": 0.02, "off": abs(way) > 0.2} for name, way in timing.items()}
+    rows = {name: {"frames": way, "error": 0.02, "out_of_step": abs(way) > 0.2} for name, way in timing.items()}
     return SimpleNamespace(timing=rows)
 
 
